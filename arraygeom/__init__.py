@@ -1,0 +1,1 @@
+"""Differentiable geometry of rigs of N unlike cameras."""

@@ -1,0 +1,1 @@
+"""Rig files: one module a format, one registry."""

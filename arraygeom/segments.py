@@ -1,0 +1,78 @@
+"""Where to look in beta: what geometry hands to attention.
+
+`Segments` is the compact form, two points for each alpha pixel; `Positions` is the explicit one. Both hold
+(x, y) in beta's pixels, the centre of the first pixel being (0, 0). A picture of height H and width W covers
+the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be looked up, all others cannot.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Positions:
+    """Explicit sample positions, L for each alpha pixel.
+
+    `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count has
+    nowhere to look.
+    """
+
+    xy: Float[Tensor, "*n l 2"]
+    mask: Bool[Tensor, "*n l"]
+
+
+@dataclass(frozen=True)
+class Segments:
+    """One straight piece of beta's picture for each alpha pixel, from `start` to `end`, in beta's pixels.
+
+    For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far bound.
+    Where `valid` is False there is nowhere to look and the ends mean nothing (but are finite).
+    """
+
+    start: Float[Tensor, "*n 2"]
+    end: Float[Tensor, "*n 2"]
+    valid: Bool[Tensor, "*n"]
+
+    @property
+    def length(self) -> Float[Tensor, "*n"]:
+        """Length in pixels. Differentiable, also at zero length (where the gradient is zero)."""
+        squared = (self.end - self.start).square().sum(-1)
+        positive = squared > 0
+        return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
+
+    def at(self, fraction: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
+        """The point at a fraction of the way from start (0) to end (1)."""
+        return self.start + fraction[..., None] * (self.end - self.start)
+
+    def fraction(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
+        """The fraction of the point of the segment's line nearest to `xy`; 0.5 on a segment of no length."""
+        along = self.end - self.start
+        squared = along.square().sum(-1)
+        positive = squared > 0
+        inner = ((xy - self.start) * along).sum(-1)
+        return torch.where(positive, inner / torch.where(positive, squared, 1.0), 0.5)
+
+    def positions(self, samples: int) -> Positions:
+        """`samples` positions, the first at start, the last at end, evenly spaced (one sample: the middle).
+
+        >>> s = Segments(torch.tensor([0.0, 4.0]), torch.tensor([6.0, 4.0]), torch.tensor(True))
+        >>> s.positions(4).xy[:, 0].tolist()
+        [0.0, 2.0, 4.0, 6.0]
+        """
+        u = sample_fractions(samples, like=self.start)
+        xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
+        return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
+
+
+def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:
+    """Where the samples of a segment are: l / (L - 1) for l = 0 .. L - 1, and 0.5 if there is only one."""
+    if samples < 1:
+        raise ValueError(f"samples must be at least 1, got {samples}")
+    if samples == 1:
+        return like.new_full((1,), 0.5)
+    return torch.linspace(0, 1, samples, dtype=like.dtype, device=like.device)

@@ -1,0 +1,1 @@
+"""The physics-aware transformer: one picture from an array of unlike cameras."""

@@ -1,0 +1,1 @@
+"""C3 attention: collect, correlate, combine."""

@@ -1,0 +1,18 @@
+"""Shapes and types of every public function are checked while testing, and only then."""
+
+from pathlib import Path
+
+import pytest
+from jaxtyping import install_import_hook
+
+install_import_hook(["arraygeom", "pat", "calib"], "beartype.beartype")
+
+SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real pictures beside the checkout; a test that needs it skips where it is absent."""
+    if not SHARED.is_dir():
+        pytest.skip(f"real pictures not at {SHARED}")
+    return SHARED
