@@ -99,9 +99,7 @@ def track(
     return Track(to_homogeneous(x) @ A.to(x.dtype).transpose(-1, -2), b.to(x.dtype))
 
 
-def segments_between(
-    track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW
-) -> Segments:
+def segments_between(track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW) -> Segments:
     """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's picture.
 
     Clipped to the picture's area and to the front of beta, in closed form: along a track every limit is
@@ -113,14 +111,12 @@ def segments_between(
     return clip_track(track, w_near, w_far, beta_hw)
 
 
-def clip_track(
-    track: Track, w_start: Float[Tensor, "*m"], w_end: Float[Tensor, "*k"], beta_hw: HW
-) -> Segments:
+def clip_track(track: Track, w_start: Float[Tensor, "*m"], w_end: Float[Tensor, "*k"], beta_hw: HW) -> Segments:
     """The part of each track between two parameters, w_end <= w_start, that lies inside beta's picture."""
     a, b = track
     h, w = beta_hw
     low, high = w_end, w_start
-    possible: Tensor | None = None
+    possible = torch.ones_like(a[..., 0], dtype=torch.bool)
     for g, slope in (
         (a[..., 0] + 0.5 * a[..., 2], b[..., 0] + 0.5 * b[..., 2]),
         ((w - 0.5) * a[..., 2] - a[..., 0], (w - 0.5) * b[..., 2] - b[..., 0]),
@@ -132,7 +128,7 @@ def clip_track(
         low = torch.where(slope > 0, torch.maximum(low, crossing), low)
         high = torch.where(slope < 0, torch.minimum(high, crossing), high)
         inside = (slope != 0) | (g >= 0)
-        possible = inside if possible is None else possible & inside
+        possible = possible & inside
     valid = possible & (low <= high)
     high, low = (torch.where(valid, v, 0.0) for v in (high, low))
     start, end = (torch.where(valid[..., None], track.at(v), 0.0) for v in (high, low))
@@ -151,9 +147,7 @@ class Depth(NamedTuple):
     valid: Bool[Tensor, "*n"]
 
 
-def depth_from_track(
-    track: Track, x: Float[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None
-) -> Depth:
+def depth_from_track(track: Track, x: Float[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None) -> Depth:
     """Depth in alpha at which a track passes nearest to beta's pixels `x`, least squares (H&Z 12.2).
 
     `deviation` is the standard deviation of x along the track in pixels (default 0); the depth's is

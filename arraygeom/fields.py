@@ -172,9 +172,7 @@ class NearestVoxels:
         across = torch.arange(-beside, beside + 1, dtype=line.dtype, device=line.device)
         steep = line[..., 0].abs() > line[..., 1].abs()
         along_centre = torch.where(steep, centre[..., 1], centre[..., 0])[..., None] + steps
-        slope, other = (
-            torch.where(steep, line[..., i], line[..., j])[..., None] for i, j in ((1, 0), (0, 1))
-        )
+        slope, other = (torch.where(steep, line[..., i], line[..., j])[..., None] for i, j in ((1, 0), (0, 1)))
         safe = torch.where(other == 0, 1.0, other)
         on_line = -(slope * along_centre + line[..., 2:]) / safe
         v = on_line.round()[..., None] + across
@@ -229,15 +227,11 @@ def foot_on_line(line: Float[Tensor, "*n 3"], point: Float[Tensor, "*n 2"]) -> F
     return point - (to_homogeneous(point) * line).sum(-1, keepdim=True) * line[..., :2]
 
 
-def line_piece(
-    line: Float[Tensor, "*n 3"], point: Float[Tensor, "*n 2"], reach: Float[Tensor, ""], hw: HW
-) -> Segments:
+def line_piece(line: Float[Tensor, "*n 3"], point: Float[Tensor, "*n 2"], reach: Float[Tensor, ""], hw: HW) -> Segments:
     """The piece of each line within `reach` of the foot of `point`, clipped to the picture; invalid without line."""
     foot = foot_on_line(line, point)
     along = torch.stack([line[..., 1], -line[..., 0]], -1)
-    pieces = clip_track(
-        Track(to_homogeneous(foot), torch.nn.functional.pad(along, (0, 1))), reach, -reach, hw
-    )
+    pieces = clip_track(Track(to_homogeneous(foot), torch.nn.functional.pad(along, (0, 1))), reach, -reach, hw)
     return Segments(pieces.start, pieces.end, pieces.valid & line.any(-1))
 
 

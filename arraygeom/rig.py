@@ -110,9 +110,9 @@ class Pair:
     def homography_at(self, depth: Float[Tensor, ""]) -> Float[Tensor, "*b 3 3"]:
         """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
         alpha, beta = self.cameras
-        normal = alpha.K.new_tensor([0.0, 0.0, -1.0])
+        normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
-        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal, depth.to(alpha.K))
+        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
 
     def to(self, *args: Any, **kwargs: Any) -> Pair:
         """Like `Tensor.to`."""
@@ -195,9 +195,7 @@ class Rig:
         """The rig in which the pixels of camera `name` are x' ~ A x and its picture's size is `hw`."""
         eye = torch.eye(3, dtype=torch.float64)
         links = {
-            (a, b): link.mapped(A if a == name else eye, A if b == name else eye)
-            if name in (a, b)
-            else link
+            (a, b): link.mapped(A if a == name else eye, A if b == name else eye) if name in (a, b) else link
             for (a, b), link in self.links.items()
         }
         return self.with_camera(name, self[name].mapped(A, hw)).replace(links=links)
