@@ -1,1 +1,83 @@
-"""Differentiable geometry of rigs of N unlike cameras."""
+"""Differentiable geometry of rigs of N unlike cameras.
+
+Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
+"""
+
+from .camera import Camera, Projected, View, intrinsics
+from .epipolar import (
+    Depth,
+    Track,
+    depth_from_track,
+    epipolar_distance,
+    epipolar_lines,
+    epipoles,
+    essential_matrix,
+    fundamental_matrix,
+    segments_between,
+    shift_origin,
+    track,
+)
+from .fields import (
+    Dense,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    ReceptiveField,
+    Rectified,
+    lazily,
+    look,
+)
+from .homography import apply_homography, infinite_homography, plane_homography
+from .pixels import pixel_grid, resize_matrix
+from .pose import Pose, rotation_from_vector
+from .rig import Link, Pair, Rig
+from .sampling import sample, to_grid
+from .segments import Positions, Segments
+from .sensor import Band, Curve, Sensor
+
+__all__ = [
+    "Band",
+    "Camera",
+    "Curve",
+    "Dense",
+    "Depth",
+    "Epipolar",
+    "EpipolarLine",
+    "HomographyDisplacement",
+    "Link",
+    "Local",
+    "NearestVoxels",
+    "Pair",
+    "Pose",
+    "Positions",
+    "Projected",
+    "ReceptiveField",
+    "Rectified",
+    "Rig",
+    "Segments",
+    "Sensor",
+    "Track",
+    "View",
+    "apply_homography",
+    "depth_from_track",
+    "epipolar_distance",
+    "epipolar_lines",
+    "epipoles",
+    "essential_matrix",
+    "fundamental_matrix",
+    "infinite_homography",
+    "intrinsics",
+    "lazily",
+    "look",
+    "pixel_grid",
+    "plane_homography",
+    "resize_matrix",
+    "rotation_from_vector",
+    "sample",
+    "segments_between",
+    "shift_origin",
+    "to_grid",
+    "track",
+]

@@ -16,8 +16,8 @@ from torch import Tensor
 class MappedPoints(NamedTuple):
     """Points after a homography, and which of them exist."""
 
-    x: Float[Tensor, "*b n 2"]
-    valid: Bool[Tensor, "*b n"]
+    x: Float[Tensor, "*n 2"]
+    valid: Bool[Tensor, "*n"]
 
 
 def plane_homography(
@@ -46,8 +46,8 @@ def infinite_homography(
     return K_beta @ R @ torch.linalg.inv(K_alpha)
 
 
-def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*b n 2"]) -> MappedPoints:
-    """Map points. `valid` where the result is finite and its homogeneous scale is positive.
+def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> MappedPoints:
+    """Map points (*n, 2); with batched H (*b), points are (*b, n, 2). `valid` where the result is finite and its homogeneous scale is positive.
 
     The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
     positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first. Where

@@ -1,1 +1,6 @@
 """C3 attention: collect, correlate, combine."""
+
+from pat.attention.operator import attend, attend_with_statistics
+from pat.attention.reference import Attended
+
+__all__ = ["Attended", "attend", "attend_with_statistics"]

@@ -1,0 +1,187 @@
+"""Camera: intrinsics, lens, pose and size."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
+
+import torch
+from jaxtyping import Bool, Float
+from kornia.geometry.camera import PinholeCamera
+from torch import Tensor
+
+from .pixels import HW, resize_matrix, shift_matrix, to_homogeneous, turn_matrix
+from .pose import Pose, matvec
+from .sensor import Sensor
+
+if TYPE_CHECKING:
+    from .distortion import Distortion
+
+
+class Projected(NamedTuple):
+    """Pixels (x, y), depth z in metres, and whether the point is in front and within the lens's range."""
+
+    x: Float[Tensor, "*n 2"]
+    depth: Float[Tensor, "*n"]
+    valid: Bool[Tensor, "*n"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class View:
+    """What is known of every camera, calibrated or not: its picture's (height, width) and what it records."""
+
+    hw: HW
+    sensor: Sensor = field(default_factory=Sensor)
+
+    def resize(self, hw: HW) -> Self:
+        """The same view at another size."""
+        return self.mapped(resize_matrix(self.hw, hw), hw)
+
+    def crop(self, top: int, left: int, hw: HW) -> Self:
+        """A window of the view, `hw` in size. A negative `top` or `left`, or a larger size, pads."""
+        return self.mapped(shift_matrix(left, top), hw)
+
+    def turn(self, quarter_turns: int) -> Self:
+        """The picture turned counter-clockwise, as `torch.rot90(image, k, (-2, -1))` turns it."""
+        hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
+        return self.mapped(turn_matrix(self.hw, quarter_turns), hw)
+
+    def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Self:
+        """The camera of the picture whose pixels are x' ~ A x, of size `hw`."""
+        return self.replace(hw=hw)
+
+    def contains(self, x: Float[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
+        """Whether points lie on the picture's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
+        h, w = self.hw
+        return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
+
+    def replace(self, **changes: Any) -> Self:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Like `Tensor.to`; a view without numbers stays as it is."""
+        return self
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera(View):
+    """A calibrated camera. Leading batch axes everywhere; every tensor may require grad.
+
+    `K` maps the plane z = 1 (after the lens) to pixels, the first pixel's centre being (0, 0). It is affine,
+    not necessarily upper triangular: that of a turned picture has zeros on its diagonal.
+    `cam_from_world`: X_cam = R X_world + t in metres, x right, y down, z forward.
+
+    >>> K = torch.tensor([[100.0, 0, 49.5], [0, 100.0, 29.5], [0, 0, 1]], dtype=torch.float64)
+    >>> camera = Camera(K=K, cam_from_world=Pose.identity(), hw=(60, 100))
+    >>> camera.project(torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64)).x.tolist()
+    [49.5, 29.5]
+    """
+
+    K: Float[Tensor, "*b 3 3"]
+    cam_from_world: Pose
+    distortion: Distortion | None = None
+
+    @property
+    def R(self) -> Float[Tensor, "*b 3 3"]:
+        """Rotation of `cam_from_world`."""
+        return self.cam_from_world.R
+
+    @property
+    def t(self) -> Float[Tensor, "*b 3"]:
+        """Translation of `cam_from_world`, metres."""
+        return self.cam_from_world.t
+
+    @property
+    def centre(self) -> Float[Tensor, "*b 3"]:
+        """The optical centre in the world, metres."""
+        return self.cam_from_world.centre
+
+    def project(self, X: Float[Tensor, "*n 3"]) -> Projected:
+        """World points (*n, 3) to pixels; with a batched camera (*b), points are (*b, n, 3)."""
+        return self.project_local(self.cam_from_world.apply(X))
+
+    def project_local(self, X: Float[Tensor, "*n 3"]) -> Projected:
+        """Points in the camera's own frame to pixels."""
+        normalised, valid = self._through_lens(X)
+        x = (to_homogeneous(normalised) @ self.K.transpose(-1, -2))[..., :2]
+        return Projected(x, X[..., 2], valid)
+
+    def unproject(self, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
+        """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
+
+        Raises nothing: ask `rays` for validity.
+        """
+        rays, valid = self.rays(x)
+        X = rays * (depth / rays[..., 2])[..., None]
+        X = torch.where(valid[..., None], X, torch.nan)
+        return self.cam_from_world.inverse().apply(X)
+
+    def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
+        """The direction in the camera's frame of what pixels see, z = 1 for pinholes, and its validity."""
+        normalised = (to_homogeneous(x) @ torch.linalg.inv(self.K).transpose(-1, -2))[..., :2]
+        if self.distortion is None:
+            return to_homogeneous(normalised), torch.ones_like(x[..., 0], dtype=torch.bool)
+        return self.distortion.unproject(normalised)
+
+    def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Self:
+        """The camera of the picture whose pixels are x' ~ A x, of size `hw`: K' = A K."""
+        return self.replace(K=A.to(self.K) @ self.K, hw=hw)
+
+    def to(self, *args: Any, **kwargs: Any) -> Self:
+        """Like `Tensor.to`, for every tensor of the camera."""
+        distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)
+        pose = self.cam_from_world.to(*args, **kwargs)
+        return self.replace(K=self.K.to(*args, **kwargs), cam_from_world=pose, distortion=distortion)
+
+    def to_kornia(self) -> PinholeCamera:
+        """The same pinhole as a kornia camera, batched (B, 4, 4). Raises ValueError if there is a lens."""
+        if self.distortion is not None:
+            raise ValueError("kornia's PinholeCamera has no lens model: undistort first, or drop `distortion`")
+        R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
+        eye = torch.eye(4, dtype=K.dtype, device=K.device).repeat(len(K), 1, 1)
+        intrinsics, extrinsics = eye.clone(), eye.clone()
+        intrinsics[:, :3, :3], extrinsics[:, :3, :3], extrinsics[:, :3, 3] = K, R, t
+        h, w = (K.new_full((len(K),), n) for n in self.hw)
+        return PinholeCamera(intrinsics, extrinsics, h, w)
+
+    @classmethod
+    def from_kornia(cls, camera: PinholeCamera) -> Camera:
+        """The camera (batched as kornia's is) of a kornia pinhole."""
+        pose = Pose(camera.extrinsics[:, :3, :3], camera.extrinsics[:, :3, 3])
+        hw = (int(camera.height[0]), int(camera.width[0]))
+        return cls(K=camera.intrinsics[:, :3, :3], cam_from_world=pose, hw=hw)
+
+    def _through_lens(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        if self.distortion is not None:
+            return self.distortion.project(X)
+        z = X[..., 2:]
+        front = z > 0
+        return X[..., :2] / torch.where(front, z, 1.0), front[..., 0]
+
+
+def intrinsics(
+    focal: tuple[float, float] | float, hw: HW, centre: tuple[float, float] | None = None
+) -> Float[Tensor, "3 3"]:
+    """K from focal lengths and the principal point in pixels; by default the picture's middle.
+
+    >>> intrinsics(500.0, (480, 640))[0].tolist()
+    [500.0, 0.0, 319.5]
+    """
+    fx, fy = focal if isinstance(focal, tuple) else (focal, focal)
+    cx, cy = centre or ((hw[1] - 1) / 2, (hw[0] - 1) / 2)
+    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+
+
+def rotation_between(a: Camera, b: Camera) -> Float[Tensor, "*b"]:
+    """The angle between two cameras' orientations, radians."""
+    R = b.R @ a.R.transpose(-1, -2)
+    skew = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
+    return torch.atan2(0.5 * skew.norm(dim=-1), 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1))
+
+
+def direction_of(camera: Camera) -> Float[Tensor, "*b 3"]:
+    """The optical axis in the world, a unit vector."""
+    axis = camera.R.new_tensor([0.0, 0.0, 1.0])
+    return matvec(camera.R.transpose(-1, -2), axis)

@@ -1,0 +1,298 @@
+"""The native rig file: YAML that people write by hand.
+
+Units and the pixel convention stand in the file. Example:
+
+    format: arraygeom-rig 1
+    units: metres               # or millimetres
+    first_pixel_centre: 0       # 0 (OpenCV), 0.5 (COLMAP) or 1 (MATLAB)
+    depth: [2, 20]              # near and far along the optical axis; far may be .inf
+    cameras:
+      mono:
+        size: [640, 400]        # width, height
+        focal: 800              # pixels; or [fx, fy]
+        centre: [319.5, 199.5]  # principal point; left out: the picture's middle
+      colour:
+        size: [640, 400]
+        focal: [620, 622]
+        rotation: [0.01, -0.02, 0.5]  # rotation vector in degrees; or a 3x3 matrix. X_camera = R X_world + t
+        translation: [-0.1, 0, 0]     # t; or `position`, the optical centre in the world
+        distortion: {model: brown-conrady, coefficients: [-0.1, 0.02, 0, 0]}
+        response: rgb                 # a name, or {centre: 450, width: 80} in nm
+        frame_rate: 30
+    links:                            # pairs of cameras that have only a size
+      - {alpha: mono, beta: colour, F: [[...], [...], [...]], H: [[...], [...], [...]]}
+
+Numbers in pixels are converted to ours (first centre at 0) when read; files are written in our convention.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from ..camera import Camera, View, intrinsics
+from ..epipolar import shift_origin
+from ..pixels import shift_matrix
+from ..pose import Pose, rotation_error, rotation_from_vector
+from ..rig import Link, Rig
+from ..sensor import Band, Curve, Sensor
+from .errors import RigFileError
+
+FORMAT = "arraygeom-rig 1"
+UNITS = {"metres": 1.0, "millimetres": 1e-3}
+TOP = ("format", "name", "units", "first_pixel_centre", "depth", "cameras", "links")
+CAMERA = (
+    *("size", "focal", "centre", "K", "rotation", "translation", "position", "distortion"),
+    *("response", "frame_rate", "time_offset", "coding", "bayer"),
+)
+CALIBRATION = ("focal", "centre", "K", "rotation", "translation", "position", "distortion")
+
+
+def recognises(path: Path, head: str) -> bool:
+    """Whether a file looks like this format, from its name and its first kilobytes."""
+    return "arraygeom-rig" in head or (path.suffix in {".yaml", ".yml"} and "\ncameras:" in "\n" + head)
+
+
+def read(path: Path) -> Rig:
+    """The rig of a native file. Raises RigFileError naming the file, the entry and what to do."""
+    try:
+        document = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        place = getattr(error, "problem_mark", None)
+        line = f" at line {place.line + 1}" if place else ""
+        raise RigFileError(
+            path, None, f"not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}"
+        ) from None
+    return _Reader(path).rig(document)
+
+
+def write(rig: Rig) -> str:
+    """The text of a native file."""
+    document: dict[str, Any] = {"format": FORMAT}
+    if rig.name:
+        document["name"] = rig.name
+    document |= {"units": "metres", "first_pixel_centre": 0}
+    if rig.depth is not None:
+        document["depth"] = [float(d) for d in rig.depth]
+    document["cameras"] = {name: _camera_entry(camera) for name, camera in rig.cameras.items()}
+    if rig.links:
+        document["links"] = [_link_entry(*names, link) for names, link in rig.links.items()]
+    return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
+
+
+class _Reader:
+    """Reads one document; knows the file's name, units and pixel origin for the messages and the conversions."""
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.metre, self.origin = path, 1.0, 0.0
+
+    def fail(self, entry: str | None, message: str) -> RigFileError:
+        return RigFileError(self.path, entry, message)
+
+    def rig(self, document: Any) -> Rig:
+        self.keys(document, TOP, None)
+        if not str(document.get("format", FORMAT)).startswith("arraygeom-rig"):
+            raise self.fail("format", f"is '{document['format']}', wanted '{FORMAT}'")
+        self.metre = self.choice(document.get("units", "metres"), UNITS, "units")
+        self.origin = self.choice(
+            document.get("first_pixel_centre", 0), {0: 0.0, 0.5: 0.5, 1: 1.0}, "first_pixel_centre"
+        )
+        entries = document.get("cameras")
+        if not isinstance(entries, dict) or not entries:
+            raise self.fail("cameras", "missing or empty: name at least one camera")
+        cameras = {str(name): self.camera(f"cameras.{name}", entry) for name, entry in entries.items()}
+        depth = None
+        if document.get("depth") is not None:
+            near, far = self.numbers(document["depth"], (2,), "depth", infinite=True) * self.metre
+            if not 0 < near <= far:
+                raise self.fail("depth", f"is [{near:g}, {far:g}] m; wanted [near, far] with 0 < near <= far")
+            depth = (near, far)
+        links = dict(self.link(f"links[{i}]", link, cameras) for i, link in enumerate(document.get("links") or []))
+        return Rig(cameras, depth=depth, links=links, name=str(document.get("name", "")))
+
+    def camera(self, entry: str, fields: Any) -> View:
+        self.keys(fields, CAMERA, entry)
+        width, height = (self.whole(n, f"{entry}.size") for n in self.pair(fields.get("size"), f"{entry}.size"))
+        sensor = self.sensor(entry, fields)
+        if not any(key in fields for key in CALIBRATION):
+            return View(hw=(height, width), sensor=sensor)
+        K = self.K(entry, fields, (height, width))
+        return Camera(
+            K=K,
+            cam_from_world=self.pose(entry, fields),
+            hw=(height, width),
+            distortion=self.distortion(f"{entry}.distortion", fields.get("distortion")),
+            sensor=sensor,
+        )
+
+    def K(self, entry: str, fields: Mapping[str, Any], hw: tuple[int, int]) -> Tensor:
+        if "K" in fields:
+            K = self.numbers(fields["K"], (3, 3), f"{entry}.K")
+            if K[2].tolist() != [0, 0, 1] or K[:2, :2].det().abs() < 1e-9:
+                raise self.fail(
+                    f"{entry}.K", "is not an intrinsic matrix: wanted [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+                )
+            return shift_matrix(self.origin, self.origin) @ K
+        if "focal" not in fields:
+            raise self.fail(entry, "has a pose or a lens but no 'focal' (pixels): add it, or leave only 'size'")
+        focal = self.pair(fields["focal"], f"{entry}.focal")
+        if min(focal) <= 0:
+            raise self.fail(f"{entry}.focal", f"is {min(focal):g}; a focal length is positive, in pixels")
+        K = intrinsics(focal, hw)
+        if fields.get("centre") is not None:
+            K[:2, 2] = self.numbers(fields["centre"], (2,), f"{entry}.centre") - self.origin
+        return K
+
+    def pose(self, entry: str, fields: Mapping[str, Any]) -> Pose:
+        R = self.rotation(f"{entry}.rotation", fields.get("rotation", [0, 0, 0]))
+        if "translation" in fields and "position" in fields:
+            raise self.fail(entry, "has both 'translation' (t) and 'position' (-R^T t): keep one")
+        if "position" in fields:
+            return Pose.from_centre(R, self.numbers(fields["position"], (3,), f"{entry}.position") * self.metre)
+        return Pose(R, self.numbers(fields.get("translation", [0, 0, 0]), (3,), f"{entry}.translation") * self.metre)
+
+    def rotation(self, entry: str, value: Any) -> Tensor:
+        if not (isinstance(value, list) and value and isinstance(value[0], list)):
+            return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
+        R = self.numbers(value, (3, 3), entry)
+        error = float(rotation_error(R))
+        if error > 1e-3:
+            kind = (
+                "a reflection (determinant -1)"
+                if torch.linalg.det(R) < 0
+                else f"not a rotation: R R^T is off by {error:.2g}"
+            )
+            raise self.fail(entry, f"is {kind}; check signs and that rows were copied whole")
+        U, _, Vh = torch.linalg.svd(R)
+        return R if error < 1e-12 else U @ Vh
+
+    def distortion(self, entry: str, value: Any) -> Any:
+        if value is None:
+            return None
+        from ..distortion import Distortion
+
+        self.keys(value, ("model", "coefficients"), entry)
+        with self.naming(entry):
+            return Distortion(
+                str(value.get("model")), self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
+            )
+
+    def sensor(self, entry: str, fields: Mapping[str, Any]) -> Sensor:
+        response = fields.get("response")
+        if isinstance(response, dict):
+            kind = Band if "centre" in response else Curve
+            self.keys(response, tuple(f.name for f in dataclasses.fields(kind)), f"{entry}.response")
+            with self.naming(f"{entry}.response"):
+                response = kind(**{k: tuple(v) if isinstance(v, list) else float(v) for k, v in response.items()})
+        known = {k: fields[k] for k in ("frame_rate", "time_offset", "coding", "bayer") if k in fields}
+        if known.get("coding", "srgb") not in {"srgb", "linear"}:
+            raise self.fail(f"{entry}.coding", f"is '{known['coding']}'; wanted 'srgb' or 'linear'")
+        return Sensor(response=response, **known)
+
+    def link(self, entry: str, fields: Any, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
+        self.keys(fields, ("alpha", "beta", "F", "H"), entry)
+        names = [str(fields.get(key)) for key in ("alpha", "beta")]
+        for key, name in zip(("alpha", "beta"), names):
+            if name not in cameras:
+                raise self.fail(f"{entry}.{key}", f"is '{name}', which is no camera of this rig ({', '.join(cameras)})")
+        F = shift_origin(self.numbers(fields.get("F"), (3, 3), f"{entry}.F"), self.origin)
+        H = None
+        if fields.get("H") is not None:
+            shift = shift_matrix(self.origin, self.origin)
+            H = shift @ self.numbers(fields["H"], (3, 3), f"{entry}.H") @ torch.linalg.inv(shift)
+        return (names[0], names[1]), Link(F, H)
+
+    def keys(self, value: Any, allowed: tuple[str, ...], entry: str | None) -> None:
+        if not isinstance(value, dict):
+            raise self.fail(entry, f"wanted a mapping with keys {', '.join(allowed)}")
+        for key in value:
+            if key not in allowed:
+                near = difflib.get_close_matches(str(key), allowed, 1)
+                hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(allowed)}"
+                raise self.fail(f"{entry}.{key}" if entry else str(key), f"unknown key; {hint}")
+
+    def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str, *, infinite: bool = False) -> Tensor:
+        wanted = "a list of numbers" if shape is None else " x ".join(map(str, shape)) + " numbers"
+        try:
+            tensor = torch.tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise self.fail(entry, f"is {value!r}; wanted {wanted}") from None
+        if shape is not None and tensor.shape != shape:
+            raise self.fail(entry, f"has shape {tuple(tensor.shape)}; wanted {wanted}")
+        if tensor.isnan().any() or (tensor.isinf().any() and not infinite):
+            raise self.fail(entry, "holds NaN or infinite numbers")
+        return tensor
+
+    def pair(self, value: Any, entry: str) -> tuple[float, float]:
+        """Two numbers; a single one counts for both."""
+        a, b = self.numbers(value if isinstance(value, list) else [value, value], (2,), entry).tolist()
+        return a, b
+
+    def whole(self, value: float, entry: str) -> int:
+        if value < 1 or value != math.floor(value):
+            raise self.fail(entry, f"is {value:g}; wanted [width, height] in whole pixels")
+        return int(value)
+
+    def choice(self, value: Any, choices: Mapping[Any, float], entry: str) -> float:
+        if isinstance(value, str | int | float) and value in choices:
+            return choices[value]
+        raise self.fail(entry, f"is {value!r}; wanted one of {', '.join(map(str, choices))}")
+
+    @contextmanager
+    def naming(self, entry: str) -> Iterator[None]:
+        """Says which entry of the file an error is about."""
+        try:
+            yield
+        except (TypeError, ValueError) as error:
+            if isinstance(error, RigFileError):
+                raise
+            raise self.fail(entry, str(error)) from None
+
+
+def _camera_entry(camera: View) -> dict[str, Any]:
+    h, w = camera.hw
+    entry: dict[str, Any] = {"size": [w, h]}
+    if isinstance(camera, Camera):
+        K = camera.K
+        plain = not bool(K[0, 1] or K[1, 0])
+        entry |= {"focal": K.diagonal()[:2].tolist(), "centre": K[:2, 2].tolist()} if plain else {"K": K.tolist()}
+        entry |= {"rotation": camera.R.tolist(), "translation": camera.t.tolist()}
+        if camera.distortion is not None:
+            lens = camera.distortion
+            entry["distortion"] = {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+    return entry | _sensor_entry(camera.sensor)
+
+
+def _sensor_entry(sensor: Sensor) -> dict[str, Any]:
+    default = Sensor()
+    entry = {k: v for k, v in vars(sensor).items() if v != getattr(default, k)}
+    if isinstance(sensor.response, Band | Curve):
+        entry["response"] = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(sensor.response).items()}
+    return entry
+
+
+def _link_entry(alpha: str, beta: str, link: Link) -> dict[str, Any]:
+    H = {} if link.H is None else {"H": link.H.tolist()}
+    return {"alpha": alpha, "beta": beta, "F": link.F.tolist()} | H
+
+
+class _Dumper(yaml.SafeDumper):
+    """Lists of numbers on one line."""
+
+
+def _represent_list(dumper: yaml.SafeDumper, items: list[Any]) -> yaml.Node:
+    flow = all(isinstance(i, int | float | list) for i in items)
+    return dumper.represent_sequence("tag:yaml.org,2002:seq", items, flow_style=flow)
+
+
+_represent: Callable[..., None] = _Dumper.add_representer
+_represent(list, _represent_list)

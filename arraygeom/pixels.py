@@ -1,0 +1,62 @@
+"""Pixel maps: what resizing, cropping, padding and turning a picture do to its coordinates.
+
+Each is a 3x3 matrix A, `x_new ~ A x_old`, on pixels whose first centre is (0, 0). Cameras follow by
+K' = A K, fundamental matrices by F' = A_beta^-T F A_alpha^-1.
+"""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+HW = tuple[int, int]
+
+
+def pixel_grid(
+    hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+) -> Float[Tensor, "h w 2"]:
+    """The centres (x, y) of all pixels of a picture.
+
+    >>> pixel_grid((2, 3))[1, 2].tolist()
+    [2.0, 1.0]
+    """
+    rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in hw)
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
+
+
+def resize_matrix(old: HW, new: HW) -> Float[Tensor, "3 3"]:
+    """c' = (c + 0.5) s - 0.5, with s the ratio of sizes along each axis.
+
+    >>> (resize_matrix((4, 4), (2, 2)) @ torch.tensor([0.5, 0.5, 1.0], dtype=torch.float64)).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    sy, sx = (n / o for n, o in zip(new, old))
+    return _matrix([[sx, 0, 0.5 * sx - 0.5], [0, sy, 0.5 * sy - 0.5], [0, 0, 1]])
+
+
+def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
+    """Cropping away `left` columns and `top` rows; negative numbers pad."""
+    return _matrix([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
+
+
+def turn_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
+    """Turning the picture counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
+
+    >>> (turn_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
+    [0.0, 0.0, 1.0]
+    """
+    A = torch.eye(3, dtype=torch.float64)
+    for _ in range(quarter_turns % 4):
+        A = _matrix([[0, 1, 0], [-1, 0, hw[1] - 1], [0, 0, 1]]) @ A
+        hw = hw[1], hw[0]
+    return A
+
+
+def to_homogeneous(x: Float[Tensor, "*n d"]) -> Float[Tensor, "*n d+1"]:
+    """Appends a coordinate of 1."""
+    return torch.nn.functional.pad(x, (0, 1), value=1.0)
+
+
+def _matrix(rows: list[list[float]]) -> Tensor:
+    return torch.tensor(rows, dtype=torch.float64)

@@ -1,0 +1,86 @@
+"""Rigid transforms: X_to = R X_from + t."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A rigid transform named `to_from_from`, for instance `cam_from_world`: X_cam = R X_world + t.
+
+    Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`. Metres.
+    """
+
+    R: Float[Tensor, "*b 3 3"]
+    t: Float[Tensor, "*b 3"]
+
+    @classmethod
+    def identity(cls, *, dtype: torch.dtype = torch.float64, device: torch.device | None = None) -> Pose:
+        """The transform that changes nothing."""
+        return cls(torch.eye(3, dtype=dtype, device=device), torch.zeros(3, dtype=dtype, device=device))
+
+    @classmethod
+    def from_centre(cls, R: Float[Tensor, "*b 3 3"], centre: Float[Tensor, "*b 3"]) -> Pose:
+        """`cam_from_world` of a camera with rotation R whose optical centre is at `centre` in the world."""
+        return cls(R, -matvec(R, centre))
+
+    def __matmul__(self, other: Pose) -> Pose:
+        return Pose(self.R @ other.R, matvec(self.R, other.t) + self.t)
+
+    def inverse(self) -> Pose:
+        """`from_to_to`: the transform the other way."""
+        Rt = self.R.transpose(-1, -2)
+        return Pose(Rt, -matvec(Rt, self.t))
+
+    def apply(self, X: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points (*n, 3) to R X + t. With batched poses (*b), points are (*b, n, 3)."""
+        return X @ self.R.transpose(-1, -2) + (self.t if self.t.ndim == 1 else self.t[..., None, :])
+
+    @property
+    def centre(self) -> Float[Tensor, "*b 3"]:
+        """Where the origin of `to` is in `from`: a camera's optical centre in the world."""
+        return self.inverse().t
+
+    def perturbed(
+        self, rotation: Float[Tensor, "*b 3"] | None = None, translation: Float[Tensor, "*b 3"] | None = None
+    ) -> Pose:
+        """exp(rotation) R and t + translation: a step on the manifold that never leaves SO(3).
+
+        `rotation` is a rotation vector in radians, about the axes of `to`.
+        """
+        R = self.R if rotation is None else rotation_from_vector(rotation) @ self.R
+        return Pose(R, self.t if translation is None else self.t + translation)
+
+    def to(self, *args: Any, **kwargs: Any) -> Pose:
+        """Like `Tensor.to`."""
+        return Pose(self.R.to(*args, **kwargs), self.t.to(*args, **kwargs))
+
+
+def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
+    """The matrix times the vector."""
+    return (M @ v[..., None])[..., 0]
+
+
+def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrix of a rotation vector (axis times angle, radians): exp of its skew matrix.
+
+    Exact to rounding in float32 too, and differentiable any number of times, at angle zero as elsewhere.
+
+    >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6)[0, 1].item()
+    -1.0
+    """
+    return torch.linalg.matrix_exp(vector_to_skew_symmetric_matrix(w))
+
+
+def rotation_error(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
+    """How far R is from a rotation: the largest entry of |R R^T - I|, or 2 for a reflection."""
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    error = (R @ R.transpose(-1, -2) - eye).abs().amax((-1, -2))
+    return torch.where(torch.linalg.det(R) > 0, error, error.clamp(min=2.0))

@@ -1,0 +1,295 @@
+"""Rig: named cameras of different kinds, and the depths of what they look at."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import fnmatch
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .camera import Camera, View
+from .epipolar import fundamental_matrix
+from .homography import plane_homography
+from .pixels import HW, resize_matrix, shift_matrix, turn_matrix
+from .pose import Pose
+
+Depths = tuple[Float[Tensor, ""], Float[Tensor, ""]]
+
+
+@dataclass(frozen=True)
+class Link:
+    """What is known of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha."""
+
+    F: Float[Tensor, "*b 3 3"]
+    H: Float[Tensor, "*b 3 3"] | None = None
+
+    def reversed(self) -> Link:
+        """The same link with alpha and beta exchanged."""
+        return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
+
+    def mapped(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
+        """The link between pictures whose pixels are A x of the old ones."""
+        A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
+        back = torch.linalg.inv(A_alpha)
+        F = torch.linalg.inv(A_beta).T @ self.F @ back
+        return Link(F, None if self.H is None else A_beta @ self.H @ back)
+
+    def to(self, *args: Any, **kwargs: Any) -> Link:
+        """Like `Tensor.to`."""
+        return Link(self.F.to(*args, **kwargs), None if self.H is None else self.H.to(*args, **kwargs))
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Alpha and one beta, and all that relates them: two calibrated cameras, or a link, or only sizes."""
+
+    alpha: View
+    beta: View
+    depth: Depths | None = None
+    link: Link | None = None
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether both cameras are calibrated."""
+        return isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)
+
+    @property
+    def cameras(self) -> tuple[Camera, Camera]:
+        """Both cameras. Raises ValueError unless the pair is calibrated."""
+        if not (isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)):
+            raise ValueError(
+                "this field needs calibrated cameras and the pair has none: "
+                "use one that needs only F or sizes, such as HomographyDisplacement or Rectified"
+            )
+        return self.alpha, self.beta
+
+    @property
+    def beta_from_alpha(self) -> Pose:
+        """X_beta = R X_alpha + t."""
+        alpha, beta = self.cameras
+        return beta.cam_from_world @ alpha.cam_from_world.inverse()
+
+    @property
+    def depth_range(self) -> Depths:
+        """(near, far) in metres. Raises ValueError if the rig states none."""
+        if self.depth is None:
+            raise ValueError("this field needs a depth range: give the rig one, `rig.replace(depth=(near, far))`")
+        return self.depth
+
+    @property
+    def fundamental(self) -> Float[Tensor, "*b 3 3"]:
+        """F with x_beta^T F x_alpha = 0, from the cameras or as given. Raises ValueError if neither is known."""
+        if self.link is not None:
+            return self.link.F
+        if not self.calibrated:
+            raise ValueError("neither the cameras' calibration nor F is known for this pair: give the rig a link")
+        alpha, beta = self.cameras
+        return fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
+
+    @property
+    def homography(self) -> Float[Tensor, "*b 3 3"]:
+        """H with x_beta ~ H x_alpha, roughly: as given; or of the plane at the middle inverse depth.
+
+        A pair that is known only by sizes, or by F alone, is taken to see the same field of view.
+        """
+        if self.link is not None and self.link.H is not None:
+            return self.link.H
+        if self.calibrated and self.depth is not None:
+            return self.homography_at(middle_depth(*self.depth))
+        if self.calibrated:
+            return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
+        return resize_matrix(self.alpha.hw, self.beta.hw)
+
+    def homography_at(self, depth: Float[Tensor, ""]) -> Float[Tensor, "*b 3 3"]:
+        """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
+        alpha, beta = self.cameras
+        normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
+        pose = self.beta_from_alpha
+        return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
+
+    def to(self, *args: Any, **kwargs: Any) -> Pair:
+        """Like `Tensor.to`."""
+        depth = None if self.depth is None else tuple(d.to(*args, **kwargs) for d in self.depth)
+        link = None if self.link is None else self.link.to(*args, **kwargs)
+        return Pair(self.alpha.to(*args, **kwargs), self.beta.to(*args, **kwargs), depth, link)  # type: ignore[arg-type]
+
+
+def middle_depth(near: Float[Tensor, ""], far: Float[Tensor, ""]) -> Float[Tensor, ""]:
+    """The depth whose inverse is midway between those of near and far: the middle of a disparity range."""
+    return 2 / (1 / near + 1 / far)
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Ordered, named cameras of different sizes, lenses and spectral responses.
+
+    `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf.
+    `links` relate cameras that are not calibrated, by (alpha, beta). A rig never changes: methods return new ones.
+    """
+
+    cameras: Mapping[str, View]
+    depth: Depths | None = None
+    links: Mapping[tuple[str, str], Link] = field(default_factory=dict)
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        if self.depth is not None:
+            object.__setattr__(self, "depth", depth_range(*self.depth))
+
+    def __getitem__(self, name: str) -> View:
+        return self.cameras[self.known(name)]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The cameras' names in order."""
+        return tuple(self.cameras)
+
+    def known(self, name: str) -> str:
+        """The name itself. Raises ValueError if the rig has no such camera."""
+        if name not in self.cameras:
+            near = difflib.get_close_matches(name, self.names, 1)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise ValueError(f"the rig has no camera '{name}'{hint} (it has: {', '.join(self.names)})")
+        return name
+
+    def betas(self, alpha: str) -> tuple[str, ...]:
+        """All names but alpha's."""
+        return tuple(n for n in self.names if n != self.known(alpha))
+
+    def pair(self, alpha: str, beta: str) -> Pair:
+        """What relates two cameras of the rig, in the order given."""
+        link = self.links.get((alpha, beta))
+        if link is None and (beta, alpha) in self.links:
+            link = self.links[beta, alpha].reversed()
+        return Pair(self[alpha], self[beta], self.depth, link)
+
+    def replace(self, **changes: Any) -> Rig:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
+
+    def with_camera(self, name: str, camera: View) -> Rig:
+        """A copy with one camera set, replacing that of the same name if there is one."""
+        return self.replace(cameras={**self.cameras, name: camera})
+
+    def resize(self, name: str, hw: HW) -> Rig:
+        """The rig whose camera `name` records pictures of another size."""
+        return self.mapped(name, resize_matrix(self[name].hw, hw), hw)
+
+    def crop(self, name: str, top: int, left: int, hw: HW) -> Rig:
+        """The rig whose camera `name` keeps a window of its picture; see `Camera.crop`."""
+        return self.mapped(name, shift_matrix(left, top), hw)
+
+    def turn(self, name: str, quarter_turns: int) -> Rig:
+        """The rig whose camera `name` has its picture turned; see `Camera.turn`."""
+        hw = self[name].hw
+        return self.mapped(name, turn_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0]))
+
+    def mapped(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
+        """The rig in which the pixels of camera `name` are x' ~ A x and its picture's size is `hw`."""
+        eye = torch.eye(3, dtype=torch.float64)
+        links = {
+            (a, b): link.mapped(A if a == name else eye, A if b == name else eye) if name in (a, b) else link
+            for (a, b), link in self.links.items()
+        }
+        return self.with_camera(name, self[name].mapped(A, hw)).replace(links=links)
+
+    def parameters(self, *, free: Iterable[str]) -> dict[str, Tensor]:
+        """Changes an optimiser may make, all zero and requiring grad; `perturbed` applies them.
+
+        `free` holds patterns over "camera.rotation" (rotation vector, radians), "camera.translation" (metres),
+        "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion", "depth.near"
+        and "depth.far" (metres), for instance ["colour.*", "depth.near"].
+        Raises ValueError for a pattern that matches nothing.
+        """
+        known = self._parameter_shapes()
+        chosen: dict[str, Tensor] = {}
+        for pattern in free:
+            names = fnmatch.filter(known, pattern)
+            if not names:
+                raise ValueError(f"no rig parameter matches '{pattern}' (there are: {', '.join(known)})")
+            chosen |= {n: torch.zeros_like(known[n]).requires_grad_() for n in names}
+        return chosen
+
+    def perturbed(self, changes: Mapping[str, Tensor]) -> Rig:
+        """The rig after changes named as in `parameters`. What is not named stays bit-identical.
+
+        Rotations step on the manifold, exp(change) R, so that they remain rotations.
+        """
+        unknown = set(changes) - set(self._parameter_shapes())
+        if unknown:
+            raise ValueError(f"no such rig parameter: {', '.join(sorted(unknown))}")
+        cameras = {name: _perturbed_camera(name, camera, changes) for name, camera in self.cameras.items()}
+        depth = self.depth
+        if depth is not None:
+            near, far = depth
+            depth = near + changes.get("depth.near", 0), far + changes.get("depth.far", 0)
+        return self.replace(cameras=cameras, depth=depth)
+
+    def to(self, *args: Any, **kwargs: Any) -> Rig:
+        """Like `Tensor.to`, for every tensor of the rig."""
+        return self.replace(
+            cameras={n: c.to(*args, **kwargs) for n, c in self.cameras.items()},
+            depth=None if self.depth is None else tuple(d.to(*args, **kwargs) for d in self.depth),
+            links={k: v.to(*args, **kwargs) for k, v in self.links.items()},
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Rig:
+        """Read a rig file of any format that `arraygeom.io` knows. Raises `arraygeom.io.RigFileError`."""
+        from .io import read_rig
+
+        return read_rig(path)
+
+    def save(self, path: str | Path) -> None:
+        """Write the native rig file; it appears whole or not at all."""
+        from .io import write_rig
+
+        write_rig(self, path)
+
+    def _parameter_shapes(self) -> dict[str, Tensor]:
+        """One tensor of the right shape, type and device for each parameter."""
+        known: dict[str, Tensor] = {}
+        for name, camera in self.cameras.items():
+            if not isinstance(camera, Camera):
+                continue
+            known |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
+            known |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
+            if camera.distortion is not None:
+                known[f"{name}.distortion"] = camera.distortion.coefficients
+        if self.depth is not None:
+            known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
+        return known
+
+
+def depth_range(near: Any, far: Any) -> Depths:
+    """(near, far) as float64 scalars. Raises ValueError unless 0 < near <= far."""
+    bounds = [d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)]
+    near, far = bounds
+    if not (near > 0 and far >= near):
+        raise ValueError(
+            f"depth bounds must satisfy 0 < near <= far, in metres; got near = {float(near):g}, far = {float(far):g}"
+        )
+    return near, far
+
+
+def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) -> View:
+    mine = {k.removeprefix(f"{name}."): v for k, v in changes.items() if k.startswith(f"{name}.")}
+    if not mine or not isinstance(camera, Camera):
+        return camera
+    pose, K, lens = camera.cam_from_world, camera.K, camera.distortion
+    if mine.keys() & {"rotation", "translation"}:
+        pose = pose.perturbed(mine.get("rotation"), mine.get("translation"))
+    if "focal" in mine:
+        K = K + torch.diag_embed(torch.nn.functional.pad(mine["focal"], (0, 1)))
+    if "centre" in mine:
+        K = K + torch.nn.functional.pad(mine["centre"][..., None], (2, 0, 0, 1))
+    if "distortion" in mine and lens is not None:
+        lens = dataclasses.replace(lens, coefficients=lens.coefficients + mine["distortion"])
+    return camera.replace(K=K, cam_from_world=pose, distortion=lens)

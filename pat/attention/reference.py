@@ -1,0 +1,171 @@
+"""C3 attention as a formula: plain torch, any device, differentiable twice. Slow, and what the fast ones obey.
+
+For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that count,
+
+    score_l  = q . K(x_l) + bias_l
+    weight_l = exp(score_l) / sum_m exp(score_m)
+    output   = sum_l weight_l V(x_l)
+
+(the physics-aware transformer, eq. 3 to 5: no scale, no position code). Shapes are written on the lines with
+b pictures, d channels, r rows of w alpha pixels, l samples. Alpha is worked off in bands of rows, so that
+without gradients no more than `BAND_BYTES` of gathered keys and values exist at a time.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from arraygeom.segments import sample_fractions
+
+BAND_BYTES = 2**27
+EDGE_SLACK = 1e-3
+"""Samples this far (pixels) off the picture's area still count: rounding puts clipped ends there."""
+LEAST_SPREAD = 1e-4
+"""A spread (pixels) below this reads 0: it is rounding, and its derivative noise."""
+
+
+class Look(NamedTuple):
+    """Where to look, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the batch.
+
+    `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples` samples.
+    """
+
+    points: Tensor
+    mask: Tensor
+    samples: int
+    straight: bool
+
+    def rows(self, top: int, bottom: int) -> Look:
+        return self._replace(points=self.points[:, top:bottom], mask=self.mask[:, top:bottom])
+
+    def positions(self) -> Tensor:
+        """All samples, (p, r, w, l, 2)."""
+        if not self.straight:
+            return self.points
+        start, end = self.points.unbind(-2)  # p r w 2
+        u = sample_fractions(self.samples, like=start)
+        return start[..., None, :] + u[:, None] * (end - start)[..., None, :]
+
+
+class Attended(NamedTuple):
+    """What C3 attention says about each alpha pixel. Where no sample counts, everything is 0.
+
+    value: (B, Dv, Ha, Wa), the values seen, weighted.
+    position: (B, 2, Ha, Wa), the expected (x, y) of the match, in beta's pixels.
+    spread: (B, Ha, Wa), root of the expected squared distance of the samples from `position`, in pixels.
+    peak: (B, Ha, Wa), the largest weight.
+    """
+
+    value: Tensor
+    position: Tensor
+    spread: Tensor
+    peak: Tensor
+
+
+def attend(
+    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
+) -> Attended:
+    """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
+    accumulate = torch.float64 if query.dtype == torch.float64 else torch.float32
+    with torch.autocast(query.device.type, enabled=False):
+        key, value = (pixels(picture.to(accumulate)) for picture in (key, value))
+        bands = [
+            _band(
+                query[:, :, top:bottom].to(accumulate).permute(0, 2, 3, 1),
+                key,
+                value,
+                look.rows(top, bottom),
+                None if bias is None else bias[:, top:bottom].to(accumulate),
+                nearest,
+            )
+            for top, bottom in _bands(query, key, value, look.samples)
+        ]
+        out = Attended(*(torch.cat(part, 1) for part in zip(*bands)))
+    image = out.value.to(query.dtype).permute(0, 3, 1, 2)
+    return Attended(image, out.position.permute(0, 3, 1, 2), out.spread, out.peak)
+
+
+def _bands(query: Tensor, key: Tensor, value: Tensor, samples: int) -> list[tuple[int, int]]:
+    b, _, ha, wa = query.shape
+    row_bytes = 2 * b * wa * samples * (key.shape[-1] + value.shape[-1]) * key.element_size()
+    rows = max(1, BAND_BYTES // max(1, row_bytes))
+    return [(top, min(top + rows, ha)) for top in range(0, ha, rows)]
+
+
+def pixels(picture: Tensor) -> Tensor:
+    """Channels last: (b, d, h, w) to (b, h, w, d)."""
+    return picture.permute(0, 2, 3, 1).contiguous()
+
+
+def _band(q: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
+    b, r, w, _ = q.shape
+    xy = look.positions().to(q.dtype)  # p r w l 2
+    counts = look.mask & on_picture(xy, hw=key.shape[1:3])  # p r w l
+    xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, look.samples, 2)
+    at = _nearest if nearest else _bilinear
+
+    score = torch.einsum("brwd,brwld->brwl", q, at(key, xy))
+    if bias is not None:
+        score = score + bias
+    weight = _softmax(score, counts)
+    out = torch.einsum("brwl,brwld->brwd", weight, at(value, xy))
+    return Attended(out, *_statistics(weight, xy))
+
+
+def on_picture(xy: Tensor, *, hw: tuple[int, int] | torch.Size) -> Tensor:
+    """Whether (..., 2) points lie on the picture's area, which reaches half a pixel beyond the border's centres."""
+    last = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]) + EDGE_SLACK
+    return ((xy >= -0.5 - EDGE_SLACK) & (xy <= last)).all(-1)
+
+
+def _nearest(picture: Tensor, xy: Tensor) -> Tensor:
+    """(b, h, w, d) at (b, ..., 2): (b, ..., d), of the pixel on whose area the position lies."""
+    x, y = (xy.detach() + 0.5).floor().long().unbind(-1)
+    h, w = picture.shape[1:3]
+    return _pick(picture, x.clamp(0, w - 1), y.clamp(0, h - 1))
+
+
+def _bilinear(picture: Tensor, xy: Tensor) -> Tensor:
+    """(b, h, w, d) at (b, ..., 2): (b, ..., d); beyond the border's centres the border's value."""
+    h, w = picture.shape[1:3]
+    x0, x1, u = _cell(xy[..., 0], w)
+    y0, y1, v = _cell(xy[..., 1], h)
+    upper = (1 - u) * _pick(picture, x0, y0) + u * _pick(picture, x1, y0)
+    lower = (1 - u) * _pick(picture, x0, y1) + u * _pick(picture, x1, y1)
+    return (1 - v) * upper + v * lower
+
+
+def _cell(c: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The two pixels around a coordinate on an axis of n pixels, and the fraction (..., 1) of the way between."""
+    c = c.clamp(0, n - 1)
+    lower = c.detach().floor().clamp(max=max(n - 2, 0))
+    index = lower.long()
+    return index, (index + 1).clamp(max=n - 1), (c - lower)[..., None]
+
+
+def _pick(picture: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    """The channels at integer pixels: (b, h, w, d) at (b, ...) gives (b, ..., d)."""
+    b, h, w, d = picture.shape
+    first = (torch.arange(b, device=x.device) * (h * w)).view(b, *[1] * (x.dim() - 1))
+    return picture.reshape(b * h * w, d)[first + y * w + x]
+
+
+def _softmax(score: Tensor, counts: Tensor) -> Tensor:
+    """Over the last axis, of what counts; all zeros where nothing does, with zero gradients."""
+    top = torch.where(counts, score.detach(), -torch.inf).amax(-1, keepdim=True)
+    top = torch.where(top.isfinite(), top, 0)
+    e = torch.where(counts, torch.where(counts, score - top, 0).exp(), 0)
+    total = e.sum(-1, keepdim=True)
+    return e / torch.where(total > 0, total, 1)
+
+
+def _statistics(weight: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Position (b, r, w, 2), spread (b, r, w) and peak (b, r, w) of weights (b, r, w, l)."""
+    position = torch.einsum("brwl,brwlc->brwc", weight, xy)
+    squared = (weight * (xy - position[..., None, :]).square().sum(-1)).sum(-1)
+    positive = squared > LEAST_SPREAD**2
+    spread = torch.where(positive, torch.where(positive, squared, 1).sqrt(), 0)
+    return position, spread, weight.max(-1).values
