@@ -200,9 +200,7 @@ def _oversampling(alpha: View, view: View) -> int:
     return min(max(round(ratio), 1), _MAX_OVERSAMPLING)
 
 
-def draw_layers(
-    rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shapes: int, generator: Generator
-) -> Layers:
+def draw_layers(rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shapes: int, generator: Generator) -> Layers:
     """Random layers in front of the first view of the rigs, between the rigs' near and far depths.
 
     Layer 0 is the background. In half of the scenes layer 1 is a ground (or a ceiling), in a quarter layer 2 is a
