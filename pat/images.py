@@ -103,7 +103,7 @@ def _decode(path: Path, label: str) -> NDArray:
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such picture: check the path")
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    coded = _decode_bytes(content) if content.size else None
+    coded = _decode_bytes(content)
     if coded is None:
         raise ValueError(f"{label}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
     return coded
