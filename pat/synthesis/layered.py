@@ -94,20 +94,19 @@ class LayeredScenes:
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.views[0], v) for v in rigs.views]
-        images = [self._image(layers, v, f) for v, f in zip(rigs.views, factors)]
-        depth = [self._depth(layers, v) for v in rigs.views]
+        images, depth = zip(*(self._seen(layers, v, f) for v, f in zip(rigs.views, factors)))
         bounds = torch.stack(depth[0].flatten(1).aminmax(dim=1), -1)
         K, R, t = ([getattr(v, k).float().to(self.device) for v in rigs.views] for k in "KRt")
-        return ArrayBatch(images, depth, K, R, t, [v.hw for v in rigs.views], bounds)
+        return ArrayBatch(list(images), list(depth), K, R, t, [v.hw for v in rigs.views], bounds)
 
-    def _image(self, layers: Layers, view: View, factor: int) -> Tensor:
-        fine = view.resized((view.hw[0] * factor, view.hw[1] * factor))
-        return avg_pool2d(self._shade(layers, fine), factor) if factor > 1 else self._shade(layers, fine)
-
-    def _depth(self, layers: Layers, view: View) -> Tensor:
-        """Depth of the surface that covers most of each pixel."""
+    def _seen(self, layers: Layers, view: View, factor: int) -> tuple[Tensor, Tensor]:
+        """Picture, and depth at the pixels' centres of the surface that covers most of each pixel."""
         front = self._front(layers, view)
-        return (1 / front.inverse_depth).view(-1, *view.hw)
+        depth = (1 / front.inverse_depth).view(-1, *view.hw)
+        if factor == 1:
+            return self._shade(layers, view, front), depth
+        fine = view.resized((view.hw[0] * factor, view.hw[1] * factor))
+        return avg_pool2d(self._shade(layers, fine, self._front(layers, fine)), factor), depth
 
     def _front(self, layers: Layers, view: View) -> _Front:
         homogeneous, opacity = self._cover(layers, view)
@@ -122,20 +121,19 @@ class LayeredScenes:
         """Inverse depth and opacity (B, L, N) of every layer at every pixel."""
         B, L = layers.present.shape
         H = layers.outline_from_plane @ plane_from_view(layers, view)
-        x, y, q = (H.float().to(self.device) @ self._pixels(view.hw)).unbind(2)
+        homogeneous = self._pixels(view.hw) @ H.float().to(self.device).mT
+        q = homogeneous[..., 2].contiguous()
         in_front = (q > 1e-6) & layers.present.to(self.device)[..., None]
-        q = torch.where(in_front, q, 1.0)
-        position = torch.stack([x / q, y / q], -1).clamp_(-1, 1).view(B * L, *view.hw, 2)
+        q.masked_fill_(~in_front, 1.0)
+        position = (homogeneous[..., :2] / q[..., None]).clamp_(-1, 1).view(B * L, *view.hw, 2)
         shapes = self.outlines[layers.outline.flatten().to(self.device)]
         distance = grid_sample(shapes, position, padding_mode="border", align_corners=False).view(B, L, -1)
-        pixel = (torch.linalg.det(H).abs().float().to(self.device)[..., None] / q**3).sqrt()
-        opacity = (distance / pixel + 0.5).clamp_(0, 1)
+        opacity = (distance / _steps(distance.view(B, L, *view.hw)).flatten(2) + 0.5).clamp_(0, 1)
         opacity = torch.where(layers.solid.to(self.device)[..., None], 1.0, opacity)
         return q, opacity * in_front
 
-    def _shade(self, layers: Layers, view: View) -> Tensor:
+    def _shade(self, layers: Layers, view: View, front: _Front) -> Tensor:
         """The picture (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the first."""
-        front = self._front(layers, view)
         H = (layers.texel_from_plane @ plane_from_view(layers, view)).float().to(self.device)
         colour = self._colours(layers, H, view.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool))
         edge = front.opacity < 1 - _FAINT
@@ -169,7 +167,7 @@ class LayeredScenes:
 
     def _pixels(self, hw: HW) -> Tensor:
         y, x = torch.meshgrid(*(torch.arange(n, device=self.device).float() for n in hw), indexing="ij")
-        return torch.stack([x, y, torch.ones_like(x)]).flatten(1)
+        return torch.stack([x, y, torch.ones_like(x)], -1).flatten(0, 1)
 
 
 _CHUNK = 1 << 16
@@ -193,6 +191,14 @@ def plane_from_view(layers: Layers, view: View) -> Float[Tensor, "b l 3 3"]:
     square = torch.eye(3, dtype=R.dtype)
     H = plane_homography(square, view.K[:, None], R_view, t_view, normal=square[2], d=-torch.ones((), dtype=R.dtype))
     return torch.linalg.inv(H)
+
+
+def _steps(distance: Tensor) -> Tensor:
+    """How much a distance changes from a pixel to the next, so that edges get one pixel wide from any angle."""
+    x = torch.nn.functional.pad(distance.diff(dim=-1).abs(), (1, 1))
+    y = torch.nn.functional.pad(distance.diff(dim=-2).abs(), (0, 0, 1, 1))
+    x, y = torch.maximum(x[..., 1:], x[..., :-1]), torch.maximum(y[..., 1:, :], y[..., :-1, :])
+    return x.square_().addcmul_(y, y).sqrt_().clamp_(min=1e-6)
 
 
 def _oversampling(alpha: View, view: View) -> int:
@@ -222,6 +228,8 @@ def draw_layers(rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shape
     present = (torch.arange(L) < number) & (facing.abs() > 0.04)
     solid = ground | wall
     solid[:, 0] = True
+    pixels = torch.where(solid, 1.3 * alpha.hw[1], alpha.hw[0] * log_uniform((0.2, 2.5), (B, L), g))
+    q = _not_nearer(rigs, q, normal, ray, pixels / 2)
     anchor = ray / q[..., None]
     R, t = _painters(normal, anchor)
     metres_per_pixel = 1 / (q * alpha.K[:, :1, 0])
@@ -230,7 +238,7 @@ def draw_layers(rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shape
         present,
         solid,
         torch.randint(shapes, (B, L), generator=g),
-        _outline_from_plane(R, metres_per_pixel, alpha.hw, g),
+        _outline_from_plane(R, metres_per_pixel * pixels / 2, g),
         *_texture(R, metres_per_pixel, facing.abs(), photos, g),
         _paint(B, L, g),
     )
@@ -251,10 +259,10 @@ def _rays(view: View, pixel: Tensor) -> Tensor:
 
 
 def _anchors(alpha: View, L: int, g: Generator) -> Tensor:
-    """Rays through the layers' middles, up to a quarter of the picture outside it."""
+    """Rays through the layers' middles, up to 15 % of the picture outside it."""
     h, w = alpha.hw
     size = torch.tensor([w, h], dtype=torch.float64)
-    return _rays(alpha, uniform((-0.25, 1.25), (len(alpha.K), L, 2), g) * size)
+    return _rays(alpha, uniform((-0.15, 1.15), (len(alpha.K), L, 2), g) * size)
 
 
 def _ground_anchor(alpha: View) -> Tensor:
@@ -289,6 +297,17 @@ def _inverse_depths(rigs: RigBatch, L: int, g: Generator) -> Tensor:
     return q
 
 
+def _not_nearer(rigs: RigBatch, q: Tensor, normal: Tensor, ray: Tensor, radius: Tensor) -> Tensor:
+    """Inverse depths at the anchors, lowered where the slant would bring the plane nearer than `near`.
+
+    The inverse depth of a plane grows by q |normal_xy| / (normal . ray) over one focal length of the picture;
+    `radius` is how far the layer reaches, in alpha's pixels.
+    """
+    slope = normal[..., :2].norm(dim=-1) / (normal * ray).sum(-1).clamp(min=1e-3)
+    grown = 1 + slope * radius / rigs.views[0].K[:, :1, 0]
+    return torch.minimum(q, 1 / (rigs.near[:, None] * grown))
+
+
 def _roles(B: int, L: int, g: Generator) -> tuple[Tensor, Tensor]:
     """Which layer is the ground and which a wall."""
     ground, wall = torch.zeros(2, B, L, dtype=torch.bool)
@@ -317,17 +336,14 @@ def _affine(angle: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
     return rotation(axis) * torch.stack([sx, sy, torch.ones_like(sx)], -1)[..., None, :]
 
 
-def _outline_from_plane(R: Tensor, metres_per_pixel: Tensor, hw: HW, g: Generator) -> Tensor:
-    """Outlines of 0.15 to 1.6 times the picture's height across, upright but for some."""
-    shape = metres_per_pixel.shape
-    pixels = hw[0] * log_uniform((0.15, 1.6), shape, g) / 2
-    s = 1 / (pixels * metres_per_pixel)
-    aspect = log_uniform((0.6, 1.7), shape, g)
-    return _affine(_upright(R) + 0.3 * _randn(shape, g), s * aspect, s / aspect)
+def _outline_from_plane(R: Tensor, radius: Tensor, g: Generator) -> Tensor:
+    """Outlines of about this radius in metres, upright but for some."""
+    aspect = log_uniform((0.7, 1.4), radius.shape, g)
+    return _affine(_upright(R) + 0.3 * _randn(radius.shape, g), aspect / radius, 1 / (aspect * radius))
 
 
 def _texture(R: Tensor, metres_per_pixel: Tensor, facing: Tensor, photos: PhotoBank, g: Generator):
-    """Which texture, and texels from metres: 0.4 to 2 texels a pixel of alpha at the anchor.
+    """Which texture, and texels from metres: 0.5 to 3 texels a pixel of alpha at the anchor.
 
     Along the slant textures are stretched as much as the view compresses them, so that they stay sharp.
     """
@@ -335,7 +351,7 @@ def _texture(R: Tensor, metres_per_pixel: Tensor, facing: Tensor, photos: PhotoB
     photo = torch.randint(photos.photos, shape, generator=g)
     other = torch.randint(len(photos), shape, generator=g)
     texture = torch.where(torch.rand(shape, generator=g) < 0.5, photo, other)
-    s = log_uniform((0.4, 2.0), shape, g) / metres_per_pixel
+    s = log_uniform((0.5, 3.0), shape, g) / metres_per_pixel
     turn = torch.where(torch.rand(shape, generator=g) < 0.8, 0.1, 3.0) * _randn(shape, g)
     A = _affine(_upright(R) + turn, s * (torch.randint(2, shape, generator=g) * 2 - 1), s * facing.clamp(min=0.1))
     A[..., :2, 2] = uniform((0, 1), (*shape, 2), g) * photos.wh.cpu()[texture, 0]
@@ -356,8 +372,8 @@ def _paint(B: int, L: int, g: Generator) -> Tensor:
     plain = torch.rand(B, L, generator=g) < 0.125
     hue = torch.where(natural, 0.1 * _randn((B, L), g), uniform((-math.pi, math.pi), (B, L), g))
     contrast = torch.where(plain, uniform((0, 0.15), (B, L), g), uniform((0.7, 1.2), (B, L), g))
-    saturation = contrast * uniform((0.4, 1.5), (B, L), g)
-    tint = torch.where(natural & ~plain, 0.02, 0.1)[..., None] * _randn((B, L, 2), g)
+    saturation = contrast * uniform((0.3, 1.25), (B, L), g)
+    tint = torch.where(natural & ~plain, 0.02, 0.07)[..., None] * _randn((B, L, 2), g)
     middle = torch.where(plain, uniform((0.1, 0.9), (B, L), g), uniform((0.35, 0.65), (B, L), g))
     ycc = torch.zeros(B, L, 3, 4, dtype=torch.float64)
     ycc[..., 0, 0], ycc[..., 0, 3] = contrast, middle - 0.5 * contrast

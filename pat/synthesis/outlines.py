@@ -10,6 +10,7 @@ from torch import Tensor
 
 _FINE = 384
 SIDE = 96
+_BORDER = 2 * _FINE // SIDE
 
 
 def outlines(count: int, seed: int) -> Float[Tensor, "count 1 side side"]:
@@ -19,14 +20,14 @@ def outlines(count: int, seed: int) -> Float[Tensor, "count 1 side side"]:
     """
     rng = np.random.default_rng(seed)
     makers = (_blob, _polygon, _cloud, _rods, _fence, _branches, _box)
-    shares = np.array([4, 3, 2, 1.2, 0.8, 1.2, 2.5])
+    shares = np.array([4, 3, 1.5, 1, 0.6, 1, 4])
     chosen = rng.choice(len(makers), size=count, p=shares / shares.sum())
     return torch.from_numpy(np.stack([_distance(_holed(makers[i](rng), rng)) for i in chosen])[:, None])
 
 
 def _distance(mask: np.ndarray) -> np.ndarray:
-    mask[[0, 1, -2, -1]] = 0
-    mask[:, [0, 1, -2, -1]] = 0
+    mask[:_BORDER] = mask[-_BORDER:] = 0
+    mask[:, :_BORDER] = mask[:, -_BORDER:] = 0
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, 5)
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, 5)
     signed = np.where(mask > 0, inside - 0.5, 0.5 - outside).astype(np.float32) * (2 / _FINE)
