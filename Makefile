@@ -50,11 +50,13 @@ bench: $(READY)
 train: $(READY)
 	@$(BIN)/pat train $(ARGS)
 
-# torch goes first, alone and by its exact version, so that nothing else chooses a build of it.
+# An environment that works is kept and brought up to date; one that does not is made anew. torch goes first, alone
+# and by its exact version, so that nothing else chooses a build of it.
 $(READY): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, $(PYTHON) is " + sys.version.split()[0])'
 	@echo "== making the environment in $(VENV) (once; some minutes)"
-	@$(PYTHON) -m venv $(VENV) || { echo "$(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) \
+		|| { echo "$(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
 	@echo "== installing torch, the largest part"
 	@$(PIP) torch
 	@echo "== installing the rest"
