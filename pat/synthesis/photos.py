@@ -68,7 +68,7 @@ class PhotoBank:
         return moved
 
     def lookup(
-        self, texture: Int[Tensor, "n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, "n"]
+        self, texture: Int[Tensor, " n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, " n"]
     ) -> Float[Tensor, "3 n"]:
         """Colours 0..1 at pixels (x, y) of the textures (first centre (0, 0)), trilinear in position and level.
 
