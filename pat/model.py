@@ -102,7 +102,7 @@ class PAT(nn.Module):
     multiple = 1
     equal_pitch = False
 
-    def __init__(self, config: PATConfig = PATConfig()) -> None:  # noqa: B008
+    def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
         self.config = config
         c, d = config, config.dim

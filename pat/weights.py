@@ -9,7 +9,6 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
-from torch import nn
 
 from .guided import GuidedPAT, GuidedPATConfig
 from .images import write_atomically
