@@ -147,7 +147,12 @@ def scenes(config: TrainConfig) -> tuple[Callable[[int], Iterator[Sample]], Call
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
     """Photographs to learn from, and every `held_out`-th for validation."""
-    raise NotImplementedError
+    n = config.held_out
+
+    def bank(choose: Callable[[int], bool]) -> PhotoBank:
+        return PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed, choose=choose)
+
+    return bank(lambda i: i % n != 0), bank(lambda i: i % n == 0)
 
 
 def degraded(scene: ArrayBatch, g: Generator) -> Sample:
