@@ -41,7 +41,7 @@ def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor
     return T.T @ F @ T
 
 
-def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
     """l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
     At alpha's epipole, and where F is zero, there is no line: all zeros. Batched F as in `map_homogeneous`.

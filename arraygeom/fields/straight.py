@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..camera import Camera
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
 from ..pixels import HW, coarse_grid
@@ -34,8 +35,8 @@ class Epipolar:
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
         """Segments from near to far, inside beta's picture and in front of it. Raises ValueError for lenses."""
-        near, far = self.bounds(pair)
-        return _between(pair, near, far, x)
+        require_pinholes(pair)
+        return _between(pair, *self.bounds(pair), x)
 
     def bounds(self, pair: Pair) -> Depths:
         """(near, far): this field's own where given, else the pair's."""
@@ -146,13 +147,19 @@ class Rectified:
 
 def pinhole_track(pair: Pair, x: Float[Tensor, "*n 2"]) -> Track:
     """The track in beta of alpha's pixels. Raises ValueError unless both cameras are pinholes."""
-    alpha, beta = pair.cameras
-    if alpha.distortion is not None or beta.distortion is not None:
-        raise ValueError("a straight field needs pinhole cameras: use Curved, or undistort the pictures first")
+    alpha, beta = require_pinholes(pair)
     return track(alpha.K, beta.K, pair.beta_from_alpha, x)
 
 
-def foot_on_line(line: Float[Tensor, "*n 3"], point: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
+    """Both cameras. Raises ValueError unless they are calibrated and without lenses."""
+    alpha, beta = pair.cameras
+    if alpha.distortion is not None or beta.distortion is not None:
+        raise ValueError("a straight field needs pinhole cameras: use Curved, or undistort the pictures first")
+    return alpha, beta
+
+
+def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) -> Float[Tensor, "*n 2"]:
     """The point of a line (scaled as `epipolar_lines` does) nearest to a point; without a line, the point."""
     l0, l1, l2 = line.unbind(-1)
     u, v = point.unbind(-1)
@@ -161,7 +168,7 @@ def foot_on_line(line: Float[Tensor, "*n 3"], point: Float[Tensor, "*n 2"]) -> F
 
 
 def line_piece(
-    line: Float[Tensor, "*n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, ""], hw: HW
+    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, ""], hw: HW
 ) -> Segments:
     """The piece of each line within `reach` of the foot of `point`, clipped to the picture.
 
