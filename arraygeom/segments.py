@@ -63,8 +63,8 @@ class Segments:
         """`samples` positions, the first at start, the last at end, evenly spaced (one sample: the middle).
 
         >>> s = Segments(torch.tensor([0.0, 4.0]), torch.tensor([6.0, 4.0]), torch.tensor(True))
-        >>> s.positions(4).xy[:, 0].tolist()
-        [0.0, 2.0, 4.0, 6.0]
+        >>> s.positions(3).xy[:, 0].tolist()
+        [0.0, 3.0, 6.0]
         """
         u = sample_fractions(samples, like=self.start)
         xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
