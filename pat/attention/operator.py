@@ -11,6 +11,8 @@ geometry (they are constant almost everywhere); position and spread do, as weigh
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Callable
 from typing import Literal
 
@@ -20,7 +22,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import reference
+from pat.attention import op, reference
 from pat.attention.reference import Attended, Look
 
 Where = Segments | Positions
@@ -184,7 +186,24 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 def _run(
     q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend
 ) -> Attended:
-    return reference.attend(q, k, v, look, bias, nearest)
+    chosen = _choose(backend, q.device.type)
+    if chosen == "reference":
+        return reference.attend(q, k, v, look, bias, nearest)
+    return op.attend(q, k, v, look, bias, nearest, backend=chosen, strict=backend != "auto")
+
+
+def _choose(backend: Backend, device: str) -> str:
+    """The backend that serves; raises if the one asked for cannot."""
+    triton = importlib.util.find_spec("triton") is not None
+    if backend == "auto":
+        return "cpu" if device == "cpu" else "triton" if device == "cuda" and triton else "reference"
+    if backend == "cpu" and device != "cpu":
+        raise RuntimeError(f"backend 'cpu' cannot serve tensors on {device}: move them, or ask for 'auto'")
+    if backend == "triton" and not triton:
+        raise RuntimeError("backend 'triton' needs the package triton, which is not installed")
+    if backend == "triton" and device != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
+        raise RuntimeError(f"backend 'triton' cannot serve tensors on {device}: move them to a GPU")
+    return backend
 
 
 def _attend_chunks(

@@ -1,0 +1,203 @@
+"""Scenes of layers: textured planes at random depths and slants with random outlines, seen by any cameras.
+
+A layer is a plane in the world with a painter: a camera with K = I that looks at it squarely from distance 1, so
+that the painter's picture is the plane itself in metres. The plane's homography from each view to the painter
+gives, at any pixel, the place on the plane and (as its third entry) the inverse depth: pictures, depth and
+occlusion are exact, and no geometry is approximated. All surfaces are opaque and diffuse.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d, grid_sample
+
+from arraygeom.camera import Camera
+from arraygeom.homography import plane_homography
+from arraygeom.pixels import HW
+from arraygeom.pose import Pose
+
+from .layers import Layers, draw_layers
+from .outlines import outlines
+from .photos import PhotoBank
+from .rigs import RigBatch, RigDistribution
+
+_FAINT = 1 / 256
+_MAX_OVERSAMPLING = 4
+
+
+@dataclass(frozen=True)
+class ArrayBatch:
+    """Pictures and truth, one entry a camera, alpha first.
+
+    `images` 0..1 (sRGB as the photographs have it); `depth` in metres along each camera's own axis at the
+    pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths.
+    """
+
+    images: list[Float[Tensor, "b 3 _ _"]]
+    depth: list[Float[Tensor, "b _ _"]]
+    K: list[Float[Tensor, "b 3 3"]]
+    R: list[Float[Tensor, "b 3 3"]]
+    t: list[Float[Tensor, "b 3"]]
+    hw: list[HW]
+    depth_range: Float[Tensor, "b 2"]
+
+    @property
+    def cameras(self) -> list[Camera]:
+        """The cameras, each batched (B)."""
+        poses = (Pose(R, t) for R, t in zip(self.R, self.t))
+        return [Camera(K=K, cam_from_world=p, hw=hw) for K, p, hw in zip(self.K, poses, self.hw)]
+
+
+class LayeredScenes:
+    """A source of training samples.
+
+    `layers` bounds the number of planes in a scene, both ends included. All randomness comes from the generator
+    given to `sample` (on the CPU, whatever the device) and from `seed`, which makes the outlines.
+    """
+
+    def __init__(
+        self,
+        photos: PhotoBank,
+        rigs: RigDistribution,
+        *,
+        hw: HW,
+        layers: tuple[int, int] = (4, 9),
+        seed: int = 0,
+        device: torch.device | str = "cpu",
+    ):
+        if not 1 <= layers[0] <= layers[1]:
+            raise ValueError(f"layers must be two numbers, at least 1 and in order, got {layers}")
+        self.photos = photos.to(device)
+        self.rigs = rigs
+        self.hw = hw
+        self.layers = layers
+        self.device = torch.device(device)
+        self.outlines = outlines(256, seed).to(device)
+
+    def sample(self, batch: int, generator: Generator) -> ArrayBatch:
+        """Random scenes seen by random rigs."""
+        return self.render(self.rigs.sample(batch, self.hw, generator), generator)
+
+    @torch.no_grad()
+    def render(self, rigs: RigBatch, generator: Generator, *, oversampling: int = 1) -> ArrayBatch:
+        """Random scenes seen by given rigs, whose first view is alpha and the world frame.
+
+        A view with fewer pixels a radian than alpha is rendered at about alpha's and averaged down by area, as a
+        coarser sensor would; `oversampling` asks for more than that.
+        """
+        layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
+        factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]
+        images, depth = zip(*(self._seen(layers, v, f) for v, f in zip(rigs.cameras, factors)))
+        bounds = torch.stack(depth[0].flatten(1).aminmax(dim=1), -1)
+        cameras = [c.to(device=self.device, dtype=torch.float32) for c in rigs.cameras]
+        K, R, t, hw = ([getattr(c, k) for c in cameras] for k in ("K", "R", "t", "hw"))
+        return ArrayBatch(list(images), list(depth), K, R, t, hw, bounds)
+
+    def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor]:
+        """Picture, and depth at the pixels' centres of the surface that covers most of each pixel."""
+        front = self._front(layers, camera)
+        depth = (1 / front.inverse_depth).view(-1, *camera.hw)
+        if factor == 1:
+            return self._shade(layers, camera, front), depth
+        fine = camera.resize((camera.hw[0] * factor, camera.hw[1] * factor))
+        return avg_pool2d(self._shade(layers, fine, self._front(layers, fine)), factor), depth
+
+    def _front(self, layers: Layers, camera: Camera) -> _Front:
+        homogeneous, opacity = self._cover(layers, camera)
+        inverse_depth = torch.where(opacity > _FAINT, homogeneous, 0.0)
+        q1, first = inverse_depth.max(1)
+        a1 = opacity.gather(1, first[:, None])[:, 0]
+        q2, second = inverse_depth.scatter(1, first[:, None], 0.0).max(1)
+        a1 = torch.where(q2 > 0, a1, 1.0)
+        return _Front(first, second, a1, torch.where(a1 >= 0.5, q1, q2))
+
+    def _cover(self, layers: Layers, camera: Camera) -> tuple[Tensor, Tensor]:
+        """Inverse depth and opacity (B, L, N) of every layer at every pixel."""
+        B, L = layers.present.shape
+        H = layers.outline_from_plane @ plane_from_camera(layers, camera)
+        homogeneous = self._pixels(camera.hw) @ H.float().to(self.device).mT
+        q = homogeneous[..., 2].contiguous()
+        in_front = (q > 1e-6) & layers.present.to(self.device)[..., None]
+        q.masked_fill_(~in_front, 1.0)
+        position = (homogeneous[..., :2] / q[..., None]).clamp_(-1, 1).view(B * L, *camera.hw, 2)
+        shapes = self.outlines[layers.outline.flatten().to(self.device)]
+        distance = grid_sample(shapes, position, padding_mode="border", align_corners=False).view(B, L, -1)
+        opacity = (distance / _steps(distance.view(B, L, *camera.hw)).flatten(2) + 0.5).clamp_(0, 1)
+        opacity = torch.where(layers.solid.to(self.device)[..., None], 1.0, opacity)
+        return q, opacity * in_front
+
+    def _shade(self, layers: Layers, camera: Camera, front: _Front) -> Tensor:
+        """The picture (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the first."""
+        H = (layers.texel_from_plane @ plane_from_camera(layers, camera)).float().to(self.device)
+        colour = self._colours(layers, H, camera.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool))
+        edge = front.opacity < 1 - _FAINT
+        behind = self._colours(layers, H, camera.hw, front.second, edge)
+        colour[:, edge] = torch.lerp(behind, colour[:, edge], front.opacity[edge])
+        return colour.view(3, -1, *camera.hw).movedim(0, 1).contiguous()
+
+    def _colours(self, layers: Layers, H: Tensor, hw: HW, layer: Tensor, where: Tensor) -> Tensor:
+        """Colours (3, B, N), or (3, n) at those pixels `where` is True if not everywhere."""
+        B, L = layers.present.shape
+        flat = layer + L * torch.arange(B, device=self.device)[:, None]
+        pixel = torch.arange(hw[0] * hw[1], device=self.device).expand_as(flat)
+        parts = zip(flat[where].split(_CHUNK), pixel[where].split(_CHUNK))
+        texture = layers.texture.flatten().to(self.device)
+        paint = layers.colour.float().flatten(0, 1).to(self.device)
+        done = [self._painted(H.flatten(0, 1)[i], texture[i], paint[i], p, hw[1]) for i, p in parts]
+        colour = torch.cat(done, 1) if done else H.new_zeros(3, 0)
+        return colour.view(3, B, -1) if len(colour[0]) == where.numel() else colour
+
+    def _painted(self, H: Tensor, texture: Tensor, paint: Tensor, pixel: Tensor, width: int) -> Tensor:
+        px, py = (pixel % width).float(), torch.div(pixel, width, rounding_mode="floor").float()
+        m = H.flatten(1).unbind(1)
+        q = m[6] * px + m[7] * py + m[8]
+        u = (m[0] * px + m[1] * py + m[2]) / q
+        v = (m[3] * px + m[4] * py + m[5]) / q
+        steps = [((m[i] - u * m[6 + i]) ** 2 + (m[3 + i] - v * m[6 + i]) ** 2) for i in (0, 1)]
+        level = 0.5 * torch.log2(torch.maximum(*steps) / q**2 + 1e-12)
+        r, g, b = self.photos.lookup(texture, torch.stack([u, v], -1), level)
+        p = paint.unbind(2)
+        return (p[0] * r[:, None] + p[1] * g[:, None] + p[2] * b[:, None] + p[3]).mT.clamp(0, 1)
+
+    def _pixels(self, hw: HW) -> Tensor:
+        y, x = torch.meshgrid(*(torch.arange(n, device=self.device).float() for n in hw), indexing="ij")
+        return torch.stack([x, y, torch.ones_like(x)], -1).flatten(0, 1)
+
+
+_CHUNK = 1 << 16
+
+
+@dataclass(frozen=True)
+class _Front:
+    """At each pixel the two foremost layers, the opacity of the first, and the inverse depth of the main one."""
+
+    first: Tensor
+    second: Tensor
+    opacity: Tensor
+    inverse_depth: Tensor
+
+
+def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"]:
+    """The homography H with H (x, 1) = (u, v, 1) / z: pixels to metres on the planes, and inverse depth."""
+    world = Pose(camera.R[:, None], camera.t[:, None])
+    pose = world @ layers.plane_from_world.inverse()
+    eye = torch.eye(3, dtype=camera.K.dtype)
+    H = plane_homography(eye, camera.K[:, None], pose.R, pose.t, normal=eye[2], d=-eye[0, 0])
+    return torch.linalg.inv(H)
+
+
+def _steps(distance: Tensor) -> Tensor:
+    """How much a distance changes from a pixel to the next, so that edges get one pixel wide from any angle."""
+    x = torch.nn.functional.pad(distance.diff(dim=-1).abs(), (1, 1))
+    y = torch.nn.functional.pad(distance.diff(dim=-2).abs(), (0, 0, 1, 1))
+    x, y = torch.maximum(x[..., 1:], x[..., :-1]), torch.maximum(y[..., 1:, :], y[..., :-1, :])
+    return x.square_().addcmul_(y, y).sqrt_().clamp_(min=1e-6)
+
+
+def _oversampling(alpha: Camera, camera: Camera) -> int:
+    ratio = float((alpha.K[:, 0, 0] / camera.K[:, 0, 0]).median())
+    return min(max(round(ratio), 1), _MAX_OVERSAMPLING)
