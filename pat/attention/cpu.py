@@ -15,10 +15,11 @@ from functools import lru_cache
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from arraygeom.segments import sample_fractions
 from pat.attention import cpu_kernels as kernels
-from pat.attention.reference import Look
+from pat.attention.reference import EDGE_SLACK, Look
 
 PIECE_SAMPLES = 2**15
 """Samples of one task: about a millisecond."""
@@ -45,7 +46,7 @@ def forward(
     )
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
     pieces = _pieces(0, b * ha * wa, look.samples)
-    _share([lambda piece=piece: kernels.forward(*call, *piece, *outputs) for piece in pieces])
+    _share([lambda p=piece: kernels.forward(*call, *_room(look, query, value), *p, *outputs) for piece in pieces])
     return out.permute(0, 3, 1, 2), statistics, logsum
 
 
@@ -77,13 +78,13 @@ def backward(
     points_out = query.new_zeros((b, *look.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 0, dtype=counted)
 
-    stride = look.samples * (1 if nearest else 4)
+    stride = look.samples * (1 if nearest else 4) + kernels.TAP_BLOCK
     step = max(64, SCRATCH_TAPS // stride)
-    scratch = _scratch(min(step, b * ha * wa), stride, counted)
+    scratch = _scratch(min(step, b * ha * wa), stride, query)
     call = (
         *(q, k, v, _geometry(look, query, key, nearest), _flat(_bias(bias, counted)), d, dv),
         *(_flat(saved[1]), _flat(saved[0])),
-        kernels.Gradients(upstream, _flat(cotangents[1].to(counted))),
+        *(upstream, _flat(cotangents[1].to(counted).contiguous())),
     )
     outputs = tuple(_flat(t) for t in (query_out, points_out, bias_out))
     additions = [
@@ -93,7 +94,8 @@ def backward(
     for first in range(0, b * ha * wa, step):
         last = min(first + step, b * ha * wa)
         pieces = _pieces(first, last, look.samples)
-        _share([lambda p=piece: kernels.backward(*call, *p, first, stride, scratch, *outputs) for piece in pieces])  # noqa: B023
+        into = (first, stride, scratch, *outputs)
+        _share([lambda p=piece: kernels.backward(*call, *_room(look, query, value), *p, *into) for piece in pieces])
         _share([lambda add=add: add(first, last) for add in additions])  # noqa: B023
     pictures = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
@@ -123,24 +125,40 @@ def _bias(bias: Tensor | None, counted: torch.dtype) -> Tensor:
 
 
 def _geometry(look: Look, query: Tensor, key: Tensor, nearest: bool) -> kernels.Look:
+    h, w = key.shape[2:]
+    number = _number(query)
+    fractions = pad(sample_fractions(look.samples, like=look.points), (0, kernels.LANES))
     return kernels.Look(
-        _flat(look.points.contiguous()),
-        _flat(look.mask.contiguous()),
-        _flat(sample_fractions(look.samples, like=look.points)),
-        look.straight,
-        nearest,
-        query.shape[2] * query.shape[3],
-        look.points.shape[0] == 1,
-        *key.shape[2:],
+        points=_flat(look.points.contiguous()),
+        mask=_flat(look.mask.contiguous().view(torch.uint8)),
+        fractions=_flat(fractions),
+        samples=look.samples,
+        straight=look.straight,
+        nearest=nearest,
+        alpha_pixels=query.shape[2] * query.shape[3],
+        shared=look.points.shape[0] == 1,
+        height=h,
+        width=w,
+        last_x=number(w - 1),
+        last_y=number(h - 1),
+        slack=number(EDGE_SLACK),
     )
 
 
-def _scratch(pixels: int, stride: int, counted: torch.dtype) -> kernels.Scratch:
-    number = np.float64 if counted == torch.float64 else np.float32
-    taps = pixels * stride
-    return kernels.Scratch(
-        np.empty(pixels, np.int32), np.empty(taps, np.int32), np.empty(taps, number), np.empty(taps, number)
-    )
+def _number(like: Tensor) -> type:
+    return np.float64 if _accumulated(like) == torch.float64 else np.float32
+
+
+def _room(look: Look, query: Tensor, value: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """Scratch for one task."""
+    integers, numbers = kernels.room(look.samples, max(query.shape[1], value.shape[1]))
+    return np.empty(integers, np.int32), np.empty(numbers, _number(query))
+
+
+def _scratch(pixels: int, stride: int, like: Tensor) -> kernels.Scratch:
+    taps = pixels * stride + kernels.LANES
+    weights = np.empty((2, taps), _number(like))
+    return kernels.Scratch(np.empty(pixels, np.int32), np.empty(taps, np.int32), *weights)
 
 
 def _channel_tasks(

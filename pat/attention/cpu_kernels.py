@@ -12,7 +12,7 @@ uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -22,10 +22,9 @@ from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 8
 TAP_BLOCK = 4
-EDGE_SLACK = np.float32(1e-3)
 LEAST_SPREAD = np.float32(1e-4)
-SUMS = {"reassoc", "contract", "nsz"}
-"""What may be done to sums so that they are vectorised: another order of additions, a fixed one."""
+ONE, HALF = np.float32(1), np.float32(0.5)
+"""In float32, so that they make a float64 of nothing that is not."""
 
 
 # ---- eight numbers at a time ---------------------------------------------------------------------------------
@@ -66,19 +65,50 @@ def _widen(builder, stored, dtype, lanes):
     return stored
 
 
-def _pointer(context, builder, array, value, index, lane):
-    data = context.make_array(array)(context, builder, value).data
-    return builder.bitcast(builder.gep(data, [index]), lane.as_pointer())
+@intrinsic
+def pointer(typing, array):
+    """Where the numbers of a flat array begin. What works on pointers counts no references (a fifth of the time
+    otherwise); the caller keeps the array."""
+
+    def code(context, builder, signature, args):
+        return context.make_array(array)(context, builder, args[0]).data
+
+    return types.CPointer(array.dtype)(array), code
+
+
+@intrinsic
+def from_index(typing, place, index):
+    """The pointer to an index."""
+
+    def code(context, builder, signature, args):
+        return builder.gep(args[0], [args[1]])
+
+    return place(place, types.intp), code
+
+
+@intrinsic
+def zero(typing, place):
+    """Nothing, in the accumulation type of the numbers at a pointer."""
+    kind = _accumulated(place.dtype)
+
+    def code(context, builder, signature, args):
+        return context.get_constant(kind, 0)
+
+    return kind(place), code
+
+
+def _at(builder, place, index, lane):
+    return builder.bitcast(builder.gep(place, [index]), lane.as_pointer())
 
 
 @intrinsic
 def load(typing, array, index):
-    """The vector at an index of a flat array."""
+    """The vector at an index, in the accumulation type."""
     kind = Vector(_accumulated(array.dtype))
 
     def code(context, builder, signature, args):
         lane = ir.VectorType(context.get_data_type(array.dtype), LANES)
-        place = _pointer(context, builder, array, args[0], args[1], lane)
+        place = _at(builder, args[0], args[1], lane)
         stored = builder.load(place, align=array.dtype.bitwidth // 8)
         return _widen(builder, stored, array.dtype, LANES)
 
@@ -87,11 +117,11 @@ def load(typing, array, index):
 
 @intrinsic
 def store(typing, array, index, vector):
-    """Puts a vector at an index of a flat array of the accumulation type."""
+    """Puts a vector at an index."""
 
     def code(context, builder, signature, args):
         lane = ir.VectorType(context.get_data_type(array.dtype), LANES)
-        place = _pointer(context, builder, array, args[0], args[1], lane)
+        place = _at(builder, args[0], args[1], lane)
         builder.store(args[2], place, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -100,11 +130,11 @@ def store(typing, array, index, vector):
 
 @intrinsic
 def load_one(typing, array, index):
-    """The number at an index of a flat array, in the accumulation type."""
+    """The number at an index, in the accumulation type."""
 
     def code(context, builder, signature, args):
         lane = context.get_data_type(array.dtype)
-        stored = builder.load(_pointer(context, builder, array, args[0], args[1], lane))
+        stored = builder.load(_at(builder, args[0], args[1], lane))
         return _widen(builder, stored, array.dtype, 1)
 
     return _accumulated(array.dtype)(array, types.intp), code
@@ -135,6 +165,81 @@ def fma(typing, a, b, c):
     return a(a, b, c), code
 
 
+def _arithmetic(instruction):
+    """The intrinsic of one instruction on two vectors."""
+
+    @intrinsic
+    def operation(typing, a, b):
+        def code(context, builder, signature, args):
+            return getattr(builder, instruction)(*args)
+
+        return a(a, b), code
+
+    return operation
+
+
+add, sub, mul = _arithmetic("fadd"), _arithmetic("fsub"), _arithmetic("fmul")
+
+
+@intrinsic
+def larger(typing, a, b):
+    """The larger of the numbers of two vectors; that of b if either is NaN."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return a(a, b), code
+
+
+@intrinsic
+def keep_above(typing, a, limit, b):
+    """The numbers of b; 0 where those of a are below the limit."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered("<", *args[:2]), ir.Constant(args[2].type, None), args[2])
+
+    return a(a, limit, b), code
+
+
+@intrinsic
+def two_to(typing, a):
+    """2 to the power of whole numbers in float32."""
+
+    def code(context, builder, signature, args):
+        def repeat(number):
+            return ir.Constant(whole, [number] * LANES)
+
+        whole = ir.VectorType(ir.IntType(32), LANES)
+        exponent = builder.add(builder.fptosi(args[0], whole), repeat(127))
+        return builder.bitcast(builder.shl(exponent, repeat(23)), args[0].type)
+
+    return a(a), code
+
+
+@intrinsic
+def total(typing, a):
+    """The sum of a vector's numbers."""
+    return a.scalar(a), _reduction("fadd", 0.0)
+
+
+@intrinsic
+def largest(typing, a):
+    """The largest of a vector's numbers."""
+    return a.scalar(a), _reduction("fmax", None)
+
+
+def _reduction(name, start):
+    def code(context, builder, signature, args):
+        vector = args[0].type
+        first = [] if start is None else [ir.Constant(vector.element, start)]
+        kind = ir.FunctionType(vector.element, [vector.element] * len(first) + [vector])
+        full = f"llvm.vector.reduce.{name}.v{LANES}{'f64' if vector.element == ir.DoubleType() else 'f32'}"
+        function = cgutils.get_or_insert_function(builder.module, kind, full)
+        return builder.call(function, [*first, args[0]], fastmath=["reassoc"])
+
+    return code
+
+
 @intrinsic
 def store_totals(typing, array, index, a, b, c, d):
     """Puts the sums of four vectors side by side."""
@@ -148,7 +253,7 @@ def store_totals(typing, array, index, a, b, c, d):
         v = pairs(pairs(args[2], args[3]), pairs(args[4], args[5]))
         low, high = (builder.shuffle_vector(v, v, _mask(half)) for half in ([0, 1, 2, 3], [4, 5, 6, 7]))
         lane = ir.VectorType(args[2].type.element, TAP_BLOCK)
-        place = _pointer(context, builder, array, args[0], args[1], lane)
+        place = _at(builder, args[0], args[1], lane)
         builder.store(builder.fadd(low, high), place, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
@@ -189,41 +294,50 @@ def _brain_float_bits(array, number):
     return np.uint16((bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16))
 
 
-def exponential(number):
-    """exp of a number at most 0."""
+def exponentials(x):
+    """exp of a vector of numbers at most 0; 0 below exp(-87), a hair above the least of float32."""
 
 
-@overload(exponential)
-def _exponential(number):
-    if number == types.float64:
-        return lambda number: math.exp(number)
-    return _exponential32
+@overload(exponentials)
+def _exponentials(x):
+    return (lambda x: _exponentials64(x)) if x.scalar == types.float64 else _exponentials32
 
 
-def _exponential32(number):
-    """Cephes' expf, without calls so that loops over it are vectorised; 1 to 2 units in the last place."""
-    x = max(number, np.float32(-87.0))
-    n = (x * np.float32(1.44269504) + np.float32(12582912.0)) - np.float32(12582912.0)
-    x = (x - n * np.float32(0.693359375)) - n * np.float32(-2.12194440e-4)
-    p = np.float32(1.9875691500e-4)
-    p = p * x + np.float32(1.3981999507e-3)
-    p = p * x + np.float32(8.3334519073e-3)
-    p = p * x + np.float32(4.1665795894e-2)
-    p = p * x + np.float32(1.6666665459e-1)
-    p = p * x + np.float32(5.0000001201e-1)
-    p = (p * x * x + x) + np.float32(1.0)
-    power = (np.int32(n) + np.int32(127)) << np.int32(23)
-    return p * np.int32(power).view(np.float32) if number > np.float32(-87.0) else np.float32(0.0)
+@intrinsic
+def _exponentials64(typing, x):
+    def code(context, builder, signature, args):
+        vector = args[0].type
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector]), "llvm.exp.v8f64")
+        return builder.call(function, args)
+
+    return x(x), code
+
+
+def _exponentials32(x):
+    """Cephes' expf; 1 to 2 units in the last place."""
+    low = splat(np.float32(-87.0))
+    shift = splat(np.float32(12582912.0))
+    y = larger(low, x)
+    n = sub(fma(y, splat(np.float32(1.44269504)), shift), shift)
+    y = fma(n, splat(np.float32(-0.693359375)), y)
+    y = fma(n, splat(np.float32(2.12194440e-4)), y)
+    p = fma(splat(np.float32(1.9875691500e-4)), y, splat(np.float32(1.3981999507e-3)))
+    p = fma(p, y, splat(np.float32(8.3334519073e-3)))
+    p = fma(p, y, splat(np.float32(4.1665795894e-2)))
+    p = fma(p, y, splat(np.float32(1.6666665459e-1)))
+    p = fma(p, y, splat(np.float32(5.0000001201e-1)))
+    p = add(fma(mul(p, y), y, y), splat(np.float32(1.0)))
+    return keep_above(x, low, mul(p, two_to(n)))
 
 
 # ---- along the channels ---------------------------------------------------------------------------------------
 
 
-@njit(inline="never")
+@njit
 def inner_products(x, rows, n, picture, channels, out):
     """out[t] = x . picture[rows[t]], for t < n; rows is padded to a multiple of TAP_BLOCK."""
     whole = channels // LANES * LANES
-    zero = splat(x.dtype.type(0))
+    nothing = splat(zero(x))
     for t in range(0, n, TAP_BLOCK):
         r0, r1, r2, r3 = (
             rows[t] * channels,
@@ -231,7 +345,7 @@ def inner_products(x, rows, n, picture, channels, out):
             rows[t + 2] * channels,
             rows[t + 3] * channels,
         )
-        a0 = a1 = a2 = a3 = zero
+        a0 = a1 = a2 = a3 = nothing
         for c in range(0, whole, LANES):
             q = load(x, c)
             a0 = fma(q, load(picture, r0 + c), a0)
@@ -246,7 +360,7 @@ def inner_products(x, rows, n, picture, channels, out):
             out[t + 3] += x[c] * load_one(picture, r3 + c)
 
 
-@njit(inline="never")
+@njit
 def weighted_sum(weights, rows, n, picture, channels, out):
     """out = sum over t < n of weights[t] picture[rows[t]]; both are padded to a multiple of TAP_BLOCK."""
     c = 0
@@ -260,7 +374,7 @@ def weighted_sum(weights, rows, n, picture, channels, out):
         _weighted_sum_8(weights, rows, n, picture, channels, c, out)
         c += LANES
     for c in range(c, channels):
-        s = weights.dtype.type(0)
+        s = zero(weights)
         for t in range(n):
             s += weights[t] * load_one(picture, rows[t] * channels + c)
         out[c] = s
@@ -268,7 +382,7 @@ def weighted_sum(weights, rows, n, picture, channels, out):
 
 @njit
 def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(weights.dtype.type(0))
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(zero(weights))
     for t in range(n):
         w = splat(weights[t])
         r = rows[t] * channels + c
@@ -292,8 +406,8 @@ def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
 
 @njit
 def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
-    one = splat(weights.dtype.type(1))
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(weights.dtype.type(0))
+    one = splat(zero(weights) + ONE)
+    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
     for t in range(0, n, TAP_BLOCK):
         w0, r0 = splat(weights[t]), rows[t] * channels + c
         w1, r1 = splat(weights[t + 1]), rows[t + 1] * channels + c
@@ -309,8 +423,8 @@ def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
 
 @njit
 def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
-    one = splat(weights.dtype.type(1))
-    a0 = a1 = a2 = a3 = splat(weights.dtype.type(0))
+    one = splat(zero(weights) + ONE)
+    a0 = a1 = a2 = a3 = splat(zero(weights))
     for t in range(0, n, TAP_BLOCK):
         a0 = fma(splat(weights[t]), load(picture, rows[t] * channels + c), a0)
         a1 = fma(splat(weights[t + 1]), load(picture, rows[t + 1] * channels + c), a1)
@@ -327,6 +441,7 @@ def scatter(counts, rows, weights, stride, x, channels, first, last, first_chann
     the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the same however
     many callers share the work.
     """
+    counts, rows, weights, x, out = pointer(counts), pointer(rows), pointer(weights), pointer(x), pointer(out)
     for p in range(first, last):
         begin = (p - first) * stride
         end = begin + counts[p - first]
@@ -362,114 +477,148 @@ def _scatter_32(rows, weights, begin, end, x, at, channels, c, out):
 
 
 class Look(NamedTuple):
-    """The geometry of a call: flat points and mask, fractions along a segment, beta's size."""
+    """The geometry of a call. The numbers are arrays outside and pointers inside."""
 
-    points: np.ndarray
-    mask: np.ndarray
-    fractions: np.ndarray
+    points: Any
+    mask: Any
+    fractions: Any
+    samples: int
     straight: bool
     nearest: bool
     alpha_pixels: int
     shared: bool
     height: int
     width: int
+    last_x: Any
+    last_y: Any
+    slack: Any
 
 
 class Samples(NamedTuple):
     """Room for the samples of one pixel that count: which they are, where, in which cell, with what weight."""
 
-    index: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    right: np.ndarray
-    down: np.ndarray
-    score: np.ndarray
-    weight: np.ndarray
-    slope: np.ndarray
-    tap: np.ndarray
+    index: Any
+    tap: Any
+    x: Any
+    y: Any
+    right: Any
+    down: Any
+    score: Any
+    weight: Any
+    slope: Any
+    score_slope: Any
 
 
 class Taps(NamedTuple):
     """Room for the taps of one pixel: their pixels in beta, and numbers for each."""
 
-    row: np.ndarray
-    by_key: np.ndarray
-    by_value: np.ndarray
-    weight: np.ndarray
-    slope: np.ndarray
+    row: Any
+    by_key: Any
+    by_value: Any
+    weight: Any
 
 
 @njit
-def _room(n, nearest, like):
-    """Scratch for n samples."""
-    m = (n if nearest else 4 * n) + TAP_BLOCK
+def _look(look):
+    return Look(
+        pointer(look.points),
+        pointer(look.mask),
+        pointer(look.fractions),
+        look.samples,
+        look.straight,
+        look.nearest,
+        look.alpha_pixels,
+        look.shared,
+        look.height,
+        look.width,
+        look.last_x,
+        look.last_y,
+        look.slack,
+    )
+
+
+def room(samples, channels):
+    """How many integers and how many numbers of scratch a task needs."""
+    n, m = samples + LANES, 4 * samples + LANES
+    return 5 * n + m, 8 * n + 3 * m + channels
+
+
+@njit
+def _room(n, integers, numbers):
+    """Scratch, cut up. What is left of it is for channels."""
+    n, m = n + LANES, 4 * n + LANES
+    i, f = pointer(integers), pointer(numbers)
     samples = Samples(
-        np.empty(n, np.int64),
-        np.empty(n, like.dtype),
-        np.empty(n, like.dtype),
-        np.empty(n, like.dtype),
-        np.empty(n, like.dtype),
-        np.empty(n, like.dtype),
-        np.empty(n, like.dtype),
-        np.empty(n, like.dtype),
-        np.empty(4 * n, np.int64),
+        i,
+        from_index(i, n),
+        f,
+        from_index(f, n),
+        from_index(f, 2 * n),
+        from_index(f, 3 * n),
+        from_index(f, 4 * n),
+        from_index(f, 5 * n),
+        from_index(f, 6 * n),
+        from_index(f, 7 * n),
     )
-    taps = Taps(
-        np.empty(m, np.int64),
-        np.empty(m, like.dtype),
-        np.empty(m, like.dtype),
-        np.empty(m, like.dtype),
-        np.empty(m, like.dtype),
-    )
-    return samples, taps
+    t = from_index(f, 8 * n)
+    taps = Taps(from_index(i, 5 * n), t, from_index(t, m), from_index(t, 2 * m))
+    return samples, taps, from_index(t, 3 * m)
 
 
 @njit
-def _surely_inside(x, y, look):
-    """Whether a point is so well on beta's area that no rounding of the samples between two such leads off it."""
-    half = look.fractions.dtype.type(0.5)
-    return (x >= -half) & (y >= -half) & (x <= look.width - half) & (y <= look.height - half)
+def _on_picture(x, y, look, slack):
+    low = -HALF - slack
+    return (x >= low) & (y >= low) & (x <= look.last_x - low) & (y <= look.last_y - low)
+
+
+@njit
+def _walk(start, along, look, out):
+    """start + fraction along, rounded as torch rounds it (no fused multiply-add)."""
+    for i in range(0, look.samples, LANES):
+        store(out, i, add(start, mul(load(look.fractions, i), along)))
 
 
 @njit
 def _collect(p, look, samples):
     """Positions of the samples of pixel p that count; how many."""
-    dtype = look.fractions.dtype.type
-    low = -dtype(0.5) - dtype(EDGE_SLACK)
-    right = dtype(look.width) - dtype(0.5) + dtype(EDGE_SLACK)
-    bottom = dtype(look.height) - dtype(0.5) + dtype(EDGE_SLACK)
     place = p % look.alpha_pixels if look.shared else p
-    length = len(look.fractions)
-    n = 0
     if look.straight:
-        if not look.mask[place]:
-            return 0
-        x0, y0 = look.points[4 * place], look.points[4 * place + 1]
-        dx, dy = look.points[4 * place + 2] - x0, look.points[4 * place + 3] - y0
-        if _surely_inside(x0, y0, look) and _surely_inside(x0 + dx, y0 + dy, look):
-            for i in range(length):
-                samples.index[i] = i
-                samples.x[i] = x0 + look.fractions[i] * dx
-                samples.y[i] = y0 + look.fractions[i] * dy
-            return length
-        for i in range(length):
-            x = x0 + look.fractions[i] * dx
-            y = y0 + look.fractions[i] * dy
-            samples.index[n], samples.x[n], samples.y[n] = i, x, y
-            n += (x >= low) & (y >= low) & (x <= right) & (y <= bottom)
-        return n
-    for i in range(length):
-        x = look.points[2 * (place * length + i)]
-        y = look.points[2 * (place * length + i) + 1]
+        return _collect_segment(place, look, samples) if look.mask[place] else 0
+    points, mask = from_index(look.points, 2 * place * look.samples), from_index(look.mask, place * look.samples)
+    n = 0
+    for i in range(look.samples):
+        x, y = points[2 * i], points[2 * i + 1]
         samples.index[n], samples.x[n], samples.y[n] = i, x, y
-        n += look.mask[place * length + i] & (x >= low) & (y >= low) & (x <= right) & (y <= bottom)
+        n += (mask[i] != 0) & _on_picture(x, y, look, look.slack)
+    return n
+
+
+@njit
+def _collect_segment(place, look, samples):
+    x0, y0 = look.points[4 * place], look.points[4 * place + 1]
+    dx, dy = look.points[4 * place + 2] - x0, look.points[4 * place + 3] - y0
+    _walk(splat(x0), splat(dx), look, samples.x)
+    _walk(splat(y0), splat(dy), look, samples.y)
+    sure = look.slack - look.slack
+    if _on_picture(x0, y0, look, sure) & _on_picture(x0 + dx, y0 + dy, look, sure):
+        for i in range(look.samples):
+            samples.index[i] = i
+        return look.samples
+    n = 0
+    for i in range(look.samples):
+        x, y = samples.x[i], samples.y[i]
+        samples.index[n], samples.x[n], samples.y[n] = i, x, y
+        n += _on_picture(x, y, look, look.slack)
     return n
 
 
 @njit
 def _tap(n, first, look, samples, taps):
     """Finds the taps of n samples; how many. `first` is the index of the first pixel of this beta."""
-    m = _tap_nearest(n, first, look, samples, taps) if look.nearest else _tap_cells(n, first, look, samples, taps)
+    if look.nearest:
+        m = _tap_nearest(n, np.int32(first), look, samples, taps)
+    else:
+        m = _tap_cells(n, np.int32(first), look, samples, taps)
     for t in range(m, m + TAP_BLOCK):
         taps.row[t] = taps.row[m - 1]
     return m
@@ -477,14 +626,18 @@ def _tap(n, first, look, samples, taps):
 
 @njit
 def _tap_nearest(n, first, look, samples, taps):
-    half = look.fractions.dtype.type(0.5)
-    last_x, last_y = np.int64(look.width - 1), np.int64(look.height - 1)
-    m = np.int64(0)
-    row = np.int64(-1)
+    """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
+    last_x, last_y, width = np.int32(look.width - 1), np.int32(look.height - 1), np.int32(look.width)
     for j in range(n):
-        x = min(np.int64(samples.x[j] + half), last_x)
-        y = min(np.int64(samples.y[j] + half), last_y)
-        here = first + y * look.width + x
+        x = min(np.int32(samples.x[j] + HALF), last_x)
+        y = min(np.int32(samples.y[j] + HALF), last_y)
+        taps.row[j] = first + y * width + x
+    if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
+        return n
+    m = 0
+    row = np.int32(-1)
+    for j in range(n):
+        here = taps.row[j]
         m += here != row
         row = here
         taps.row[m - 1] = row
@@ -495,19 +648,18 @@ def _tap_nearest(n, first, look, samples, taps):
 @njit
 def _tap_cells(n, first, look, samples, taps):
     """Each cell has four taps, of which those that the cell before had, too, are taken from there."""
-    dtype = look.fractions.dtype.type
-    zero, far_x, far_y = dtype(0), dtype(look.width - 1), dtype(look.height - 1)
-    cell_x, cell_y = np.int64(max(look.width - 2, 0)), np.int64(max(look.height - 2, 0))
-    step_x, step_y = np.int64(min(1, look.width - 1)), np.int64(min(1, look.height - 1)) * look.width
-    x, y = np.int64(-2), np.int64(-2)
-    t00 = t10 = t01 = t11 = np.int64(0)
-    m = np.int64(0)
+    nothing = zero(samples.x)
+    width = np.int32(look.width)
+    cell_x, cell_y = np.int32(max(look.width - 2, 0)), np.int32(max(look.height - 2, 0))
+    step_x, step_y = np.int32(min(1, look.width - 1)), np.int32(min(1, look.height - 1)) * width
+    x = y = np.int32(-2)
+    t00 = t10 = t01 = t11 = m = np.int32(0)
     for j in range(n):
-        right = min(max(samples.x[j], zero), far_x)
-        down = min(max(samples.y[j], zero), far_y)
-        new_x, new_y = min(np.int64(right), cell_x), min(np.int64(down), cell_y)
+        right = min(max(samples.x[j], nothing), look.last_x)
+        down = min(max(samples.y[j], nothing), look.last_y)
+        new_x, new_y = min(np.int32(right), cell_x), min(np.int32(down), cell_y)
         if new_x != x or new_y != y:
-            row = first + new_y * look.width + new_x
+            row = first + new_y * width + new_x
             if new_y == y and new_x == x + 1:
                 t00, t01 = t10, t11
                 t10, t11, m = _fresh(row + step_x, row + step_x + step_y, m, taps)
@@ -524,17 +676,16 @@ def _tap_cells(n, first, look, samples, taps):
                 t00, t10, m = _fresh(row, row + step_x, m, taps)
                 t01, t11, m = _fresh(row + step_y, row + step_x + step_y, m, taps)
             x, y = new_x, new_y
-        samples.right[j] = right - dtype(x)
-        samples.down[j] = down - dtype(y)
+        samples.right[j], samples.down[j] = right - np.float32(x), down - np.float32(y)
         samples.tap[4 * j], samples.tap[4 * j + 1] = t00, t10
         samples.tap[4 * j + 2], samples.tap[4 * j + 3] = t01, t11
-    return m
+    return np.int64(m)
 
 
 @njit
 def _fresh(row, other, m, taps):
     taps.row[m], taps.row[m + 1] = row, other
-    return m, m + 1, m + 2
+    return m, np.int32(m + 1), np.int32(m + 2)
 
 
 @njit
@@ -542,7 +693,8 @@ def _interpolate(n, m, look, samples, by_tap, out):
     """From numbers on taps to numbers on samples."""
     if look.nearest:
         if m == n:
-            out[:n] = by_tap[:n]
+            for j in range(0, n, LANES):
+                store(out, j, load(by_tap, j))
         else:
             for j in range(n):
                 out[j] = by_tap[samples.tap[j]]
@@ -559,10 +711,11 @@ def _interpolate(n, m, look, samples, by_tap, out):
 def _distribute(n, m, look, samples, numbers, by_tap):
     """From numbers on samples to numbers on taps: the transpose of `_interpolate`."""
     if look.nearest and m == n:
-        by_tap[:n] = numbers[:n]
-        by_tap[n : n + TAP_BLOCK] = 0
+        for j in range(0, n, LANES):
+            store(by_tap, j, load(numbers, j))
+        _fill(by_tap, n, n + TAP_BLOCK, zero(by_tap))
         return
-    by_tap[: m + TAP_BLOCK] = 0
+    _fill(by_tap, 0, m + TAP_BLOCK, zero(by_tap))
     if look.nearest:
         for j in range(n):
             by_tap[samples.tap[j]] += numbers[j]
@@ -578,12 +731,18 @@ def _distribute(n, m, look, samples, numbers, by_tap):
 
 
 @njit
+def _fill(numbers, first, last, filler):
+    for j in range(first, last):
+        numbers[j] = filler
+
+
+@njit
 def _slopes(j, samples, by_tap):
     """How the interpolated number changes with x and with y, at sample j."""
     u, v = samples.right[j], samples.down[j]
     a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
     c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
-    return (1 - v) * (b - a) + v * (d - c), (1 - u) * (c - a) + u * (d - b)
+    return (ONE - v) * (b - a) + v * (d - c), (ONE - u) * (c - a) + u * (d - b)
 
 
 # ---- forward and backward ----------------------------------------------------------------------------------------
@@ -596,7 +755,13 @@ def _unpack(array, at, n, out):
 
 
 @njit
-def _score(p, q, key, channels, look, bias, samples, taps):
+def _pack(numbers, n, array, at):
+    for c in range(n):
+        array[at + c] = narrow(array, numbers[c])
+
+
+@njit
+def _score(p, q, key, channels, look, bias, biased, samples, taps):
     """Collects pixel p's samples and scores them: how many samples, how many taps."""
     n = _collect(p, look, samples)
     if n == 0:
@@ -604,90 +769,99 @@ def _score(p, q, key, channels, look, bias, samples, taps):
     m = _tap(n, p // look.alpha_pixels * (look.height * look.width), look, samples, taps)
     inner_products(q, taps.row, m, key, channels, taps.by_key)
     _interpolate(n, m, look, samples, taps.by_key, samples.score)
-    if len(bias) > 0:
+    if biased:
         for j in range(n):
-            samples.score[j] += bias[p * len(look.fractions) + samples.index[j]]
+            samples.score[j] += bias[p * look.samples + samples.index[j]]
+    _fill(samples.score, n, n + LANES, zero(q) - np.float32(np.inf))
     return n, m
-
-
-@njit(fastmath={"nnan", "nsz"})
-def _largest(numbers, n):
-    top = numbers[0]
-    for j in range(1, n):
-        top = max(top, numbers[j])
-    return top
-
-
-@njit(fastmath=SUMS)
-def _sum(numbers, n):
-    s = numbers.dtype.type(0)
-    for j in range(n):
-        s += numbers[j]
-    return s
 
 
 @njit
 def _softmax(n, samples):
     """Weights of n scores, and the logarithm of the sum of exponentials (-inf if there is none)."""
-    top = _largest(samples.score, n)
+    score, weight = samples.score, samples.weight
+    best = load(score, 0)
+    for j in range(LANES, n, LANES):
+        best = larger(load(score, j), best)
+    top = largest(best)
     if top == -np.inf:
         return top
-    for j in range(n):
-        samples.weight[j] = exponential(samples.score[j] - top)
-    mass = _sum(samples.weight, n)
-    scale = 1 / mass
-    for j in range(n):
-        samples.weight[j] *= scale
+    mass = _exponentiate(n, samples, top)
+    scale = splat(ONE / mass)
+    for j in range(0, n, LANES):
+        store(weight, j, mul(load(weight, j), scale))
     return top + math.log(mass)
 
 
-@njit(fastmath=SUMS)
-def _expected(n, samples):
-    x = y = samples.weight.dtype.type(0)
-    for j in range(n):
-        x += samples.weight[j] * samples.x[j]
-        y += samples.weight[j] * samples.y[j]
-    return x, y
+@njit
+def _exponentiate(n, samples, top):
+    """weight = exp(score - top), and the sum; scores are padded with -inf."""
+    minus_top = splat(-top)
+    mass = splat(zero(samples.score))
+    for j in range(0, n, LANES):
+        e = exponentials(add(load(samples.score, j), minus_top))
+        store(samples.weight, j, e)
+        mass = add(mass, e)
+    return total(mass)
 
 
-@njit(fastmath=SUMS)
-def _spread(n, samples, x, y):
-    squared = samples.weight.dtype.type(0)
-    for j in range(n):
-        squared += samples.weight[j] * ((samples.x[j] - x) ** 2 + (samples.y[j] - y) ** 2)
-    spread = math.sqrt(squared)
-    return spread if spread > LEAST_SPREAD else samples.weight.dtype.type(0)
+@njit
+def _measure(n, samples, statistics):
+    """Expected position, spread and largest of the weights, which are padded with 0."""
+    nothing = zero(samples.x)
+    _fill(samples.x, n, n + LANES, nothing)
+    _fill(samples.y, n, n + LANES, nothing)
+    x = y = squared = peak = splat(nothing)
+    for j in range(0, n, LANES):
+        w = load(samples.weight, j)
+        x = fma(w, load(samples.x, j), x)
+        y = fma(w, load(samples.y, j), y)
+    statistics[0], statistics[1] = total(x), total(y)
+    x, y = splat(statistics[0]), splat(statistics[1])
+    for j in range(0, n, LANES):
+        w = load(samples.weight, j)
+        dx, dy = sub(load(samples.x, j), x), sub(load(samples.y, j), y)
+        squared = fma(w, fma(dx, dx, mul(dy, dy)), squared)
+        peak = larger(w, peak)
+    spread = math.sqrt(total(squared))
+    statistics[2] = spread if spread > LEAST_SPREAD else nothing
+    statistics[3] = largest(peak)
 
 
 @njit(nogil=True, cache=True)
-def forward(query, key, value, look, bias, channels, value_channels, first, last, out, statistics, logsum):
+def forward(
+    query,
+    key,
+    value,
+    look,
+    bias,
+    channels,
+    value_channels,
+    integers,
+    numbers,
+    first,
+    last,
+    out,
+    statistics,
+    logsum,
+):
     """The alpha pixels first .. last: values out, statistics (pixel, 4) and log of the sum of exponentials."""
-    samples, taps = _room(len(look.fractions), look.nearest, look.fractions)
-    q = np.empty(channels, look.fractions.dtype)
-    seen = np.empty(value_channels, look.fractions.dtype)
+    biased = len(bias) > 0
+    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
+    out, statistics = pointer(out), pointer(statistics)
+    samples, taps, q = _room(look.samples, integers, numbers)
     for p in range(first, last):
         _unpack(query, p * channels, channels, q)
-        n, m = _score(p, q, key, channels, look, bias, samples, taps)
+        n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
         logsum[p] = _softmax(n, samples) if n > 0 else -np.inf
         if logsum[p] == -np.inf:
-            seen[:] = 0
-            statistics[4 * p : 4 * p + 4] = 0
+            _fill(q, 0, value_channels, zero(q))
+            _fill(statistics, 4 * p, 4 * p + 4, zero(q))
         else:
             _distribute(n, m, look, samples, samples.weight, taps.weight)
-            weighted_sum(taps.weight, taps.row, m, value, value_channels, seen)
-            x, y = _expected(n, samples)
-            statistics[4 * p], statistics[4 * p + 1] = x, y
-            statistics[4 * p + 2] = _spread(n, samples, x, y)
-            statistics[4 * p + 3] = _largest(samples.weight, n)
-        for c in range(value_channels):
-            out[p * value_channels + c] = narrow(out, seen[c])
-
-
-class Gradients(NamedTuple):
-    """Cotangents of the outputs, flat: of values, and of statistics (pixel, 4)."""
-
-    value: np.ndarray
-    statistics: np.ndarray
+            weighted_sum(taps.weight, taps.row, m, value, value_channels, q)
+            _measure(n, samples, from_index(statistics, 4 * p))
+        _pack(q, value_channels, out, p * value_channels)
 
 
 class Scratch(NamedTuple):
@@ -700,62 +874,58 @@ class Scratch(NamedTuple):
 
 
 @njit
-def _blame(n, p, samples, statistics, gradients, score_slopes):
-    """From gradients by weights (in samples.slope, from the values alone) to gradients by scores."""
-    gx, gy = gradients.statistics[4 * p], gradients.statistics[4 * p + 1]
-    spread, peak = statistics[4 * p + 2], statistics[4 * p + 3]
-    pull = gradients.statistics[4 * p + 2] / (2 * spread) if spread > 0 else spread
-    x, y = statistics[4 * p], statistics[4 * p + 1]
+def _blame(n, samples, statistics, upstream):
+    """From gradients by the weights to gradients by the scores. Samples' slopes hold those of the values."""
+    nothing = zero(upstream)
+    x, y, spread, gx, gy, gspread = _six(statistics, upstream)
+    pull = HALF * gspread / spread if spread > 0 else nothing
     if gx != 0 or gy != 0 or pull != 0:
         for j in range(n):
             away = (samples.x[j] - x) ** 2 + (samples.y[j] - y) ** 2
             samples.slope[j] += gx * samples.x[j] + gy * samples.y[j] + pull * away
-    if gradients.statistics[4 * p + 3] != 0:
+    if upstream[3] != 0:
         best = 0
         for j in range(1, n):
-            if samples.weight[j] > samples.weight[best]:
-                best = j
-        samples.slope[best] += gradients.statistics[4 * p + 3]
-    mean = _inner(samples.weight, samples.slope, n)
-    for j in range(n):
-        score_slopes[j] = samples.weight[j] * (samples.slope[j] - mean)
-
-
-@njit(fastmath=SUMS)
-def _inner(a, b, n):
-    s = a.dtype.type(0)
-    for j in range(n):
-        s += a[j] * b[j]
-    return s
+            best = j if samples.weight[j] > samples.weight[best] else best
+        samples.slope[best] += upstream[3]
+    _fill(samples.slope, n, n + LANES, nothing)
+    mean = splat(nothing)
+    for j in range(0, n, LANES):
+        mean = fma(load(samples.weight, j), load(samples.slope, j), mean)
+    mean = splat(total(mean))
+    for j in range(0, n, LANES):
+        store(samples.score_slope, j, mul(load(samples.weight, j), sub(load(samples.slope, j), mean)))
 
 
 @njit
-def _move(n, p, look, samples, taps, statistics, gradients, score_slopes, out):
+def _six(statistics, upstream):
+    return statistics[0], statistics[1], statistics[2], upstream[0], upstream[1], upstream[2]
+
+
+@njit
+def _move(n, p, look, samples, taps, statistics, upstream, out):
     """Gradients by the positions of the samples, and by the points that made them."""
-    place_x, place_y, spread = statistics[4 * p], statistics[4 * p + 1], statistics[4 * p + 2]
-    gx, gy = gradients.statistics[4 * p], gradients.statistics[4 * p + 1]
-    pull = gradients.statistics[4 * p + 2] / spread if spread > 0 else spread
-    length = len(look.fractions)
-    dtype = look.fractions.dtype.type
-    far_x, far_y = dtype(look.width - 1), dtype(look.height - 1)
+    nothing = zero(upstream)
+    centre_x, centre_y, spread, gx, gy, gspread = _six(statistics, upstream)
+    pull = gspread / spread if spread > 0 else nothing
+    x0 = y0 = x1 = y1 = nothing
     for j in range(n):
         x, y, w = samples.x[j], samples.y[j], samples.weight[j]
-        dx, dy = w * (gx + pull * (x - place_x)), w * (gy + pull * (y - place_y))
+        dx, dy = w * (gx + pull * (x - centre_x)), w * (gy + pull * (y - centre_y))
         if not look.nearest:
             kx, ky = _slopes(j, samples, taps.by_key)
-            vx, vy = _slopes(j, samples, taps.slope)
-            dx += (score_slopes[j] * kx + w * vx) if (x >= 0) & (x <= far_x) else dtype(0)
-            dy += (score_slopes[j] * ky + w * vy) if (y >= 0) & (y <= far_y) else dtype(0)
+            vx, vy = _slopes(j, samples, taps.by_value)
+            dx += samples.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= look.last_x) else nothing
+            dy += samples.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= look.last_y) else nothing
         i = samples.index[j]
         if look.straight:
             u = look.fractions[i]
-            out[4 * p] += (1 - u) * dx
-            out[4 * p + 1] += (1 - u) * dy
-            out[4 * p + 2] += u * dx
-            out[4 * p + 3] += u * dy
+            x1, y1 = x1 + u * dx, y1 + u * dy
+            x0, y0 = x0 + dx - u * dx, y0 + dy - u * dy
         else:
-            out[2 * (p * length + i)] = dx
-            out[2 * (p * length + i) + 1] = dy
+            out[2 * (p * look.samples + i)], out[2 * (p * look.samples + i) + 1] = dx, dy
+    if look.straight:
+        out[4 * p], out[4 * p + 1], out[4 * p + 2], out[4 * p + 3] = x0, y0, x1, y1
 
 
 @njit(nogil=True, cache=True)
@@ -769,7 +939,10 @@ def backward(
     value_channels,
     logsum,
     statistics,
-    gradients,
+    value_upstream,
+    statistics_upstream,
+    integers,
+    numbers,
     first,
     last,
     scratch_first,
@@ -783,37 +956,52 @@ def backward(
 
     Outputs that are not wanted have length 0; points_out and bias_out come zeroed.
     """
-    samples, taps = _room(len(look.fractions), look.nearest, look.fractions)
-    q = np.empty(channels, look.fractions.dtype)
-    seen = np.empty(value_channels, look.fractions.dtype)
-    score_slopes = np.empty(len(look.fractions), look.fractions.dtype)
+    biased, wants_query, wants_points = len(bias) > 0, len(query_out) > 0, len(points_out) > 0
+    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
+    statistics, value_upstream = pointer(statistics), pointer(value_upstream)
+    statistics_upstream, query_out, points_out = (
+        pointer(statistics_upstream),
+        pointer(query_out),
+        pointer(points_out),
+    )
+    counts, rows = pointer(scratch.counts), pointer(scratch.rows)
+    by_key, by_value = pointer(scratch.by_key), pointer(scratch.by_value)
+    samples, taps, q = _room(look.samples, integers, numbers)
     for p in range(first, last):
         slot = p - scratch_first
-        scratch.counts[slot] = 0
         _unpack(query, p * channels, channels, q)
-        n, m = _score(p, q, key, channels, look, bias, samples, taps) if logsum[p] > -np.inf else (0, 0)
+        n, m = 0, 0
+        if logsum[p] > -np.inf:
+            n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
+        counts[slot] = m
         if n == 0:
-            query_out[p * channels : (p + 1) * channels] = 0
+            if wants_query:
+                _fill(q, 0, channels, zero(q))
+                _pack(q, channels, query_out, p * channels)
             continue
-        for j in range(n):
-            samples.weight[j] = exponential(min(samples.score[j] - logsum[p], logsum[p] - logsum[p]))
-        _unpack(gradients.value, p * value_channels, value_channels, seen)
-        inner_products(seen, taps.row, m, value, value_channels, taps.slope)
-        _interpolate(n, m, look, samples, taps.slope, samples.slope)
-        _blame(n, p, samples, statistics, gradients, score_slopes)
-        if len(points_out) > 0:
-            _move(n, p, look, samples, taps, statistics, gradients, score_slopes, points_out)
+        _exponentiate(n, samples, logsum[p])
+        _unpack(value_upstream, p * value_channels, value_channels, q)
+        inner_products(q, taps.row, m, value, value_channels, taps.by_value)
+        _interpolate(n, m, look, samples, taps.by_value, samples.slope)
+        _blame(n, samples, from_index(statistics, 4 * p), from_index(statistics_upstream, 4 * p))
+        if wants_points:
+            _move(
+                n,
+                p,
+                look,
+                samples,
+                taps,
+                from_index(statistics, 4 * p),
+                from_index(statistics_upstream, 4 * p),
+                points_out,
+            )
         if len(bias_out) > 0:
             for j in range(n):
-                bias_out[p * len(look.fractions) + samples.index[j]] = score_slopes[j]
-        _distribute(n, m, look, samples, samples.weight, taps.weight)
-        begin = slot * stride
-        scratch.counts[slot] = m
-        scratch.rows[begin : begin + m] = taps.row[:m]
-        scratch.by_value[begin : begin + m] = taps.weight[:m]
-        _distribute(n, m, look, samples, score_slopes, taps.weight)
-        scratch.by_key[begin : begin + m] = taps.weight[:m]
-        if len(query_out) > 0:
-            weighted_sum(taps.weight, taps.row, m, key, channels, q)
-            for c in range(channels):
-                query_out[p * channels + c] = narrow(query_out, q[c])
+                bias_out[p * look.samples + samples.index[j]] = samples.score_slope[j]
+        _distribute(n, m, look, samples, samples.weight, from_index(by_value, slot * stride))
+        _distribute(n, m, look, samples, samples.score_slope, from_index(by_key, slot * stride))
+        for t in range(m):
+            rows[slot * stride + t] = taps.row[t]
+        if wants_query:
+            weighted_sum(from_index(by_key, slot * stride), taps.row, m, key, channels, q)
+            _pack(q, channels, query_out, p * channels)
