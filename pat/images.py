@@ -52,9 +52,7 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
-        raise ValueError(
-            f"{path}: a picture has 1 or 3 channels, got {planes.shape[0]}: write channels one by one"
-        )
+        raise ValueError(f"{path}: a picture has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
     if not np.isfinite(planes).all():
         raise ValueError(f"{path}: the picture to write has NaN or infinite values")
     content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
@@ -93,9 +91,7 @@ def to_luma_chroma(
     return luma, torch.cat([rgb[..., 0:1, :, :], rgb[..., 2:3, :, :]], -3) - luma
 
 
-def from_luma_chroma(
-    luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 2 h w"]
-) -> Float[Tensor, "*b 3 h w"]:
+def from_luma_chroma(luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 2 h w"]) -> Float[Tensor, "*b 3 h w"]:
     """The inverse of `to_luma_chroma`; not cut to 0..1. Its luminance is `luma`, whatever the chroma."""
     red_weight, green_weight, blue_weight = REC601
     red, blue = chroma[..., 0:1, :, :], chroma[..., 1:2, :, :]
@@ -107,7 +103,7 @@ def _decode(path: Path, label: str) -> NDArray:
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such picture: check the path")
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    coded = _decode_bytes(content) if content.size else None
+    coded = _decode_bytes(content)
     if coded is None:
         raise ValueError(f"{label}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
     return coded
@@ -130,9 +126,7 @@ def _opaque(coded: NDArray, label: str) -> NDArray:
         raise ValueError(f"{label}: has {coded.shape[2]} channels: give a grey (1) or RGB (3) picture")
     full = np.iinfo(coded.dtype).max if np.issubdtype(coded.dtype, np.integer) else 1.0
     if (coded[..., 3] != full).any():
-        raise ValueError(
-            f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha"
-        )
+        raise ValueError(f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha")
     return coded[..., :3]
 
 

@@ -37,9 +37,7 @@ def score(image: Float[Tensor, "_ _ _"], truth: Float[Tensor, "_ _ _"]) -> Score
     pixels.
     """
     if image.shape != truth.shape:
-        raise ValueError(
-            f"the picture is {tuple(image.shape)} and the truth {tuple(truth.shape)}: give equal shapes"
-        )
+        raise ValueError(f"the picture is {tuple(image.shape)} and the truth {tuple(truth.shape)}: give equal shapes")
     if min(image.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
     ours, theirs = (x.detach().cpu().double().numpy() for x in (image, truth))

@@ -1,0 +1,272 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch.autograd import gradcheck, gradgradcheck
+
+from arraygeom.distortion import Distortion
+
+FOCAL = 1000.0
+BROWN = [-0.3, 0.12, 1e-3, -2e-3, -0.02, 0.01, 0.02, -3e-3, 1e-3, -2e-3, 1.5e-3, 7e-4, 0.03, -0.05]
+FISHEYES = [[0.05, -0.01, 0.003, -0.0005], [0.0, 0, 0, 0], [-0.04, -0.009, 0.009, -0.004], [0.3, 0.2, 0.1, 0.05]]
+COUNTS = [4, 5, 8, 12, 14]
+
+
+def brown(n: int = 14) -> Distortion:
+    return Distortion("brown-conrady", torch.tensor(BROWN[:n], dtype=torch.float64))
+
+
+def fisheye(k: list[float]) -> Distortion:
+    return Distortion("kannala-brandt", torch.tensor(k, dtype=torch.float64))
+
+
+def plane_points(n: int = 2000, spread: float = 0.6, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return spread * torch.randn(n, 2, dtype=torch.float64, generator=generator)
+
+
+def directions(n: int = 2000, seed: int = 0) -> torch.Tensor:
+    X = torch.randn(n, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return X / X.norm(dim=-1, keepdim=True)
+
+
+def opencv(d: Distortion, X: torch.Tensor) -> np.ndarray:
+    """OpenCV's pixels for focal length 1 and no principal point, in float64."""
+    coefficients, zero = d.coefficients.numpy(), np.zeros(3)
+    if d.model == "kannala-brandt":
+        return cv2.fisheye.projectPoints(X.numpy()[None], zero, zero, np.eye(3), coefficients)[0][0]
+    return cv2.projectPoints(X.numpy(), zero, zero, np.eye(3), coefficients)[0][:, 0]
+
+
+@pytest.mark.parametrize("n", COUNTS)
+def test_brown_conrady_is_opencvs(n):
+    X = torch.cat([plane_points(), torch.ones(2000, 1)], -1) * torch.linspace(0.1, 30, 2000)[:, None]
+    xy_d, valid = brown(n).project(X.double())
+    error = FOCAL * np.abs(xy_d.numpy() - opencv(brown(n), X))
+    assert valid.float().mean() > 0.95
+    assert error[valid.numpy()].max() < 1e-9
+
+
+@pytest.mark.parametrize("k", FISHEYES)
+def test_fisheye_is_opencvs(k):
+    X = directions()
+    X = X[X[:, 2] > 0.01]
+    xy_d, valid = fisheye(k).project(X)
+    assert valid.float().mean() > 0.9
+    assert FOCAL * np.abs(xy_d.numpy() - opencv(fisheye(k), X))[valid.numpy()].max() < 1e-9
+
+
+@pytest.mark.parametrize("n", COUNTS)
+@pytest.mark.parametrize(("dtype", "pixels"), [(torch.float64, 1e-6), (torch.float32, 0.05)])
+def test_brown_conrady_round_trip(n, dtype, pixels):
+    d, xy = brown(n).to(dtype), plane_points().to(dtype)
+    xy_d, valid = d.distort(xy)
+    back, valid_back = d.undistort(xy_d)
+    assert bool((valid_back | ~valid).all())
+    assert FOCAL * (back - xy)[valid].abs().max() < pixels
+
+
+@pytest.mark.parametrize("k", FISHEYES)
+@pytest.mark.parametrize(("dtype", "pixels"), [(torch.float64, 1e-6), (torch.float32, 0.05)])
+def test_fisheye_round_trip_all_round(k, dtype, pixels):
+    d, X = fisheye(k).to(dtype), directions().to(dtype)
+    xy_d, valid = d.project(X)
+    ray, valid_back = d.unproject(xy_d)
+    assert bool((valid_back | ~valid).all())
+    assert FOCAL * (ray - X)[valid].abs().max() < pixels
+    assert (ray.norm(dim=-1) - 1).abs().max() < 1e-6
+
+
+@pytest.mark.parametrize("d", [brown(), fisheye(FISHEYES[0])], ids=lambda d: d.model)
+def test_unproject_is_undistort_ahead(d):
+    xy_d = plane_points(spread=0.3)
+    ray, valid = d.unproject(xy_d)
+    xy, valid_too = d.undistort(xy_d)
+    both = valid & valid_too
+    assert both.float().mean() > 0.9
+    torch.testing.assert_close((ray[..., :2] / ray[..., 2:])[both], xy[both], rtol=1e-12, atol=1e-12)
+    assert bool((d.distort(xy)[0] - xy_d)[both].abs().max() < 1e-12)
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from(COUNTS), st.sampled_from([torch.float32, torch.float64]))
+def test_any_brown_conrady_lens(seed, n, dtype):
+    """Whatever the coefficients: nothing wild, and what is valid comes back."""
+    generator = torch.Generator().manual_seed(seed)
+    scale = torch.tensor([0.5, 0.5, 0.01, 0.01, 0.3, 0.5, 0.3, 0.1, 0.01, 0.01, 0.01, 0.01, 0.1, 0.1])
+    c = (torch.randn(14, generator=generator) * scale)[:n].to(dtype)
+    d, xy = Distortion("brown-conrady", c), plane_points(300, 1.0, seed).to(dtype)
+    xy_d, valid = d.distort(xy)
+    back, valid_back = d.undistort(xy_d)
+    assert bool(xy_d.isfinite().all() & back.isfinite().all())
+    if dtype == torch.float64:
+        assert bool((valid_back | ~valid).all())
+        assert bool((FOCAL * (back - xy)[valid].abs() < 1e-6).all())
+    else:
+        assert (valid & ~valid_back).sum() <= 1
+
+
+def test_past_the_turn_is_invalid_and_bounded():
+    """k1 = -0.1: r - 0.1 r^3 turns where 1 = 0.3 r^2, at r = 1.82574, where it is 2/3 of r."""
+    d, turn = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64)), 0.3**-0.5
+    xy = torch.tensor([[0, turn * 0.999], [0, turn * 1.001], [30.0, 40.0], [0, 1e30]], dtype=torch.float64)
+    xy_d, valid = d.distort(xy)
+    assert valid.tolist() == [True, False, False, False]
+    assert xy_d.norm(dim=-1).max() <= turn * 2 / 3 + 1e-6
+    _, valid_back = d.undistort(torch.tensor([[0, turn * 0.6666], [0, turn * 0.6668]], dtype=torch.float64))
+    assert valid_back.tolist() == [True, False]
+
+
+def test_a_second_rise_is_not_valid():
+    """k1 = -1, k2 = 0.3: falls between r^2 = 0.46 and 1.4 and rises again beyond; only the first rise counts."""
+    d = Distortion("brown-conrady", torch.tensor([-1, 0.3, 0, 0], dtype=torch.float64))
+    _, valid = d.distort(torch.tensor([[0.6, 0.0], [1.0, 0.0], [2.0, 0.0]], dtype=torch.float64))
+    assert valid.tolist() == [True, False, False]
+
+
+def test_poles_are_not_crossed():
+    """k4 = -1: 1 / (1 - r^2) is infinite at 1 and negative beyond."""
+    d = Distortion("brown-conrady", torch.tensor([0, 0, 0, 0, 0, -1.0, 0, 0], dtype=torch.float64))
+    xy_d, valid = d.distort(torch.tensor([[0.9, 0.0], [1.0, 0.0], [1.1, 0.0]], dtype=torch.float64))
+    assert valid.tolist() == [True, False, False]
+    assert xy_d.abs().max() < 20
+
+
+def test_tangential_fold_is_invalid():
+    """p1 = 0.1: dy'/dy = 1 + 0.6 y, so the lens mirrors below y = -1.67; dx'/dx too below y = -5."""
+    d = Distortion("brown-conrady", torch.tensor([0, 0, 0.1, 0], dtype=torch.float64))
+    _, valid = d.distort(torch.tensor([[0, -1.6], [0, -1.7], [0, -7.0]], dtype=torch.float64))
+    assert valid.tolist() == [True, False, False]
+
+
+def test_points_behind_a_perspective_camera_are_invalid():
+    X = torch.tensor([[0.1, 0.1, 1], [0.1, 0.1, 0], [0.1, 0.1, -1], [0, 0, 0], [1, 0, 1e-9]], dtype=torch.float64)
+    xy_d, valid = brown().project(X)
+    assert valid.tolist() == [True, False, False, False, False]
+    assert bool(xy_d.isfinite().all())
+
+
+def test_fisheye_sees_behind_itself():
+    """With no coefficients theta is the radius: 90 degrees right is (pi/2, 0), straight back has no image."""
+    X = torch.tensor([[1, 0, 0], [0, 1, -1], [0, 0, -1], [0, 0, 0], [0, 0, 2]], dtype=torch.float64)
+    xy_d, valid = fisheye([0, 0, 0, 0]).project(X)
+    assert valid.tolist() == [True, True, False, False, True]
+    torch.testing.assert_close(xy_d[0], torch.tensor([np.pi / 2, 0], dtype=torch.float64))
+    torch.testing.assert_close(xy_d[1], torch.tensor([0, 3 * np.pi / 4], dtype=torch.float64))
+    _, no_pinhole_point = fisheye([0, 0, 0, 0]).undistort(xy_d[:2])
+    assert not no_pinhole_point.any()
+
+
+def test_fisheye_past_the_turn():
+    """k1 = -0.1 turns at theta = 1.82574, 104.6 degrees."""
+    d, turn = fisheye([-0.1, 0, 0, 0]), 0.3**-0.5
+    theta = torch.tensor([turn - 0.01, turn + 0.01, 3.0], dtype=torch.float64)
+    xy_d, valid = d.project(torch.stack([theta.sin(), 0 * theta, theta.cos()], -1))
+    assert valid.tolist() == [True, False, False]
+    assert xy_d.abs().max() <= turn * 2 / 3 + 1e-6
+    ray, valid = d.unproject(torch.tensor([[1.21, 0.0], [1.22, 0.0], [1e6, 0.0]], dtype=torch.float64))
+    assert valid.tolist() == [True, False, False]
+    torch.testing.assert_close(ray.norm(dim=-1), torch.ones(3, dtype=torch.float64))
+
+
+def test_fisheye_near_the_axis_in_float32():
+    d = fisheye(FISHEYES[0])
+    radii = torch.logspace(-12, 0, 200, dtype=torch.float32)
+    X = torch.stack([radii, -0.5 * radii, torch.ones_like(radii)], -1)
+    single, valid = d.to(torch.float32).project(X)
+    double, _ = d.project(X.double())
+    assert bool(valid.all())
+    assert ((single - double) / double).abs().max() < 1e-6
+    ray, _ = d.to(torch.float32).unproject(single)
+    assert ((ray[:, :2] / ray[:, 2:] - X[:, :2]) / X[:, :2]).abs().max() < 2e-6
+
+
+def test_derivatives_on_the_axis_in_float32():
+    """On the axis the map is the identity to second order: Jacobian I, Hessian 0."""
+    for d in (brown().to(torch.float32), fisheye(FISHEYES[0]).to(torch.float32)):
+        zero = torch.zeros(2)
+        lens = Distortion(d.model, d.coefficients[:4])
+        for f in (lens.distort, lens.undistort):
+            J = torch.autograd.functional.jacobian(lambda x, f=f: f(x)[0], zero)
+            torch.testing.assert_close(J, torch.eye(2))
+    H = torch.autograd.functional.hessian(lambda x: lens.distort(x)[0].sum(), zero)
+    torch.testing.assert_close(H, torch.zeros(2, 2))
+
+
+def valid_points(d: Distortion, n: int = 3) -> torch.Tensor:
+    """A few distorted points well inside, the axis among them."""
+    return torch.cat([plane_points(n, 0.25), torch.zeros(1, 2)]).double()
+
+
+@pytest.mark.parametrize("d", [brown(5), brown(14), fisheye(FISHEYES[2])], ids=["5", "14", "fisheye"])
+@pytest.mark.parametrize("method", ["distort", "undistort", "project", "unproject"])
+def test_derivatives(d, method):
+    points = valid_points(d)
+    if method == "project":
+        points = torch.cat([points, torch.full((4, 1), 0.7)], -1).double()
+    inputs = (d.coefficients.clone().requires_grad_(), points.requires_grad_())
+
+    def f(c, p):
+        return getattr(Distortion(d.model, c), method)(p)[0]
+
+    assert gradcheck(f, inputs)
+    assert gradgradcheck(f, inputs)
+
+
+def test_fisheye_derivatives_beyond_90_degrees():
+    X = torch.tensor([[1.0, 0.2, -0.3], [-0.5, 0.7, 0.0]], dtype=torch.float64, requires_grad=True)
+    c = torch.tensor(FISHEYES[0], dtype=torch.float64, requires_grad=True)
+    assert gradgradcheck(lambda c, X: Distortion("kannala-brandt", c).project(X)[0], (c, X))
+    xy_d = Distortion("kannala-brandt", c).project(X)[0].detach().requires_grad_()
+    assert gradgradcheck(lambda c, x: Distortion("kannala-brandt", c).unproject(x)[0], (c, xy_d))
+
+
+@pytest.mark.parametrize("d", [brown(), fisheye(FISHEYES[0])], ids=lambda d: d.model)
+def test_gradients_are_finite_where_points_are_not_valid(d):
+    X = torch.tensor([[0, 0, -1], [0, 0, 0], [50, 0, 1e-3], [1, 1, -1], [torch.nan, 0, 1]], dtype=torch.float64)
+    c = d.coefficients.clone().requires_grad_()
+    lens, X = Distortion(d.model, c), X.requires_grad_()
+    xy_d, _ = lens.project(X)
+    far = torch.tensor([[9.0, 9.0], [torch.inf, 0]], dtype=torch.float64, requires_grad=True)
+    total = xy_d.sum() + lens.undistort(far)[0].sum() + lens.unproject(far)[0].sum()
+    assert bool(total.isfinite())
+    assert all(bool(g.isfinite().all()) for g in torch.autograd.grad(total, (c, X, far)))
+
+
+def test_not_finite_points_are_invalid():
+    bad = torch.tensor([[torch.nan, 0.1], [torch.inf, 0.1], [0.1, 0.1]], dtype=torch.float64)
+    for d in (brown(), fisheye(FISHEYES[0])):
+        for method in (d.distort, d.undistort, d.unproject):
+            value, valid = method(bad)
+            assert valid.tolist() == [False, False, True]
+            assert bool(value.isfinite().all())
+
+
+@pytest.mark.parametrize("d", [brown(), fisheye(FISHEYES[0])], ids=lambda d: d.model)
+def test_a_batch_of_lenses_is_each_lens(d):
+    factors = torch.tensor([0.5, 1.0, 1.5], dtype=torch.float64)
+    batch = Distortion(d.model, factors[:, None] * d.coefficients)
+    xy = plane_points(3 * 40).reshape(3, 4, 10, 2)
+    for method in ("distort", "undistort", "unproject"):
+        values, valid = getattr(batch, method)(xy)
+        for i in range(3):
+            one, one_valid = getattr(Distortion(d.model, factors[i] * d.coefficients), method)(xy[i])
+            torch.testing.assert_close(values[i], one, rtol=1e-9, atol=1e-9)
+            assert torch.equal(valid[i], one_valid)
+
+
+def test_no_points():
+    for d in (brown(), fisheye(FISHEYES[0])):
+        assert d.undistort(torch.zeros(0, 2).double())[0].shape == (0, 2)
+        assert d.project(torch.zeros(4, 0, 3).double())[0].shape == (4, 0, 2)
+
+
+def test_what_does_not_exist_is_refused():
+    with pytest.raises(ValueError, match="unknown lens model 'fov'"):
+        Distortion("fov", torch.zeros(1))
+    with pytest.raises(ValueError, match="4 or 5 or 8 or 12 or 14 coefficients, got 6"):
+        Distortion("brown-conrady", torch.zeros(6))
+    with pytest.raises(ValueError, match="takes 4 coefficients, got 5"):
+        Distortion("kannala-brandt", torch.zeros(5))
