@@ -45,9 +45,9 @@ def mean_shift(batch: ArrayBatch) -> torch.Tensor:
 def test_depth_and_cameras_foretell_the_other_view(smooth, mode, resolution):
     batch = draw(smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)))
     across = look_across(batch)
-    assert across.visible.float().mean() > 0.4
+    assert across.visible.float().mean() > 0.3
     error = (across.image - batch.images[0]).abs().amax(1)[across.visible]
-    assert error.median() < 0.004
+    assert error.median() < 0.012
     assert error.quantile(0.9) < 0.05
 
 
@@ -55,7 +55,7 @@ def test_depth_and_cameras_foretell_the_other_view(smooth, mode, resolution):
 @pytest.mark.parametrize("resolution", [1.0, 0.5, 0.25])
 def test_no_shift_between_views_of_different_resolution(smooth, mode, resolution):
     batch = draw(smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)), 12, 3)
-    assert mean_shift(batch).abs().max() < 0.03
+    assert mean_shift(batch).abs().max() < 0.03 / resolution
 
 
 def test_occlusion_is_seen_from_both_sides(rich):
