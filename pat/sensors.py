@@ -24,6 +24,7 @@ from torch.nn.functional import conv2d, interpolate, pad
 from arraygeom.pixels import HW, resize_matrix
 from arraygeom.sensor import Band
 
+Number = float | int
 _RGB_NANOMETRES = (600.0, 540.0, 460.0)
 _RGB_SIGMA = 35.0
 _REC601 = (0.299, 0.587, 0.114)
@@ -81,7 +82,7 @@ class Coded(Step):
 class Exposure(Step):
     """Linear light times a gain: exposure time, aperture and amplification together."""
 
-    gain: float | Tensor
+    gain: Number | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The brighter or darker pictures, not clipped."""
@@ -149,7 +150,7 @@ class BoxBlur(Step):
 class GaussianBlur(Step):
     """Uniform Gaussian defocus; sigma in pixels."""
 
-    sigma: float | Tensor
+    sigma: Number | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The blurred pictures."""
@@ -164,7 +165,7 @@ class GaussianBlur(Step):
 class DiscBlur(Step):
     """Uniform defocus by a round aperture: the mean over a disc, its radius in pixels, its rim one pixel soft."""
 
-    radius: float | Tensor
+    radius: Number | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The blurred pictures."""
@@ -190,7 +191,7 @@ class Resample(Step):
     the usual antialiased resize with a = -0.5.
     """
 
-    to: float | HW
+    to: Number | HW
     method: Literal["area", "bicubic"] = "area"
 
     def hw(self, hw: HW) -> HW:
@@ -228,8 +229,8 @@ class Noise(Step):
     differentiable; true Poisson counts differ visibly below about ten electrons only.
     """
 
-    full_well: float
-    read: float = 0.0
+    full_well: Number
+    read: Number = 0.0
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The noisy pictures, not clipped."""
@@ -267,9 +268,9 @@ class Jitter(Step):
     for coded values.
     """
 
-    gain: float = 0.05
-    gamma: float = 0.05
-    balance: float = 0.03
+    gain: Number = 0.05
+    gamma: Number = 0.05
+    balance: Number = 0.03
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The changed pictures."""

@@ -14,7 +14,7 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose, rotation_from_vector
 
-Range = tuple[float, float]
+Range = tuple[float | int, float | int]
 
 
 @dataclass(frozen=True)
