@@ -65,9 +65,7 @@ class Attended(NamedTuple):
     peak: Tensor
 
 
-def attend(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
-) -> Attended:
+def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
     """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
     accumulate = torch.float64 if query.dtype == torch.float64 else torch.float32
     with torch.autocast(query.device.type, enabled=False):

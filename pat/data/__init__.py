@@ -1,1 +1,27 @@
 """Pairs and arrays on disk."""
+
+from pat.data.pairs import (
+    Calibration,
+    Disparity,
+    StereoPair,
+    flickr_pairs,
+    folder_pairs,
+    kitti_pairs,
+    middlebury_pairs,
+    syntim_pairs,
+)
+from pat.data.protocol import MonoColourTask, mono_colour_task, reduce_by
+
+__all__ = [
+    "Calibration",
+    "Disparity",
+    "MonoColourTask",
+    "StereoPair",
+    "flickr_pairs",
+    "folder_pairs",
+    "kitti_pairs",
+    "middlebury_pairs",
+    "mono_colour_task",
+    "reduce_by",
+    "syntim_pairs",
+]

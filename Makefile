@@ -1,0 +1,64 @@
+# Only python3 (3.11 or newer) and make are needed: every target makes the environment first.
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.ready
+PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input --constraint constraints.txt
+
+.PHONY: help env demo test test-long check format bench train
+
+help:
+	@echo "make demo       fuse the sample array into out/demo"
+	@echo "make test       the tests"
+	@echo "make test-long  the tests, longer ones included"
+	@echo "make check      format, lint and types"
+	@echo "make format     put the format right, and what lint can repair"
+	@echo "make bench      measure attention"
+	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
+	@echo "make env        only the environment, in $(VENV)"
+
+env: $(READY)
+
+demo: $(READY)
+	@echo "== fusing the sample array into out/demo"
+	@$(BIN)/pat demo --out out/demo
+
+test: $(READY)
+	@echo "== tests"
+	@$(BIN)/python -m pytest -m "not slow"
+
+test-long: $(READY)
+	@echo "== tests, longer ones included"
+	@$(BIN)/python -m pytest
+
+check: $(READY)
+	@echo "== format"
+	@$(BIN)/ruff format --check .
+	@echo "== lint"
+	@$(BIN)/ruff check .
+	@echo "== types"
+	@$(BIN)/mypy
+
+format: $(READY)
+	@$(BIN)/ruff format .
+	@$(BIN)/ruff check --fix .
+
+bench: $(READY)
+	@$(BIN)/python -m tests.benchmarks.bench_attention
+
+train: $(READY)
+	@$(BIN)/pat train $(ARGS)
+
+# An environment that works is kept and brought up to date; one that does not is made anew. torch goes first, alone
+# and by its exact version, so that nothing else chooses a build of it.
+$(READY): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "Python 3.11 or newer is needed, $(PYTHON) is " + sys.version.split()[0])'
+	@echo "== making the environment in $(VENV) (once; some minutes)"
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || $(PYTHON) -m venv --clear $(VENV) \
+		|| { echo "$(PYTHON) cannot make environments; on Debian and Ubuntu: apt-get install python3-venv"; exit 1; }
+	@echo "== installing torch, the largest part"
+	@$(PIP) torch
+	@echo "== installing the rest"
+	@$(PIP) --editable '.[dev]'
+	@touch $@

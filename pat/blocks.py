@@ -1,0 +1,53 @@
+"""The convolutional blocks that the networks are made of."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class ResidualBlock(nn.Module):
+    """x + conv(leaky(conv(x))), both 3x3."""
+
+    def __init__(self, dim: int, *, dilation: int = 1) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(dim, dim, 3, padding=dilation, dilation=dilation)
+        self.second = nn.Conv2d(dim, dim, 3, padding=1)
+        self.act = nn.LeakyReLU(0.1, inplace=True)
+
+    def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
+        """The same size and channels."""
+        return x + self.second(self.act(self.first(x)))
+
+
+class ResidualASPP(nn.Module):
+    """Three groups of atrous convolutions (dilations 1, 4, 8), each fused by 1x1 and added (Wang et al. 2019)."""
+
+    def __init__(self, dim: int, dilations: tuple[int, ...] = (1, 4, 8)) -> None:
+        super().__init__()
+        self.groups = nn.ModuleList(
+            nn.ModuleList(nn.Conv2d(dim, dim, 3, padding=d, dilation=d, bias=False) for d in dilations)
+            for _ in range(3)
+        )
+        self.fuse = nn.ModuleList(nn.Conv2d(dim * len(dilations), dim, 1, bias=False) for _ in range(3))
+        self.act = nn.LeakyReLU(0.1, inplace=True)
+
+    def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
+        """The same size and channels; each group works on the result of the one before."""
+        total, y = x, x
+        for group, fuse in zip(self.groups, self.fuse):
+            assert isinstance(group, nn.ModuleList)
+            y = fuse(torch.cat([self.act(conv(y)) for conv in group], 1))
+            total = total + y
+        return total
+
+
+def conv(inputs: int, outputs: int, *, stride: int = 1) -> nn.Sequential:
+    """A 3x3 convolution and its activation."""
+    return nn.Sequential(nn.Conv2d(inputs, outputs, 3, stride=stride, padding=1), nn.LeakyReLU(0.1, inplace=True))
+
+
+def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:
+    """Bilinear, by the pixel-area convention c' = (c + 0.5) factor - 0.5."""
+    return nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)

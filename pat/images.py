@@ -1,0 +1,170 @@
+"""Pictures on disk and their colours.
+
+A picture in memory is a float tensor (C, H, W), 0..1, in the coding the file has (sRGB for ordinary
+pictures), colours in the order red, green, blue. Files appear whole or not at all.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from uuid import uuid4
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+REC601 = (0.299, 0.587, 0.114)
+"""Weights of red, green and blue in luminance, on coded values (ITU-R BT.601)."""
+
+_LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
+
+
+def read_image(path: str | Path, *, name: str | None = None) -> Float[Tensor, "c h w"]:
+    """The picture in a PNG, TIFF, JPEG or PNM file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+
+    8-bit values are divided by 255 and 16-bit ones by 65535: a 12-bit camera that stores 0..4095 in 16 bits
+    reads as a dark picture. Float files must hold 0..1. A wholly opaque alpha channel is dropped. Rotation
+    tags (EXIF) are ignored: pixels are where the sensor, hence its calibration, has them. `name` (such as a
+    camera's) goes in front of error messages.
+
+    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable picture.
+    """
+    path = Path(path)
+    label = f"{name}: {path}" if name else f"{path}"
+    coded = _opaque(_decode(path, label), label)
+    planes = coded[None] if coded.ndim == 2 else coded[..., ::-1].transpose(2, 0, 1)
+    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label)))
+
+
+def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
+    """Write a grey or RGB picture, whole or not at all, in the format its name ends in (.png, .tif, .jpg).
+
+    8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif only) keep
+    floats as they are. Raises ValueError for a picture with NaN or another number of channels, and for a
+    format that cannot hold it.
+    """
+    path = Path(path)
+    planes = image.detach().cpu().numpy()
+    if planes.shape[0] not in (1, 3):
+        raise ValueError(f"{path}: a picture has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
+    if not np.isfinite(planes).all():
+        raise ValueError(f"{path}: the picture to write has NaN or infinite values")
+    content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(content)
+
+
+@contextmanager
+def write_atomically(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` to write to; it takes `path`'s place when the block ends without error.
+
+    After an error the temporary file is gone and a former `path` is as it was. The temporary name ends as
+    `path` does, so that writers that choose the format by suffix choose the same. Missing folders are made.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.stem}-{uuid4().hex}{path.suffix}")
+    try:
+        yield temporary
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def luminance(rgb: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 1 h w"]:
+    """Rec. 601 luma of coded values, 0.299 R + 0.587 G + 0.114 B: MATLAB's rgb2gray, and OpenCV's."""
+    weights = rgb.new_tensor(REC601)
+    return (rgb * weights[:, None, None]).sum(-3, keepdim=True)
+
+
+def to_luma_chroma(
+    rgb: Float[Tensor, "*b 3 h w"],
+) -> tuple[Float[Tensor, "*b 1 h w"], Float[Tensor, "*b 2 h w"]]:
+    """Luminance Y and the colour differences (R - Y, B - Y), which are zero for grey."""
+    luma = luminance(rgb)
+    return luma, torch.cat([rgb[..., 0:1, :, :], rgb[..., 2:3, :, :]], -3) - luma
+
+
+def from_luma_chroma(luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 2 h w"]) -> Float[Tensor, "*b 3 h w"]:
+    """The inverse of `to_luma_chroma`; not cut to 0..1. Its luminance is `luma`, whatever the chroma."""
+    red_weight, green_weight, blue_weight = REC601
+    red, blue = chroma[..., 0:1, :, :], chroma[..., 1:2, :, :]
+    green = -(red_weight * red + blue_weight * blue) / green_weight
+    return torch.cat([red, green, blue], -3) + luma
+
+
+def _decode(path: Path, label: str) -> NDArray:
+    if not path.is_file():
+        raise FileNotFoundError(f"{label}: no such picture: check the path")
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    coded = _decode_bytes(content)
+    if coded is None:
+        raise ValueError(f"{label}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
+    return coded
+
+
+def _decode_bytes(content: NDArray) -> NDArray | None:
+    level = cv2.setLogLevel(0)
+    try:
+        return cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        cv2.setLogLevel(level)
+
+
+def _opaque(coded: NDArray, label: str) -> NDArray:
+    if coded.ndim == 2 or coded.shape[2] == 3:
+        return coded
+    if coded.shape[2] != 4:
+        raise ValueError(f"{label}: has {coded.shape[2]} channels: give a grey (1) or RGB (3) picture")
+    full = np.iinfo(coded.dtype).max if np.issubdtype(coded.dtype, np.integer) else 1.0
+    if (coded[..., 3] != full).any():
+        raise ValueError(f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha")
+    return coded[..., :3]
+
+
+def _unit_range(planes: NDArray, label: str) -> NDArray[np.float32]:
+    if planes.dtype in (np.uint8, np.uint16):
+        return planes.astype(np.float32) / np.float32(np.iinfo(planes.dtype).max)
+    if not np.issubdtype(planes.dtype, np.floating):
+        raise ValueError(
+            f"{label}: has {planes.dtype} values: save it with 8 or 16 bits without sign, or as float 0..1"
+        )
+    if not np.isfinite(planes).all():
+        raise ValueError(f"{label}: has NaN or infinite values: replace them before fusing")
+    low, high = float(planes.min()), float(planes.max())
+    if low < 0 or high > 1:
+        raise ValueError(f"{label}: has float values from {low:g} to {high:g}: scale them to 0..1")
+    return planes.astype(np.float32)
+
+
+def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
+    suffix = path.suffix.lower()
+    if suffix in (".jpg", ".jpeg") and bits != 8:
+        raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
+    if bits == 32 and suffix not in (".tif", ".tiff"):
+        raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")
+    try:
+        # Without the option OpenCV writes float colours as LogLuv, which has 3 digits.
+        done, content = cv2.imencode(suffix, _quantised(colours, bits), _LZW if bits == 32 else [])
+    except cv2.error:
+        done = False
+    if not done:
+        raise ValueError(f"{path}: cannot write a picture named so: end the name in .png, .tif or .jpg")
+    return content.tobytes()
+
+
+def _quantised(colours: NDArray, bits: int) -> NDArray:
+    if bits == 32:
+        return colours.astype(np.float32)
+    if bits not in (8, 16):
+        raise ValueError(f"bits must be 8, 16 or 32 (float), got {bits}")
+    kind = np.uint8 if bits == 8 else np.uint16
+    return np.rint(np.clip(colours, 0, 1).astype(np.float64) * np.iinfo(kind).max).astype(kind)

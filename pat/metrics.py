@@ -1,0 +1,81 @@
+"""How good a picture or a disparity is: PSNR, SSIM, end-point error, and how sure a mean is."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from torch import Tensor
+
+SSIM_WINDOW = 11
+"""Side of the SSIM window in pixels: a Gaussian of sigma 1.5 cut at 3.5 sigma."""
+
+
+class Score(NamedTuple):
+    """PSNR in dB (infinite for equal pictures) and SSIM (1 for equal pictures)."""
+
+    psnr: float
+    ssim: float
+
+
+class DisparityScore(NamedTuple):
+    """Mean absolute error in pixels, and the share of pixels whose error is at most one pixel."""
+
+    end_point_error: float
+    within_one: float
+
+
+def score(image: Float[Tensor, "_ _ _"], truth: Float[Tensor, "_ _ _"]) -> Score:
+    """PSNR over all channels, and the mean SSIM of the channels, by scikit-image; values 0..1.
+
+    SSIM as in Wang et al. 2004: Gaussian window of sigma 1.5 (11 x 11), K1 = 0.01, K2 = 0.03, population
+    covariance. Nothing is cut or rounded here. Raises ValueError if the shapes differ or a side is under 11
+    pixels.
+    """
+    if image.shape != truth.shape:
+        raise ValueError(f"the picture is {tuple(image.shape)} and the truth {tuple(truth.shape)}: give equal shapes")
+    if min(image.shape[-2:]) < SSIM_WINDOW:
+        raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
+    ours, theirs = (x.detach().cpu().double().numpy() for x in (image, truth))
+    with np.errstate(divide="ignore"):
+        psnr = peak_signal_noise_ratio(theirs, ours, data_range=1)
+    ssim = structural_similarity(
+        theirs,
+        ours,
+        data_range=1,
+        channel_axis=0,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+    )
+    return Score(float(psnr), float(ssim))
+
+
+def disparity_score(
+    disparity: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
+) -> DisparityScore:
+    """Errors of a disparity, in pixels, where `valid`. Raises ValueError if no pixel is valid."""
+    if not valid.any():
+        raise ValueError("no pixel has a true disparity: nothing to compare with")
+    error = (disparity - truth)[valid].abs().double()
+    return DisparityScore(float(error.mean()), float((error <= 1).double().mean()))
+
+
+def bootstrap_interval(
+    values: Sequence[float], *, confidence: float = 0.95, resamples: int = 10_000, seed: int = 0
+) -> tuple[float, float]:
+    """The percentile bootstrap interval of the mean of `values`; (nan, nan) for fewer than two.
+
+    Efron & Tibshirani 1993, section 13.3. The same seed gives the same interval.
+    """
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be between 0 and 1, got {confidence}")
+    if len(values) < 2:
+        return math.nan, math.nan
+    drawn = np.random.default_rng(seed).choice(np.asarray(values, float), (resamples, len(values)))
+    low, high = np.quantile(drawn.mean(1), [(1 - confidence) / 2, (1 + confidence) / 2])
+    return float(low), float(high)

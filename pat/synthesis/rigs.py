@@ -1,0 +1,169 @@
+"""Random rigs for training: distributions of baselines, focal lengths, rotations and resolutions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+HW = tuple[int, int]
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class View:
+    """One camera of each rig of a batch: K, `cam_from_world` as R and t (metres), and the picture's height and width."""
+
+    K: Float[Tensor, "b 3 3"]
+    R: Float[Tensor, "b 3 3"]
+    t: Float[Tensor, "b 3"]
+    hw: HW
+
+    def resized(self, hw: HW) -> View:
+        """The same camera with another number of pixels: c' = (c + 0.5) s - 0.5, f' = s f along each axis."""
+        s = self.K.new_tensor([hw[1] / self.hw[1], hw[0] / self.hw[0]])
+        K = self.K.clone()
+        K[:, :2, :2] *= s[:, None]
+        K[:, :2, 2] = (self.K[:, :2, 2] + 0.5) * s - 0.5
+        return replace(self, K=K, hw=hw)
+
+
+@dataclass(frozen=True)
+class RigBatch:
+    """The cameras, alpha first, and the depths (metres, along alpha's axis) between which scenes should lie."""
+
+    views: list[View]
+    near: Float[Tensor, "b"]
+    far: Float[Tensor, "b"]
+
+
+@dataclass(frozen=True)
+class RigDistribution:
+    """What random rigs look like. Pairs are ranges; lengths are drawn evenly in their logarithm.
+
+    - `mode`: "rectified" (betas displaced along x alone, their pictures resized copies of alpha's geometry, so
+      that x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
+    - `parallax`: displacement of the nearest depth against infinity, in alpha's pixels; sets the baseline.
+    - `near` in metres and `depth_ratio` = far / near.
+    - `frame`: width of the whole picture as a multiple of alpha's, which is a patch of it; `focal`: focal length
+      as a multiple of that width.
+    - `resolutions`: beta's pixels a radian over alpha's and its size over alpha's; one is drawn for each camera
+      of a batch.
+    - `alpha`, rectified only: whether alpha is the left camera, the right, or either (one draw a rig).
+    - general only: `focal_ratio` (on top of the resolution), `rotation` in degrees about a random axis,
+      `toe_in` (how far betas turn towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how far
+      beta's patch misses alpha's, as a fraction of its size).
+    """
+
+    mode: Literal["rectified", "general"] = "rectified"
+    betas: int = 1
+    parallax: Range = (12.0, 120.0)
+    near: Range = (0.5, 8.0)
+    depth_ratio: Range = (1.5, 40.0)
+    frame: Range = (1.0, 4.0)
+    focal: Range = (0.7, 1.5)
+    resolutions: tuple[float, ...] = (1.0, 0.5, 0.25)
+    alpha: Literal["left", "right", "either"] = "either"
+    focal_ratio: Range = (0.5, 2.0)
+    rotation: float = 4.0
+    toe_in: Range = (0.0, 1.0)
+    decentring: float = 0.1
+
+    def sample(self, batch: int, hw: HW, generator: Generator) -> RigBatch:
+        """`batch` rigs, alpha's pictures being of height and width `hw`, alpha's frame being the world."""
+        near = log_uniform(self.near, (batch,), generator)
+        far = near * log_uniform(self.depth_ratio, (batch,), generator)
+        alpha = self._alpha(batch, hw, generator)
+        beta = self._rectified_beta if self.mode == "rectified" else self._general_beta
+        return RigBatch([alpha] + [beta(alpha, near, far, generator) for _ in range(self.betas)], near, far)
+
+    def _alpha(self, batch: int, hw: HW, g: Generator) -> View:
+        h, w = hw
+        width = w * log_uniform(self.frame, (batch,), g)
+        height = torch.clamp(0.7 * width, min=h)
+        corner = uniform((0, 1), (batch, 2), g) * (torch.stack([width, height], -1) - torch.tensor([w, h]))
+        K = torch.eye(3, dtype=torch.float64).repeat(batch, 1, 1)
+        K[:, 0, 0] = K[:, 1, 1] = width * log_uniform(self.focal, (batch,), g)
+        K[:, :2, 2] = torch.stack([width, height], -1) / 2 - corner - 0.5
+        return View(K, torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), torch.zeros(batch, 3).double(), hw)
+
+    def _baseline(self, alpha: View, near: Tensor, g: Generator) -> Tensor:
+        return log_uniform(self.parallax, near.shape, g) * near / alpha.K[:, 0, 0]
+
+    def _resolution(self, g: Generator) -> float:
+        return self.resolutions[int(torch.randint(len(self.resolutions), (), generator=g))]
+
+    def _rectified_beta(self, alpha: View, near: Tensor, far: Tensor, g: Generator) -> View:
+        drawn = torch.randint(2, near.shape, generator=g) * 2 - 1
+        side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[self.alpha]
+        t = torch.zeros_like(alpha.t)
+        t[:, 0] = -side * self._baseline(alpha, near, g)
+        return replace(alpha, t=t).resized(scaled(alpha.hw, self._resolution(g)))
+
+    def _general_beta(self, alpha: View, near: Tensor, far: Tensor, g: Generator) -> View:
+        """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the picture."""
+        batch, resolution = len(near), self._resolution(g)
+        hw = scaled(alpha.hw, resolution)
+        centre = self._baseline(alpha, near, g)[:, None] * _direction(batch, g)
+        depth = 1 / torch.lerp(1 / far, 1 / near, uniform((0, 1), (batch,), g))
+        target = _middle_ray(alpha) * depth[:, None]
+        turn = uniform(self.toe_in, (batch, 1), g) * _turn_towards(target - centre, target)
+        wobble = math.radians(self.rotation) * torch.randn(batch, 3, generator=g, dtype=torch.float64) / 2
+        R = rotation(wobble) @ rotation(turn)
+        t = -(R @ centre[..., None])[..., 0]
+        K = alpha.K.clone()
+        K[:, 0, 0] *= resolution * log_uniform(self.focal_ratio, (batch,), g)
+        K[:, 1, 1] = K[:, 0, 0]
+        seen = (R @ target[..., None])[..., 0] + t
+        size = torch.tensor([hw[1], hw[0]], dtype=torch.float64)
+        middle = (size - 1) / 2 + uniform((-self.decentring, self.decentring), (batch, 2), g) * size
+        K[:, :2, 2] = middle - K[:, :1, 0] * seen[:, :2] / seen[:, 2:]
+        return View(K, R, t, hw)
+
+
+def scaled(hw: HW, s: float) -> HW:
+    """The size s times as large, rounded."""
+    return round(hw[0] * s), round(hw[1] * s)
+
+
+def uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:
+    """Float64 values even between the bounds."""
+    low, high = bounds
+    return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+
+def log_uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:
+    """Float64 values whose logarithm is even between the bounds'."""
+    return uniform((math.log(bounds[0]), math.log(bounds[1])), shape, generator).exp()
+
+
+def rotation(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """Rotation matrix of a rotation vector in radians."""
+    x, y, z = vector.unbind(-1)
+    o = torch.zeros_like(x)
+    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3)))
+
+
+def _direction(batch: int, g: Generator) -> Tensor:
+    """Unit vectors, mostly across the optical axis."""
+    v = torch.randn(batch, 3, generator=g, dtype=torch.float64) * torch.tensor([1, 0.7, 0.25])
+    return v / v.norm(dim=-1, keepdim=True)
+
+
+def _middle_ray(view: View) -> Tensor:
+    h, w = view.hw
+    middle = torch.tensor([(w - 1) / 2, (h - 1) / 2, 1], dtype=torch.float64)
+    return (torch.linalg.inv(view.K) @ middle[:, None])[..., 0]
+
+
+def _turn_towards(direction: Tensor, old: Tensor) -> Tensor:
+    """Rotation vector that takes `direction` to where `old` was, so that beta sees it as alpha does."""
+    a, b = (v / v.norm(dim=-1, keepdim=True) for v in (direction, old))
+    axis = torch.linalg.cross(a, b)
+    sine = axis.norm(dim=-1, keepdim=True)
+    angle = torch.atan2(sine, (a * b).sum(-1, keepdim=True))
+    return axis * angle / sine.clamp(min=1e-12)

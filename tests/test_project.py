@@ -1,0 +1,171 @@
+"""The project agrees with itself: names, versions, layers, and what its documents say."""
+
+import ast
+import doctest
+import importlib
+import importlib.metadata
+import inspect
+import os
+import re
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("arraygeom", "pat", "calib")
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS = {"bpy", "OpenEXR", "Imath", "triton", "jupyterlab", "panel", "plotly"}
+"""Modules that need not be installed."""
+
+READING_FILES = {
+    *("open", "read_text", "read_bytes", "write_text", "write_bytes", "safe_load"),
+    *("imread", "imwrite", "FileStorage", "loadtxt", "savetxt", "genfromtxt", "loadmat", "fromfile", "tofile"),
+}
+
+
+def sources(*packages: str) -> list[Path]:
+    return [path for package in packages for path in sorted((ROOT / package).rglob("*.py"))]
+
+
+def imports(path: Path) -> set[str]:
+    """The outermost names of all modules that a file imports from other packages."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            names.add(node.module.partition(".")[0])
+    return names
+
+
+def names(path: Path) -> set[str]:
+    """All names that a file's code uses: variables, attributes, imported names."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Name):
+            found.add(node.id)
+        elif isinstance(node, ast.Attribute):
+            found.add(node.attr)
+        elif isinstance(node, ast.alias):
+            found.add(node.name.rpartition(".")[2])
+    return found
+
+
+def module_name(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def load(path: Path):
+    try:
+        return importlib.import_module(module_name(path))
+    except ModuleNotFoundError as error:
+        if error.name in EXTRAS:
+            pytest.skip(f"{error.name} is not installed")
+        raise
+
+
+def each(paths: list[Path]):
+    return pytest.mark.parametrize("path", paths, ids=module_name)
+
+
+def pins() -> dict[str, list[Requirement]]:
+    lines = (ROOT / "constraints.txt").read_text().splitlines()
+    found: dict[str, list[Requirement]] = {}
+    for pin in (Requirement(line) for line in lines if line and not line.startswith("#")):
+        found.setdefault(canonicalize_name(pin.name), []).append(pin)
+    return found
+
+
+def blocks(document: str, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", (ROOT / document).read_text(), re.M | re.S)
+
+
+def test_arraygeom_knows_nothing_of_pat_and_calib():
+    assert {p.name: imports(p) & {"pat", "calib"} for p in sources("arraygeom") if imports(p) & {"pat", "calib"}} == {}
+
+
+def test_arraygeom_has_no_network():
+    assert [p.name for p in sources("arraygeom") if names(p) & {"Module", "Parameter", "Sequential"}] == []
+
+
+def test_one_module_uses_grid_sample():
+    assert [module_name(p) for p in sources(*PACKAGES) if "grid_sample" in names(p)] == ["arraygeom.sampling"]
+
+
+def test_arraygeom_touches_files_only_in_io():
+    assert {
+        p.name: names(p) & READING_FILES
+        for p in sources("arraygeom")
+        if names(p) & READING_FILES and "io" not in p.relative_to(ROOT).parts
+    } == {}
+
+
+def test_arraygeom_draws_only_in_viz():
+    assert [p.name for p in sources("arraygeom") if imports(p) & {"matplotlib", "plotly"} and p.stem != "viz"] == []
+
+
+def test_at_most_one_module_imports_blender():
+    assert len([p for p in sources(*PACKAGES) if "bpy" in imports(p)]) <= 1
+
+
+@each([p for p in sources(*PACKAGES) if p.name == "__init__.py"])
+def test_public_names_exist_and_are_documented(path):
+    module = load(path)
+    for name in getattr(module, "__all__", []):
+        value = getattr(module, name)
+        if inspect.isclass(value) or inspect.isfunction(value):
+            assert value.__doc__, f"{name} has no docstring"
+            assert not value.__doc__.startswith(f"{name}("), f"{name} has only the docstring Python made"
+
+
+@each([p for p in sources(*PACKAGES) if ">>>" in p.read_text()])
+def test_examples_in_docstrings(path):
+    results = doctest.testmod(load(path))
+    assert results.attempted
+    assert not results.failed
+
+
+def test_one_version():
+    newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.M)
+    assert newest
+    assert newest[1] == PROJECT["version"] == importlib.metadata.version(PROJECT["name"])
+
+
+def test_what_is_asked_for_is_pinned_exactly_and_in_range():
+    pinned = pins()
+    for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]:
+        asked = Requirement(text)
+        for pin in pinned[canonicalize_name(asked.name)]:
+            (only,) = pin.specifier
+            assert only.operator == "=="
+            assert "+" not in only.version, "a local version exists on one index only"
+            assert asked.specifier.contains(only.version), f"{pin} is not in {asked}"
+
+
+def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
+    (rig,), (program,) = blocks("README.md", "yaml"), blocks("README.md", "python")
+    (tmp_path / "rig.yaml").write_text(rig)
+    monkeypatch.chdir(tmp_path)
+    exec(program, {})
+    assert "tensor" in capsys.readouterr().out
+
+
+def test_documents_name_targets_and_files_that_exist():
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    for document in ("README.md", "CONTRIBUTING.md"):
+        text = (ROOT / document).read_text()
+        assert set(re.findall(r"^make (\S+)", text, re.M)) <= targets
+        assert [link for link in re.findall(r"\]\(([^):#]+)\)", text) if not (ROOT / link).exists()] == []
+
+
+def test_continuous_integration_can_start():
+    assert os.access(ROOT / ".ci/run", os.X_OK)
+
+
+def test_licence_is_the_one_stated():
+    text = (ROOT / "LICENSE").read_text()
+    assert PROJECT["license"] == "Apache-2.0"
+    assert "Apache License\n                           Version 2.0, January 2004" in text
