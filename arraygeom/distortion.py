@@ -160,17 +160,12 @@ def _brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     limit = _brown_limit(lens).to(xy_d)
     target, ahead = _untilt(lens, xy_d)
     with torch.no_grad():
-        start = _brown_start(lens, target, limit)
-        solved = _brown_solve(lens, start, target, limit)
-        planar, jacobian = _brown_planar(lens, solved)
-        tolerance = 64 * torch.finfo(target.dtype).eps * (1 + _norm(target))
-        valid = (_norm(planar - target) < tolerance) & (solved.square().sum(-1) < limit) & _orients(jacobian)
-        valid = valid & ahead
+        solved, valid = _brown_inverse(lens, target, limit)
     safe_target = torch.where(valid[..., None], target, 0.0)
     xy = torch.where(valid[..., None], solved, 0.0)
     for _ in range(2):
         xy = xy - _newton_step(*_brown_planar(lens, xy), safe_target)
-    return torch.where(valid[..., None], xy, start), valid
+    return torch.where(valid[..., None], xy, solved), valid & ahead
 
 
 def _brown_planar(lens: _Brown, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
@@ -223,13 +218,31 @@ def _brown_start(lens: _Brown, target: Tensor, limit: Tensor) -> Tensor:
     return target * (r / torch.where(wanted > 0, wanted, 1.0))[..., None]
 
 
-def _brown_solve(lens: _Brown, xy: Tensor, target: Tensor, limit: Tensor, iterations: int = 30) -> Tensor:
-    """Newton from inside the limit, with halved steps where a whole one goes too far or does not help.
+def _brown_inverse(lens: _Brown, target: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """The solution and whether there is one; where not, the solution of the radial terms alone.
 
-    On the limit itself the slope is nearly 0 and a step leads nowhere, hence the start a little inside.
+    Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in.
     """
-    squared = xy.square().sum(-1)
-    xy = xy * (0.9 * limit / squared.clamp_min(1e-30)).sqrt().clamp_max(1.0)[..., None]
+    start = solved = _brown_start(lens, target, limit)
+    valid = torch.zeros_like(target[..., 0], dtype=torch.bool)
+    for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
+        attempt = _brown_solve(lens, torch.where(valid[..., None], solved, begin), target, limit)
+        planar, jacobian = _brown_planar(lens, attempt)
+        tolerance = 64 * torch.finfo(target.dtype).eps * (1 + _norm(target))
+        valid = (_norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & _orients(jacobian)
+        solved = torch.where(valid[..., None], attempt, start)
+        if bool(valid.all()):
+            break
+    return solved, valid
+
+
+def _pulled_in(xy: Tensor, squared_radius: Tensor) -> Tensor:
+    factor = (squared_radius / xy.square().sum(-1).clamp_min(1e-30)).sqrt()
+    return xy * factor.clamp_max(1.0)[..., None]
+
+
+def _brown_solve(lens: _Brown, xy: Tensor, target: Tensor, limit: Tensor, iterations: int = 30) -> Tensor:
+    """Newton, with halved steps where a whole one goes too far or does not help."""
     planar, jacobian = _brown_planar(lens, xy)
     error, scale = _norm(planar - target), torch.ones_like(target[..., 0])
     enough = 2 * torch.finfo(target.dtype).eps * (1 + _norm(target))
