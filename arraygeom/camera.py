@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -27,6 +27,9 @@ class Projected(NamedTuple):
     valid: Bool[Tensor, "*n"]
 
 
+AnyView = TypeVar("AnyView", bound="View")
+
+
 @dataclass(frozen=True, kw_only=True)
 class View:
     """What is known of every camera, calibrated or not: its picture's (height, width) and what it records."""
@@ -34,20 +37,20 @@ class View:
     hw: HW
     sensor: Sensor = field(default_factory=Sensor)
 
-    def resize(self, hw: HW) -> Self:
+    def resize(self: AnyView, hw: HW) -> AnyView:
         """The same view at another size."""
         return self.mapped(resize_matrix(self.hw, hw), hw)
 
-    def crop(self, top: int, left: int, hw: HW) -> Self:
+    def crop(self: AnyView, top: int, left: int, hw: HW) -> AnyView:
         """A window of the view, `hw` in size. A negative `top` or `left`, or a larger size, pads."""
         return self.mapped(shift_matrix(left, top), hw)
 
-    def turn(self, quarter_turns: int) -> Self:
+    def turn(self: AnyView, quarter_turns: int) -> AnyView:
         """The picture turned counter-clockwise, as `torch.rot90(image, k, (-2, -1))` turns it."""
         hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
         return self.mapped(turn_matrix(self.hw, quarter_turns), hw)
 
-    def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Self:
+    def mapped(self: AnyView, A: Float[Tensor, "3 3"], hw: HW) -> AnyView:
         """The camera of the picture whose pixels are x' ~ A x, of size `hw`."""
         return self.replace(hw=hw)
 
@@ -56,11 +59,11 @@ class View:
         h, w = self.hw
         return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
 
-    def replace(self, **changes: Any) -> Self:
+    def replace(self: AnyView, **changes: Any) -> AnyView:
         """A copy with some fields changed."""
         return dataclasses.replace(self, **changes)
 
-    def to(self, *args: Any, **kwargs: Any) -> Self:
+    def to(self: AnyView, *args: Any, **kwargs: Any) -> AnyView:
         """Like `Tensor.to`; a view without numbers stays as it is."""
         return self
 
@@ -114,7 +117,9 @@ class Camera(View):
         Raises nothing: ask `rays` for validity.
         """
         rays, valid = self.rays(x)
-        X = rays * (depth / rays[..., 2])[..., None]
+        z = rays[..., 2]
+        valid = valid & (z != 0)
+        X = rays * (depth / torch.where(valid, z, 1.0))[..., None]
         X = torch.where(valid[..., None], X, torch.nan)
         return self.cam_from_world.inverse().apply(X)
 
@@ -125,11 +130,11 @@ class Camera(View):
             return to_homogeneous(normalised), torch.ones_like(x[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
-    def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Self:
+    def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Camera:
         """The camera of the picture whose pixels are x' ~ A x, of size `hw`: K' = A K."""
         return self.replace(K=A.to(self.K) @ self.K, hw=hw)
 
-    def to(self, *args: Any, **kwargs: Any) -> Self:
+    def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Like `Tensor.to`, for every tensor of the camera."""
         distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)
         pose = self.cam_from_world.to(*args, **kwargs)

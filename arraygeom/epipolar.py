@@ -14,9 +14,9 @@ from kornia.geometry.epipolar import cross_product_matrix
 from kornia.geometry.epipolar import fundamental_from_essential as _fundamental_from_essential
 from torch import Tensor
 
-from .pixels import HW, to_homogeneous
+from .pixels import HW, map_homogeneous, to_homogeneous
 from .pose import Pose, matvec
-from .segments import Segments
+from .segments import FLAT, Segments
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
@@ -41,15 +41,21 @@ def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor
     return T.T @ F @ T
 
 
-def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 3"]:
+def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
     """l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
-    At alpha's epipole there is no line: all zeros.
+    At alpha's epipole, and where F is zero, there is no line: all zeros. Batched F as in `map_homogeneous`.
     """
-    line = to_homogeneous(x) @ F.transpose(-1, -2)
-    squared = line[..., :2].square().sum(-1, keepdim=True)
-    positive = squared > 0
-    return torch.where(positive, line / torch.where(positive, squared, 1.0).sqrt(), 0.0)
+    size = F.abs().amax((-2, -1), keepdim=True)
+    line = map_homogeneous(F / torch.where(size > 0, size, 1.0), x)
+    squared = line[..., 0].square() + line[..., 1].square()
+    positive = squared > SMALLEST_SQUARE
+    scale = torch.where(positive, torch.where(positive, squared, 1.0).rsqrt(), 0.0)
+    return line * scale[..., None]
+
+
+SMALLEST_SQUARE = 1e-30
+"""A line F x whose (x, y) part is smaller than this, squared and with the largest entry of F at 1, is no line."""
 
 
 def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[Tensor, "*b 3"]]:
@@ -68,18 +74,18 @@ def epipolar_distance(
 class Track(NamedTuple):
     """What beta sees of alpha's rays: the homogeneous pixel `a + w b` at inverse depth w in alpha (1/m).
 
-    `a` (*n, 3) is where the point at infinity would be; `b` (3) is the same for all pixels of a pair of
-    pinholes. The third coordinate is z_beta / z_alpha.
+    `a` (*n, 3) is where the point at infinity would be; `b`, which broadcasts against it, is the same for all
+    pixels of a pair of pinholes. The third coordinate is z_beta / z_alpha.
     """
 
     a: Float[Tensor, "*n 3"]
-    b: Float[Tensor, "*b 3"]
+    b: Float[Tensor, "*m 3"]
 
     def at(self, w: Float[Tensor, "*n"]) -> Float[Tensor, "*n 2"]:
         """Beta's pixels at inverse depths; where the point is not in front of beta the value is finite only."""
         P = self.a + w[..., None] * self.b
         z = P[..., 2:]
-        return P[..., :2] / torch.where(z > 0, z, 1.0)
+        return P[..., :2] / torch.where(z > FRONT, z, 1.0)
 
 
 def track(
@@ -88,55 +94,77 @@ def track(
     beta_from_alpha: Pose,
     x: Float[Tensor, "*n 2"],
 ) -> Track:
-    """The track in beta of each alpha pixel. Batched rigs (*b, 3, 3) take pixels (*b, n, 2).
+    """The track in beta of each alpha pixel. Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
 
     Matrices are composed in their own precision, pixels computed in that of `x`.
     """
-    A = K_beta @ beta_from_alpha.R @ torch.linalg.inv(K_alpha)
-    b = matvec(K_beta, beta_from_alpha.t)
-    if b.ndim > 1:
-        b = b[..., None, :]
-    return Track(to_homogeneous(x) @ A.to(x.dtype).transpose(-1, -2), b.to(x.dtype))
+    a = map_homogeneous(K_beta @ beta_from_alpha.R @ torch.linalg.inv(K_alpha), x)
+    b = matvec(K_beta, beta_from_alpha.t).to(x.dtype)
+    return Track(a, _beside(b, a.ndim, trailing=1))
 
 
 def segments_between(track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW) -> Segments:
     """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's picture.
 
-    Clipped to the picture's area and to the front of beta, in closed form: along a track every limit is
-    linear in inverse depth.
+    Clipped to the picture's area and to the front of beta, in closed form: with s going from 0 at far to 1 at
+    near in proportion to inverse depth, the homogeneous pixel is P + s D, and every limit is linear in s with a
+    slope that is one number for the whole picture.
     """
-    w_far, w_near = (1 / d.to(track.a.dtype) for d in (far, near))
-    if w_far.ndim:
-        w_far, w_near = w_far[..., None], w_near[..., None]
-    return clip_track(track, w_near, w_far, beta_hw)
-
-
-def clip_track(track: Track, w_start: Float[Tensor, "*m"], w_end: Float[Tensor, "*k"], beta_hw: HW) -> Segments:
-    """The part of each track between two parameters, w_end <= w_start, that lies inside beta's picture."""
     a, b = track
+    w_far, w_near = (_beside(1 / d.to(a.dtype), a.ndim - 1) for d in (far, near))
+    X, Y, Z = (a + w_far[..., None] * b).unbind(-1)
+    DX, DY, DZ = ((w_near - w_far)[..., None] * b).unbind(-1)
     h, w = beta_hw
-    low, high = w_end, w_start
-    possible = torch.ones_like(a[..., 0], dtype=torch.bool)
+    low, high = torch.zeros_like(X), torch.ones_like(X)
+    valid = torch.ones_like(X, dtype=torch.bool)
     for g, slope in (
-        (a[..., 0] + 0.5 * a[..., 2], b[..., 0] + 0.5 * b[..., 2]),
-        ((w - 0.5) * a[..., 2] - a[..., 0], (w - 0.5) * b[..., 2] - b[..., 0]),
-        (a[..., 1] + 0.5 * a[..., 2], b[..., 1] + 0.5 * b[..., 2]),
-        ((h - 0.5) * a[..., 2] - a[..., 1], (h - 0.5) * b[..., 2] - b[..., 1]),
-        (a[..., 2] - FRONT, b[..., 2]),
+        (X + 0.5 * Z, DX + 0.5 * DZ),
+        ((w - 0.5) * Z - X, (w - 0.5) * DZ - DX),
+        (Y + 0.5 * Z, DY + 0.5 * DZ),
+        ((h - 0.5) * Z - Y, (h - 0.5) * DZ - DY),
+        (Z - FRONT, DZ),
     ):
-        crossing = -g / torch.where(slope == 0, 1.0, slope)
-        low = torch.where(slope > 0, torch.maximum(low, crossing), low)
-        high = torch.where(slope < 0, torch.minimum(high, crossing), high)
-        inside = (slope != 0) | (g >= 0)
-        possible = possible & inside
-    valid = possible & (low <= high)
-    high, low = (torch.where(valid, v, 0.0) for v in (high, low))
-    start, end = (torch.where(valid[..., None], track.at(v), 0.0) for v in (high, low))
-    return Segments(start, end, valid)
+        low, high, valid = _limited(low, high, valid, g, slope)
+    valid = valid & (low <= high)
+    return Segments(*(_place((X, Y, Z), (DX, DY, DZ), s, valid, beta_hw) for s in (high, low)), valid)
 
 
-FRONT = 1e-6
-"""A point counts as in front of beta from this ratio of its depths in beta and alpha on."""
+def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The range of s within [low, high] where g + s slope >= 0; `slope` holds one number for many pixels."""
+    rising, falling = slope > FLAT, slope < -FLAT
+    flat = ~(rising | falling)
+    crossing = g * (-1 / torch.where(flat, 1.0, slope))
+    if bool(rising.any()):
+        low = torch.maximum(low, torch.where(rising, crossing, 0.0))
+    if bool(falling.any()):
+        high = torch.minimum(high, torch.where(falling, crossing, 1.0))
+    if bool(flat.any()):
+        valid = valid & ((g >= 0) | ~flat)
+    return low, high, valid
+
+
+def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tensor, hw: HW) -> Tensor:
+    """The pixels of P + s D, kept from leaving the picture by rounding; zero where not valid."""
+    s = torch.where(valid, s, 0.0)
+    X, Y, Z = (torch.addcmul(p, s, d) for p, d in zip(P, D))
+    Z = torch.where(valid, Z, 1.0)
+    limits = hw[1] - 0.5, hw[0] - 0.5
+    return torch.stack([torch.where(valid, (c / Z).clamp(-0.5, m), 0.0) for c, m in zip((X, Y), limits)], -1)
+
+
+def _beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
+    """A value for each rig of a batch, with axes of length 1 for its pixels."""
+    if v.ndim == trailing:
+        return v
+    batch = v.ndim - trailing
+    return v.reshape(*v.shape[:batch], *[1] * (ndim - v.ndim), *v.shape[batch:])
+
+
+FRONT = 1e-3
+"""A point counts as in front of beta from this ratio of its depths in beta and alpha on.
+
+A ray that meets beta's centre (alpha's epipole) tends to 0/0 there; at 1e-3 float32 still holds 0.1 px.
+"""
 
 
 class Depth(NamedTuple):
@@ -148,19 +176,22 @@ class Depth(NamedTuple):
 
 
 def depth_from_track(track: Track, x: Float[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None) -> Depth:
-    """Depth in alpha at which a track passes nearest to beta's pixels `x`, least squares (H&Z 12.2).
+    """Depth in alpha of the point of a track nearest to beta's pixels `x`.
 
     `deviation` is the standard deviation of x along the track in pixels (default 0); the depth's is
-    propagated to first order. Invalid where the baseline gives no depth or the depth is not positive.
+    propagated to first order, d depth = depth^2 / |dx/dw|. Invalid where the baseline gives no depth, or where
+    the depth is not positive or the point not in front of beta.
     """
     a, b = track
-    c = a[..., :2] - x * a[..., 2:]
-    e = b[..., :2] - x * b[..., 2:]
-    squared = e.square().sum(-1)
-    w = -(c * e).sum(-1) / torch.where(squared > 0, squared, 1.0)
-    valid = (squared > 0) & (w > 0)
+    c, e = (v[..., :2] - x * v[..., 2:] for v in (a, b))
+    along = b[..., :2] * a[..., 2:] - a[..., :2] * b[..., 2:]
+    slope = (e * along).sum(-1)
+    moves = slope.abs() > FLAT * FLAT
+    w = -(c * along).sum(-1) / torch.where(moves, slope, 1.0)
     z_ratio = a[..., 2] + w * b[..., 2]
+    valid = moves & (w > 0) & (z_ratio > FRONT)
     depth = torch.where(valid, 1 / torch.where(valid, w, 1.0), 0.0)
-    pixels_per_w = squared.clamp(min=torch.finfo(w.dtype).tiny).sqrt() / z_ratio.abs().clamp(min=FRONT)
+    length = torch.where(valid, along.square().sum(-1), 1.0).sqrt()
+    pixels_per_w = torch.where(valid, slope.abs() / (length * torch.where(valid, z_ratio, 1.0)), 1.0)
     sigma = torch.zeros_like(w) if deviation is None else deviation
-    return Depth(depth, torch.where(valid, sigma / pixels_per_w * depth.square(), 0.0), valid)
+    return Depth(depth, torch.where(valid, sigma / pixels_per_w, 0.0) * depth.square(), valid)

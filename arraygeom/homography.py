@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .pixels import map_homogeneous
+
 
 class MappedPoints(NamedTuple):
     """Points after a homography, and which of them exist."""
@@ -47,15 +49,18 @@ def infinite_homography(
 
 
 def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> MappedPoints:
-    """Map points (*n, 2); with batched H (*b), points are (*b, n, 2). `valid` where the result is finite and its homogeneous scale is positive.
+    """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
-    The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
+    `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
     positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first. Where
     not valid, x is zero and so is its gradient.
     """
-    homogeneous = x @ H[..., :, :2].mT + H[..., None, :, 2]
-    scale = homogeneous[..., 2:]
-    positive = scale > torch.finfo(scale.dtype).tiny
-    mapped = homogeneous[..., :2] / torch.where(positive, scale, 1.0)
-    valid = positive[..., 0] & mapped.isfinite().all(-1)
-    return MappedPoints(torch.where(valid[..., None], mapped, 0.0), valid)
+    X, Y, scale = map_homogeneous(H, x).unbind(-1)
+    valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
+    scale = torch.where(valid, scale, 1.0)
+    mapped = [torch.where(valid, c, 0.0) / scale for c in (X, Y)]
+    return MappedPoints(torch.stack(mapped, -1), valid)
+
+
+SMALLEST_SCALE = 1e-9
+"""Homogeneous scales from here on count as positive: for a plane's homography, the ratio of depths."""

@@ -53,6 +53,32 @@ def turn_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
     return A
 
 
+def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:
+    """M (x, y, 1) for every point, in the precision of `x`.
+
+    A batch of matrices (*b, k, 3) takes points (*b, ..., 2), or with axes of length 1 in place of *b.
+    By multiplications and additions of its own rather than by `matmul`, whose precision TF32 and autocast lower
+    to ten or eight bits: pixels need all of them. Raises ValueError for points without the batch's axes.
+    """
+    batch = M.ndim - 2
+    if x.ndim - 1 < batch:
+        raise ValueError(f"a rig batched over {tuple(M.shape[:-2])} needs pixels (*batch, ..., 2), got {tuple(x.shape)}")
+    beside = (...,) + (None,) * (x.ndim - 1 - batch)
+    u, v = x.unbind(-1)
+    rows = [[m[beside] for m in row.unbind(-1)] for row in M.to(x.dtype).unbind(-2)]
+    return torch.stack([torch.addcmul(torch.addcmul(c, a, u), b, v) for a, b, c in rows]).movedim(0, -1)
+
+
+def coarse_grid(hw: HW, spacing: int = 16) -> Float[Tensor, "h w 2"]:
+    """About every `spacing`-th pixel centre, the outermost included, float64.
+
+    >>> coarse_grid((3, 5), 2)[0, :, 0].tolist()
+    [0.0, 2.0, 4.0]
+    """
+    rows, columns = (torch.linspace(0, n - 1, -(-(n - 1) // spacing) + 1, dtype=torch.float64) for n in hw)
+    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
+
+
 def to_homogeneous(x: Float[Tensor, "*n d"]) -> Float[Tensor, "*n d+1"]:
     """Appends a coordinate of 1."""
     return torch.nn.functional.pad(x, (0, 1), value=1.0)

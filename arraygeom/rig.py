@@ -20,7 +20,7 @@ from .homography import plane_homography
 from .pixels import HW, resize_matrix, shift_matrix, turn_matrix
 from .pose import Pose
 
-Depths = tuple[Float[Tensor, ""], Float[Tensor, ""]]
+Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class Pair:
             return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         return resize_matrix(self.alpha.hw, self.beta.hw)
 
-    def homography_at(self, depth: Float[Tensor, ""]) -> Float[Tensor, "*b 3 3"]:
+    def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
         """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
         alpha, beta = self.cameras
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
@@ -121,7 +121,7 @@ class Pair:
         return Pair(self.alpha.to(*args, **kwargs), self.beta.to(*args, **kwargs), depth, link)  # type: ignore[arg-type]
 
 
-def middle_depth(near: Float[Tensor, ""], far: Float[Tensor, ""]) -> Float[Tensor, ""]:
+def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     """The depth whose inverse is midway between those of near and far: the middle of a disparity range."""
     return 2 / (1 / near + 1 / far)
 
@@ -130,12 +130,13 @@ def middle_depth(near: Float[Tensor, ""], far: Float[Tensor, ""]) -> Float[Tenso
 class Rig:
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
-    `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf.
+    `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf. Every
+    number may have leading batch axes, the same for all: a batch of rigs.
     `links` relate cameras that are not calibrated, by (alpha, beta). A rig never changes: methods return new ones.
     """
 
     cameras: Mapping[str, View]
-    depth: Depths | None = None
+    depth: Any = None  # Depths | None once made; numbers serve as well
     links: Mapping[tuple[str, str], Link] = field(default_factory=dict)
     name: str = ""
 
@@ -269,14 +270,25 @@ class Rig:
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """(near, far) as float64 scalars. Raises ValueError unless 0 < near <= far."""
+    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far."""
     bounds = [d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)]
     near, far = bounds
-    if not (near > 0 and far >= near):
+    if not bool(((near > 0) & (far >= near)).all()):
         raise ValueError(
-            f"depth bounds must satisfy 0 < near <= far, in metres; got near = {float(near):g}, far = {float(far):g}"
+            f"depth bounds must satisfy 0 < near <= far, in metres; got near = {_shown(near)}, far = {_shown(far)}"
         )
     return near, far
+
+
+def _shown(d: Tensor) -> str:
+    return ", ".join(f"{v:g}" for v in d.reshape(-1).tolist())
+
+
+def _focal_places(K: Tensor) -> Tensor:
+    """Where K has fx and fy, with their signs: the diagonal, or for a turned picture the other one."""
+    block = K.detach()[..., :2, :2]
+    largest = block.abs() == block.abs().amax(-2, keepdim=True)
+    return torch.where(largest, block.sign(), 0.0)
 
 
 def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) -> View:
@@ -287,7 +299,7 @@ def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) ->
     if mine.keys() & {"rotation", "translation"}:
         pose = pose.perturbed(mine.get("rotation"), mine.get("translation"))
     if "focal" in mine:
-        K = K + torch.diag_embed(torch.nn.functional.pad(mine["focal"], (0, 1)))
+        K = K + torch.nn.functional.pad(_focal_places(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
     if "centre" in mine:
         K = K + torch.nn.functional.pad(mine["centre"][..., None], (2, 0, 0, 1))
     if "distortion" in mine and lens is not None:

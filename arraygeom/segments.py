@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .pixels import HW
+
 
 @dataclass(frozen=True)
 class Positions:
@@ -61,12 +63,38 @@ class Segments:
         """`samples` positions, the first at start, the last at end, evenly spaced (one sample: the middle).
 
         >>> s = Segments(torch.tensor([0.0, 4.0]), torch.tensor([6.0, 4.0]), torch.tensor(True))
-        >>> s.positions(4).xy[:, 0].tolist()
-        [0.0, 2.0, 4.0, 6.0]
+        >>> s.positions(3).xy[:, 0].tolist()
+        [0.0, 3.0, 6.0]
         """
         u = sample_fractions(samples, like=self.start)
         xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
+
+
+def clip_to_picture(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
+    """The part of each segment on the picture's area (Liang and Barsky 1984); invalid where there is none."""
+    low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
+    for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):
+        moves = b - a
+        flat = moves.abs() < FLAT
+        slowness = 1 / torch.where(flat, 1.0, moves)
+        first, last = (-0.5 - a) * slowness, (limit - a) * slowness
+        inside = (a >= -0.5) & (a <= limit)
+        low = torch.maximum(low, torch.where(flat, torch.where(inside, 0.0, 2.0), torch.minimum(first, last)))
+        high = torch.minimum(high, torch.where(flat, 1.0, torch.maximum(first, last)))
+    valid = low <= high
+    return Segments(*(_on_picture(start, end, s, valid, hw) for s in (low, high)), valid)
+
+
+def _on_picture(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> Tensor:
+    """The points at fraction s, kept from leaving the picture by rounding; zero where not valid."""
+    s = torch.where(valid, s, 0.0)
+    limits = zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5))
+    return torch.stack([torch.where(valid, (a + s * (b - a)).clamp(-0.5, m), 0.0) for a, b, m in limits], -1)
+
+
+FLAT = 1e-6
+"""A limit of the picture that moves by less than this along a whole segment, in pixels, is either kept or not."""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, l]:

@@ -39,7 +39,7 @@ class GuidedPATConfig:
     `keep_luminance` lets the network add colour to alpha, and never luminance.
     """
 
-    widths: tuple[int, int, int, int] = (24, 40, 48, 64)
+    widths: tuple[int, int, int, int] = (16, 32, 40, 48)
     coarse_dim: int = 32
     coarse_value: int = 16
     fine_dim: int = 8
@@ -53,10 +53,12 @@ class Match(NamedTuple):
     """The first look, corrected, at a quarter of the size.
 
     reach: (B, 1, h, w), how far from the segment's end (the far bound) the match is, pixels of beta.
+    position: (B, 2, h, w), the match in beta's pixels.
     logit: (B, 1, h, w), of the confidence that beta sees the point there.
     """
 
     reach: Tensor
+    position: Tensor
     logit: Tensor
 
 
@@ -79,7 +81,7 @@ class GuidedPAT(nn.Module):
     halo = 448
     """Encoder 160, judge 120, propagation 120, head 20, upsampling: the sum, rounded up to a multiple."""
 
-    def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:  # noqa: B008
+    def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
         self.config = c = config
         w2, w4, _, _ = c.widths
@@ -138,29 +140,25 @@ class GuidedPAT(nn.Module):
     def _first_look(self, own: Encoded, other: Encoded, look: Look, hw: tuple[int, int]) -> Match:
         segments = _segments(look, hw, COARSE)
         length = segments.length[:, None]
+        valid = segments.valid[:, None]
         reduced = Segments(_reduced(segments.start), _reduced(segments.end), segments.valid)
         samples = -(-(look.samples - 1) // COARSE) + 1
         query, key = self.coarse_key(own.quarter), self.coarse_key(other.quarter)
         attended = attend_with_statistics(query, key, self.coarse_value(other.quarter), reduced, samples=samples)
         fraction = reduced.fraction(attended.position.movedim(1, -1))
         reach = (1 - fraction)[:, None] * length
-        statistics = [
-            reach / 64,
-            attended.spread[:, None] / 4,
-            attended.peak[:, None],
-            segments.valid[:, None].to(reach),
-        ]
-        statistics[-1] = statistics[-1].expand_as(reach)
-        answer = self.judge(torch.cat([own.quarter, attended.value, *statistics], 1))
-        logit = torch.where(segments.valid[:, None], answer[:, 1:], NOWHERE)
-        return Match(reach + COARSE * answer[:, :1], logit)
+        facts = [reach / 64, attended.spread[:, None] / 4, attended.peak[:, None], valid.to(reach).expand_as(reach)]
+        answer = self.judge(torch.cat([own.quarter, attended.value, *facts], 1))
+        reach = reach + COARSE * answer[:, :1]
+        position = segments.end + reach[:, 0, :, :, None] * _along(segments)
+        return Match(reach, position.movedim(-1, 1), torch.where(valid, answer[:, 1:], NOWHERE))
 
 
 def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
     """Pieces of segments (B or 1, 4 h, 4 w), `window` pixels to either side of the match at `reach` from their end."""
     length = segments.length
     reach = enlarge(reach, COARSE)[:, 0].clamp(min=0).minimum(length)
-    along = (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+    along = _along(segments)
     middle = segments.end + reach[..., None] * along
     return Segments(middle + window * along, middle - window * along, segments.valid.expand(reach.shape))
 
@@ -174,6 +172,12 @@ def _segments(look: Look, hw: tuple[int, int], step: int) -> Segments:
         raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the pictures")
     start, end = (v.reshape(-1, *grid, 2) for v in (found.start, found.end))
     return Segments(start, end, found.valid.reshape(-1, *grid))
+
+
+def _along(segments: Segments) -> Tensor:
+    """Unit vectors from end to start; zero where a segment is a point."""
+    length = segments.length
+    return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
 
 
 def _reduced(x: Tensor) -> Tensor:
@@ -225,8 +229,8 @@ class Head(nn.Module):
 
     def __init__(self, width: int, bands: int) -> None:
         super().__init__()
-        self.start = nn.Sequential(conv(4 * (1 + 2 * bands) + 2 * width, 32), ResidualBlock(32), ResidualBlock(32))
-        self.last = nn.Conv2d(32, 4 * bands, 3, padding=1)
+        self.start = nn.Sequential(conv(4 * (1 + 2 * bands) + 2 * width, 24), ResidualBlock(24), ResidualBlock(24))
+        self.last = nn.Conv2d(24, 4 * bands, 3, padding=1)
         nn.init.zeros_(self.last.weight)
 
     def forward(self, alpha: Tensor, half: Tensor, context: Tensor, colour: Tensor, certain: Tensor) -> Tensor:

@@ -6,6 +6,7 @@ configuration is the paper's; variants are configuration.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol
@@ -14,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom.segments import Positions, Segments
+from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_grid
 
 from .attention import Attended, attend_with_statistics
 from .blocks import ResidualASPP, ResidualBlock
@@ -29,6 +30,17 @@ class Look:
 
     at: Callable[[Tensor], Segments | Positions]
     samples: int
+
+    @classmethod
+    def along(cls, field: ReceptiveField, pair: Pair) -> Look:
+        """The field of a pair, with about one sample for each pixel of beta on the longest segment."""
+        sparse = pixel_grid(pair.alpha.hw)[::4, ::4].reshape(-1, 2)
+        at = lazily(field, pair)
+        found = at(sparse)
+        if isinstance(found, Positions):
+            return cls(at, found.xy.shape[-2])
+        longest = torch.where(found.valid, found.length, 0.0).max()
+        return cls(at, math.ceil(float(longest)) + 1)
 
 
 Looks = Sequence[Look]
@@ -90,7 +102,7 @@ class PAT(nn.Module):
     multiple = 1
     equal_pitch = False
 
-    def __init__(self, config: PATConfig = PATConfig()) -> None:  # noqa: B008
+    def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
         self.config = config
         c, d = config, config.dim

@@ -5,7 +5,9 @@ from pathlib import Path
 import pytest
 from jaxtyping import install_import_hook
 
-install_import_hook(["arraygeom", "pat", "calib"], "beartype.beartype")
+from tests import typecheck
+
+install_import_hook(["arraygeom", "pat", "calib"], f"{typecheck.__name__}.checked")
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 

@@ -20,6 +20,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS = {"bpy", "OpenEXR", "Imath", "triton", "jupyterlab", "panel", "plotly"}
 """Modules that need not be installed."""
 
+SHAPED = {"Float", "Float32", "Float64", "Bool", "Int", "Int32", "Int64", "UInt8", "Integer", "Real", "Num", "Shaped"}
+
 READING_FILES = {
     *("open", "read_text", "read_bytes", "write_text", "write_bytes", "safe_load"),
     *("imread", "imwrite", "FileStorage", "loadtxt", "savetxt", "genfromtxt", "loadmat", "fromfile", "tofile"),
@@ -109,6 +111,15 @@ def test_arraygeom_draws_only_in_viz():
 
 def test_at_most_one_module_imports_blender():
     assert len([p for p in sources(*PACKAGES) if "bpy" in imports(p)]) <= 1
+
+
+@each([p for p in sources(*PACKAGES) if "jaxtyping" in imports(p)])
+def test_shapes_are_strings(path):
+    """Shapes that a formatter has unquoted, `Float[Tensor, b * n]`, mean something else or nothing."""
+    subscripts = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Subscript)]
+    shaped = [n for n in subscripts if isinstance(n.value, ast.Name) and n.value.id in SHAPED]
+    unquoted = [n for n in shaped if not isinstance(n.slice.elts[1], ast.Constant)]
+    assert [f"line {n.lineno}: {ast.unparse(n)}" for n in unquoted] == []
 
 
 @each([p for p in sources(*PACKAGES) if p.name == "__init__.py"])

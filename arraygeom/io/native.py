@@ -27,7 +27,6 @@ Numbers in pixels are converted to ours (first centre at 0) when read; files are
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -40,6 +39,7 @@ import yaml
 from torch import Tensor
 
 from ..camera import Camera, View, intrinsics
+from ..distortion import Distortion
 from ..epipolar import shift_origin
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
@@ -175,11 +175,9 @@ class _Reader:
         U, _, Vh = torch.linalg.svd(R)
         return R if error < 1e-12 else U @ Vh
 
-    def distortion(self, entry: str, value: Any) -> Any:
+    def distortion(self, entry: str, value: Any) -> Distortion | None:
         if value is None:
             return None
-        from ..distortion import Distortion
-
         self.keys(value, ("model", "coefficients"), entry)
         with self.naming(entry):
             return Distortion(
@@ -189,14 +187,20 @@ class _Reader:
     def sensor(self, entry: str, fields: Mapping[str, Any]) -> Sensor:
         response = fields.get("response")
         if isinstance(response, dict):
-            kind = Band if "centre" in response else Curve
-            self.keys(response, tuple(f.name for f in dataclasses.fields(kind)), f"{entry}.response")
-            with self.naming(f"{entry}.response"):
-                response = kind(**{k: tuple(v) if isinstance(v, list) else float(v) for k, v in response.items()})
+            response = self.response(f"{entry}.response", response)
         known = {k: fields[k] for k in ("frame_rate", "time_offset", "coding", "bayer") if k in fields}
         if known.get("coding", "srgb") not in {"srgb", "linear"}:
             raise self.fail(f"{entry}.coding", f"is '{known['coding']}'; wanted 'srgb' or 'linear'")
         return Sensor(response=response, **known)
+
+    def response(self, entry: str, fields: dict[str, Any]) -> Band | Curve:
+        if "centre" in fields:
+            self.keys(fields, ("centre", "width"), entry)
+            centre, width = self.numbers([fields["centre"], fields.get("width")], (2,), entry).tolist()
+            return Band(centre, width)
+        self.keys(fields, ("wavelength", "response"), entry)
+        curve = self.numbers([fields.get("wavelength"), fields.get("response")], None, entry)
+        return Curve(tuple(curve[0].tolist()), tuple(curve[1].tolist()))
 
     def link(self, entry: str, fields: Any, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
         self.keys(fields, ("alpha", "beta", "F", "H"), entry)

@@ -11,6 +11,8 @@ geometry (they are constant almost everywhere); position and spread do, as weigh
 
 from __future__ import annotations
 
+import importlib.util
+import os
 from collections.abc import Callable
 from typing import Literal
 
@@ -20,7 +22,7 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import reference
+from pat.attention import op, reference
 from pat.attention.reference import Attended, Look
 
 Where = Segments | Positions
@@ -121,9 +123,13 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"query, key and value must not be empty, got {shapes}")
     if not (query.dtype == key.dtype == value.dtype and query.dtype in DTYPES):
         names = ", ".join(str(t.dtype) for t in (query, key, value))
-        raise TypeError(f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}")
+        raise TypeError(
+            f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}"
+        )
     if not query.device == key.device == value.device:
-        raise ValueError(f"query, key and value are on {query.device}, {key.device} and {value.device}: move them")
+        raise ValueError(
+            f"query, key and value are on {query.device}, {key.device} and {value.device}: move them"
+        )
     if interpolation not in ("bilinear", "nearest"):
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
     if backend not in ("auto", "reference", "cpu", "triton"):
@@ -138,15 +144,21 @@ def _form(where: Where, query: Tensor, samples: int | None) -> Look:
     elif isinstance(where, Positions):
         points, mask, straight = where.xy, where.mask, False
         if samples not in (None, points.shape[-2]):
-            raise ValueError(f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it")
+            raise ValueError(
+                f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it"
+            )
         samples = points.shape[-2]
     else:
-        raise TypeError(f"look must be Segments, Positions or a function that returns them, got {type(where)}")
+        raise TypeError(
+            f"look must be Segments, Positions or a function that returns them, got {type(where)}"
+        )
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
     if tuple(mask.shape[:-1]) not in ((ha, wa), (b, ha, wa), (1, ha, wa)):
-        raise ValueError(f"look has the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}")
+        raise ValueError(
+            f"look has the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}"
+        )
     if points.device != query.device:
         raise ValueError(f"look is on {points.device}, the features are on {query.device}: move one of them")
     if mask.dim() == 3:
@@ -171,8 +183,27 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
         raise ValueError(f"bias {tuple(bias.shape)} does not broadcast to {(b, ha, wa, samples)}") from None
 
 
-def _run(q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend) -> Attended:
-    return reference.attend(q, k, v, look, bias, nearest)
+def _run(
+    q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend
+) -> Attended:
+    chosen = _choose(backend, q.device.type)
+    if chosen == "reference":
+        return reference.attend(q, k, v, look, bias, nearest)
+    return op.attend(q, k, v, look, bias, nearest, backend=chosen, strict=backend != "auto")
+
+
+def _choose(backend: Backend, device: str) -> str:
+    """The backend that serves; raises if the one asked for cannot."""
+    triton = importlib.util.find_spec("triton") is not None
+    if backend == "auto":
+        return "cpu" if device == "cpu" else "triton" if device == "cuda" and triton else "reference"
+    if backend == "cpu" and device != "cpu":
+        raise RuntimeError(f"backend 'cpu' cannot serve tensors on {device}: move them, or ask for 'auto'")
+    if backend == "triton" and not triton:
+        raise RuntimeError("backend 'triton' needs the package triton, which is not installed")
+    if backend == "triton" and device != "cuda" and os.environ.get("TRITON_INTERPRET") != "1":
+        raise RuntimeError(f"backend 'triton' cannot serve tensors on {device}: move them to a GPU")
+    return backend
 
 
 def _attend_chunks(

@@ -36,11 +36,16 @@ def _distance(mask: np.ndarray) -> np.ndarray:
 
 def _filled(points: np.ndarray) -> np.ndarray:
     mask = np.zeros((_FINE, _FINE), np.uint8)
-    return cv2.fillPoly(mask, [_pixels(points)], 1)
+    return cv2.fillPoly(mask, [_pixels(points)], (1,))
 
 
 def _pixels(points: np.ndarray) -> np.ndarray:
     return np.round((points + 1) * (_FINE / 2) - 0.5).astype(np.int32)
+
+
+def _line(mask: np.ndarray, ends: np.ndarray, width: int) -> None:
+    start, end = _pixels(ends).tolist()
+    cv2.line(mask, start, end, (1,), thickness=width)
 
 
 def _polar(radius: np.ndarray, angle: np.ndarray) -> np.ndarray:
@@ -77,7 +82,7 @@ def _cloud(rng: np.random.Generator) -> np.ndarray:
 def _rods(rng: np.random.Generator) -> np.ndarray:
     mask = np.zeros((_FINE, _FINE), np.uint8)
     for ends in rng.uniform(-0.95, 0.95, (rng.integers(1, 5), 2, 2)):
-        cv2.line(mask, *map(tuple, _pixels(ends).tolist()), 1, thickness=int(rng.integers(8, 22)))
+        _line(mask, ends, int(rng.integers(8, 22)))
     return mask
 
 
@@ -99,13 +104,13 @@ def _grow(mask: np.ndarray, rng: np.random.Generator, at: np.ndarray, angle: flo
     if width < 5:
         return
     end = at + length * np.array([np.cos(angle), np.sin(angle)])
-    cv2.line(mask, *map(tuple, _pixels(np.stack([at, end])).tolist()), 1, thickness=width)
+    _line(mask, np.stack([at, end]), width)
     for _ in range(rng.integers(2, 4)):
         _grow(mask, rng, end, angle + rng.normal(0, 0.6), length * rng.uniform(0.6, 0.85), width - 5)
 
 
 def _holed(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     if rng.random() < 0.2:
-        centre = tuple(_pixels(rng.uniform(-0.4, 0.4, 2)).tolist())
-        cv2.circle(mask, centre, int(rng.integers(15, 60)), 0, thickness=-1)
+        centre = _pixels(rng.uniform(-0.4, 0.4, 2)).tolist()
+        cv2.circle(mask, centre, int(rng.integers(15, 60)), (0,), thickness=-1)
     return mask

@@ -6,7 +6,7 @@ Textures repeat by mirroring, so that a plane may be as large as it likes. Each 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import cv2
@@ -43,16 +43,23 @@ class PhotoBank:
 
     @classmethod
     def load(
-        cls, *folders: str | Path, max_edge: int = 1024, cache: str | Path | None = None, seed: int = 0
+        cls,
+        *folders: str | Path,
+        max_edge: int = 1024,
+        cache: str | Path | None = None,
+        seed: int = 0,
+        choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
         """All pictures under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside them.
 
         `cache` names an .npz file (keep it outside the repository) that is written on the first call and read
-        on later ones; it is not checked against the folders. Raises ValueError where no picture is found.
+        on later ones; it is not checked against the folders. `choose` says by its number whether a picture is
+        taken, to hold some out. Raises ValueError where no picture is found.
         """
         pictures = _cached(cache) if cache and Path(cache).exists() else _read(folders, max_edge)
         if cache and not Path(cache).exists():
             np.savez(cache, *pictures)
+        pictures = [p for i, p in enumerate(pictures) if choose(i)]
         rng = np.random.default_rng(seed)
         extra = patterns(rng, 48) + recoloured(pictures, rng, 48)
         return cls(pictures + extra, photos=len(pictures))
@@ -68,7 +75,7 @@ class PhotoBank:
         return moved
 
     def lookup(
-        self, texture: Int[Tensor, "n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, "n"]
+        self, texture: Int[Tensor, " n"], xy: Float[Tensor, "n 2"], level: Float[Tensor, " n"]
     ) -> Float[Tensor, "3 n"]:
         """Colours 0..1 at pixels (x, y) of the textures (first centre (0, 0)), trilinear in position and level.
 

@@ -3,42 +3,27 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-HW = tuple[int, int]
-Range = tuple[float, float]
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW
+from arraygeom.pose import Pose, rotation_from_vector
 
-
-@dataclass(frozen=True)
-class View:
-    """One camera of each rig of a batch: K, `cam_from_world` as R and t (metres), and the picture's height and width."""
-
-    K: Float[Tensor, "b 3 3"]
-    R: Float[Tensor, "b 3 3"]
-    t: Float[Tensor, "b 3"]
-    hw: HW
-
-    def resized(self, hw: HW) -> View:
-        """The same camera with another number of pixels: c' = (c + 0.5) s - 0.5, f' = s f along each axis."""
-        s = self.K.new_tensor([hw[1] / self.hw[1], hw[0] / self.hw[0]])
-        K = self.K.clone()
-        K[:, :2, :2] *= s[:, None]
-        K[:, :2, 2] = (self.K[:, :2, 2] + 0.5) * s - 0.5
-        return replace(self, K=K, hw=hw)
+Range = tuple[float | int, float | int]
 
 
 @dataclass(frozen=True)
 class RigBatch:
-    """The cameras, alpha first, and the depths (metres, along alpha's axis) between which scenes should lie."""
+    """The cameras, alpha first, each batched (B), and the depths (metres, from alpha) where scenes should be."""
 
-    views: list[View]
-    near: Float[Tensor, "b"]
-    far: Float[Tensor, "b"]
+    cameras: list[Camera]
+    near: Float[Tensor, " b"]
+    far: Float[Tensor, " b"]
 
 
 @dataclass(frozen=True)
@@ -81,7 +66,7 @@ class RigDistribution:
         beta = self._rectified_beta if self.mode == "rectified" else self._general_beta
         return RigBatch([alpha] + [beta(alpha, near, far, generator) for _ in range(self.betas)], near, far)
 
-    def _alpha(self, batch: int, hw: HW, g: Generator) -> View:
+    def _alpha(self, batch: int, hw: HW, g: Generator) -> Camera:
         h, w = hw
         width = w * log_uniform(self.frame, (batch,), g)
         height = torch.clamp(0.7 * width, min=h)
@@ -89,22 +74,23 @@ class RigDistribution:
         K = torch.eye(3, dtype=torch.float64).repeat(batch, 1, 1)
         K[:, 0, 0] = K[:, 1, 1] = width * log_uniform(self.focal, (batch,), g)
         K[:, :2, 2] = torch.stack([width, height], -1) / 2 - corner - 0.5
-        return View(K, torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), torch.zeros(batch, 3).double(), hw)
+        world = Pose(torch.eye(3).double().expand(batch, 3, 3), torch.zeros(batch, 3).double())
+        return Camera(K=K, cam_from_world=world, hw=hw)
 
-    def _baseline(self, alpha: View, near: Tensor, g: Generator) -> Tensor:
+    def _baseline(self, alpha: Camera, near: Tensor, g: Generator) -> Tensor:
         return log_uniform(self.parallax, near.shape, g) * near / alpha.K[:, 0, 0]
 
     def _resolution(self, g: Generator) -> float:
         return self.resolutions[int(torch.randint(len(self.resolutions), (), generator=g))]
 
-    def _rectified_beta(self, alpha: View, near: Tensor, far: Tensor, g: Generator) -> View:
+    def _rectified_beta(self, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
         drawn = torch.randint(2, near.shape, generator=g) * 2 - 1
         side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[self.alpha]
         t = torch.zeros_like(alpha.t)
         t[:, 0] = -side * self._baseline(alpha, near, g)
-        return replace(alpha, t=t).resized(scaled(alpha.hw, self._resolution(g)))
+        return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, self._resolution(g)))
 
-    def _general_beta(self, alpha: View, near: Tensor, far: Tensor, g: Generator) -> View:
+    def _general_beta(self, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
         """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the picture."""
         batch, resolution = len(near), self._resolution(g)
         hw = scaled(alpha.hw, resolution)
@@ -113,7 +99,7 @@ class RigDistribution:
         target = _middle_ray(alpha) * depth[:, None]
         turn = uniform(self.toe_in, (batch, 1), g) * _turn_towards(target - centre, target)
         wobble = math.radians(self.rotation) * torch.randn(batch, 3, generator=g, dtype=torch.float64) / 2
-        R = rotation(wobble) @ rotation(turn)
+        R = rotation_from_vector(wobble) @ rotation_from_vector(turn)
         t = -(R @ centre[..., None])[..., 0]
         K = alpha.K.clone()
         K[:, 0, 0] *= resolution * log_uniform(self.focal_ratio, (batch,), g)
@@ -122,7 +108,7 @@ class RigDistribution:
         size = torch.tensor([hw[1], hw[0]], dtype=torch.float64)
         middle = (size - 1) / 2 + uniform((-self.decentring, self.decentring), (batch, 2), g) * size
         K[:, :2, 2] = middle - K[:, :1, 0] * seen[:, :2] / seen[:, 2:]
-        return View(K, R, t, hw)
+        return Camera(K=K, cam_from_world=Pose(R, t), hw=hw)
 
 
 def scaled(hw: HW, s: float) -> HW:
@@ -141,23 +127,16 @@ def log_uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> 
     return uniform((math.log(bounds[0]), math.log(bounds[1])), shape, generator).exp()
 
 
-def rotation(vector: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrix of a rotation vector in radians."""
-    x, y, z = vector.unbind(-1)
-    o = torch.zeros_like(x)
-    return torch.linalg.matrix_exp(torch.stack([o, -z, y, z, o, -x, -y, x, o], -1).unflatten(-1, (3, 3)))
-
-
 def _direction(batch: int, g: Generator) -> Tensor:
     """Unit vectors, mostly across the optical axis."""
     v = torch.randn(batch, 3, generator=g, dtype=torch.float64) * torch.tensor([1, 0.7, 0.25])
     return v / v.norm(dim=-1, keepdim=True)
 
 
-def _middle_ray(view: View) -> Tensor:
-    h, w = view.hw
+def _middle_ray(camera: Camera) -> Tensor:
+    h, w = camera.hw
     middle = torch.tensor([(w - 1) / 2, (h - 1) / 2, 1], dtype=torch.float64)
-    return (torch.linalg.inv(view.K) @ middle[:, None])[..., 0]
+    return (torch.linalg.inv(camera.K) @ middle[:, None])[..., 0]
 
 
 def _turn_towards(direction: Tensor, old: Tensor) -> Tensor:

@@ -1,0 +1,40 @@
+"""Receptive fields: where in beta to look for the point that an alpha pixel sees.
+
+A field is anything that can be called with a `Pair` and alpha pixels x (*n, 2), and answers with `Segments` or
+`Positions` over *n. The families here are frozen dataclasses; a plain function serves as well:
+
+>>> def right_here(pair, x):  # the same pixel in beta, and nothing else
+...     return Segments(x, x, torch.ones_like(x[..., 0], dtype=torch.bool))
+
+A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes of length 1 in place of *b.
+"""
+
+import torch
+
+from ..segments import Segments
+from .explicit import Dense, Local, NearestVoxels
+from .protocol import Look, ReceptiveField, lazily, look
+from .straight import (
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Rectified,
+    covering_displacement,
+    pinhole_track,
+)
+
+__all__ = [
+    "Dense",
+    "Epipolar",
+    "EpipolarLine",
+    "HomographyDisplacement",
+    "Local",
+    "Look",
+    "NearestVoxels",
+    "ReceptiveField",
+    "Rectified",
+    "covering_displacement",
+    "lazily",
+    "look",
+    "pinhole_track",
+]

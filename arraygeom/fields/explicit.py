@@ -1,0 +1,117 @@
+"""Fields that are lists of positions: the paper's nearest pixels, windows, everything."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ..epipolar import epipolar_lines
+from ..homography import apply_homography
+from ..pixels import pixel_grid
+from ..rig import Pair
+from ..segments import Positions
+
+
+@dataclass(frozen=True)
+class NearestVoxels:
+    """The `count` integer pixels of beta nearest the epipolar line, within +-`window` of H x; from F.
+
+    The paper's own construction. Distances are perpendicular to the line; pixels equally far, to 1e-3 px, are
+    taken by row, then column. Where fewer pixels of the picture lie in the window the rest are masked, and
+    where there is no line (the epipole, no baseline) all are.
+    """
+
+    count: int = 96
+    window: int = 80
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+        """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole."""
+        with torch.no_grad():
+            line = epipolar_lines(pair.fundamental, x)
+            centre, placed = apply_homography(pair.homography, x)
+        usable = placed & (line != 0).any(-1)
+        xy, mask = self._nearest(line.reshape(-1, 3), centre.round().reshape(-1, 2), pair)
+        xy, mask = xy.reshape(*x.shape[:-1], -1, 2), mask.reshape(*x.shape[:-1], -1) & usable[..., None]
+        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+    def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:
+        """Beside the line first; the whole window where that cannot be known to hold the nearest `count`."""
+        beside = 2 + self.count // (2 * self.window + 1)
+        xy, mask, distance = self._choose(self._candidates(line, centre, beside), line, centre, pair)
+        reach = (beside + 0.5) * line[:, :2].abs().amax(-1)
+        unsure = (distance.amax(-1) > reach - TIE).nonzero()[:, 0]
+        for some in unsure.split(64):
+            xy[some], mask[some], _ = self._choose(self._window(centre[some]), line[some], centre[some], pair)
+        return xy, mask
+
+    def _choose(self, xy: Tensor, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
+        """(pixels, which count, distances) of the nearest `count` of some candidates."""
+        h, w = pair.beta.hw
+        inside = pair.beta.contains(xy) & ((xy - centre[:, None]).abs() <= self.window).all(-1)
+        at_centre = (centre * line[:, :2]).sum(-1, keepdim=True) + line[:, 2:]
+        distance = ((xy - centre[:, None]) * line[:, None, :2]).sum(-1) + at_centre
+        order = (xy[..., 1] * w + xy[..., 0]) * (TIE / (h * w))
+        key = torch.where(inside, distance.abs() + order, torch.inf)
+        pad = self.count - key.shape[-1]
+        if pad > 0:
+            key = torch.nn.functional.pad(key, (0, pad), value=torch.inf)
+            xy = torch.nn.functional.pad(xy, (0, 0, 0, pad))
+        nearest = key.topk(self.count, largest=False)
+        mask = nearest.values.isfinite()
+        return xy.gather(-2, nearest.indices[..., None].expand(*mask.shape, 2)), mask, nearest.values
+
+    def _candidates(self, line: Tensor, centre: Tensor, beside: int) -> Tensor:
+        """Whole pixels (n, k, 2): in every column of the window (or row, if steep) those nearest the line."""
+        steps, across = (torch.arange(-n, n + 1).to(line) for n in (self.window, beside))
+        steep = line[:, 0].abs() > line[:, 1].abs()
+        u = torch.where(steep, centre[:, 1], centre[:, 0])[:, None] + steps
+        along, other = (torch.where(steep, line[:, i], line[:, j])[:, None] for i, j in ((1, 0), (0, 1)))
+        crossing = -(along * u + line[:, 2:]) / torch.where(other == 0, 1.0, other)
+        v = crossing.round()[..., None] + across
+        u = u[..., None].expand_as(v)
+        return torch.where(steep[:, None, None, None], torch.stack([v, u], -1), torch.stack([u, v], -1)).flatten(1, 2)
+
+    def _window(self, centre: Tensor) -> Tensor:
+        """All pixels (n, k, 2) of the windows."""
+        side = 2 * self.window + 1
+        grid = pixel_grid((side, side), dtype=centre.dtype, device=centre.device) - self.window
+        return centre[:, None] + grid.reshape(-1, 2)
+
+
+TIE = 1e-3
+"""Distances closer than this, in pixels, count as equal."""
+
+
+@dataclass(frozen=True)
+class Local:
+    """A `size` x `size` window around H x; from H only (the CNN-like case)."""
+
+    size: int = 5
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+        """Positions (*n, size^2, 2), row by row, on a grid of whole pixels' spacing centred on H x."""
+        centre, placed = apply_homography(pair.homography, x)
+        offsets = pixel_grid((self.size, self.size), dtype=x.dtype, device=x.device) - (self.size - 1) / 2
+        xy = centre[..., None, :] + offsets.reshape(-1, 2)
+        return _masked(xy, pair.beta.contains(xy) & placed[..., None])
+
+
+@dataclass(frozen=True)
+class Dense:
+    """Every `stride`-th pixel of beta; from nothing (small pictures, and the unphysical control)."""
+
+    stride: int = 1
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+        """Positions (*n, H W / stride^2, 2), the same for every alpha pixel."""
+        grid = pixel_grid(pair.beta.hw, dtype=x.dtype, device=x.device)[:: self.stride, :: self.stride]
+        xy = grid.reshape(-1, 2).expand(*x.shape[:-1], -1, 2)
+        return Positions(xy, torch.ones_like(xy[..., 0], dtype=torch.bool))
+
+
+def _masked(xy: Float[Tensor, "*n l 2"], mask: Bool[Tensor, "*n l"]) -> Positions:
+    """Positions that are zero where they do not count."""
+    return Positions(torch.where(mask[..., None], xy, 0.0), mask)

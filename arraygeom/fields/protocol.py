@@ -1,0 +1,58 @@
+"""The protocol that every receptive field follows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..pixels import pixel_grid
+from ..rig import Pair
+from ..segments import Positions, Segments
+
+Look = Segments | Positions
+
+
+@runtime_checkable
+class ReceptiveField(Protocol):
+    """Where to look in beta for each alpha pixel."""
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
+        """Segments or positions in beta's pixels, for alpha's pixels x. Differentiable in the pair's numbers."""
+        ...
+
+
+def look(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Look:
+    """The field over given pixels, or over alpha's whole picture (H, W); a batch of rigs gives (*b, H, W)."""
+    return field(pair, all_pixels(pair) if x is None else x)
+
+
+def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], Look]:
+    """The field as a function of alpha pixels alone, which attention calls chunk by chunk."""
+    return lambda x: field(pair, x)
+
+
+def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
+    """Alpha's pixel centres, float32, with the axes of a batch of rigs (of length 1) in front."""
+    known = pair.alpha.K if isinstance(pair.alpha, Camera) else pair.link.F if pair.link is not None else None
+    device = None if known is None else known.device
+    axes = 0 if known is None else known.ndim - 2
+    grid = pixel_grid(pair.alpha.hw, device=device)
+    return grid.reshape(*[1] * axes, *grid.shape)
+
+
+CHUNK = 1 << 15
+"""Pixels handled at once, so that what is computed on the way stays in a core's cache."""
+
+
+def in_chunks(f: Callable[[Tensor], Segments], x: Float[Tensor, "*n 2"]) -> Segments:
+    """f over pixels, some rows of the first axis at a time; f must answer for each pixel alone."""
+    rows = max(1, CHUNK * x.shape[0] * 2 // max(x.numel(), 1)) if x.ndim > 1 else 0
+    if x.ndim == 1 or rows >= x.shape[0] or x.shape[0] == 1:
+        return f(x)
+    parts = [f(rows_of_x) for rows_of_x in x.split(rows)]
+    return Segments(*(torch.cat([getattr(p, name) for p in parts]) for name in ("start", "end", "valid")))

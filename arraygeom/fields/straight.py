@@ -1,0 +1,183 @@
+"""Fields that are straight in beta's picture: one segment for each alpha pixel."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..camera import Camera
+from ..epipolar import Track, epipolar_lines, segments_between, track
+from ..homography import apply_homography
+from ..pixels import HW, coarse_grid
+from ..rig import Depths, Pair, depth_range
+from ..segments import Segments, clip_to_picture
+from .protocol import in_chunks
+
+
+@dataclass(frozen=True)
+class Epipolar:
+    """The segment of the epipolar line between the pair's depth bounds; needs calibration.
+
+    `near` and `far` (metres) override the pair's own.
+
+    Where nothing of the segment is in beta's picture and in front of beta it is invalid. Without a baseline,
+    with near = far, and for identical cameras it is a point. An alpha pixel on the epipole sees one point of
+    beta, whatever the depth: a point too. Where the epipole is inside beta's picture, segments end short of
+    it: what lies on the line between the cameras would be behind one of them.
+    """
+
+    near: float | None = None
+    far: float | None = None
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+        """Segments from near to far, inside beta's picture and in front of it. Raises ValueError for lenses."""
+        require_pinholes(pair)
+        return _between(pair, *self.bounds(pair), x)
+
+    def bounds(self, pair: Pair) -> Depths:
+        """(near, far): this field's own where given, else the pair's."""
+        if self.near is not None and self.far is not None:
+            return depth_range(self.near, self.far)
+        near, far = pair.depth_range
+        return depth_range(near if self.near is None else self.near, far if self.far is None else self.far)
+
+
+@dataclass(frozen=True)
+class EpipolarLine:
+    """The whole epipolar line inside beta; from calibration or F.
+
+    With calibration, the part in front of both cameras, from depth zero to infinity; else all of it, from
+    either end. From F, an alpha pixel on the epipole has no line, and the segment is invalid.
+    """
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+        """Segments across beta's picture."""
+        if pair.link is None and pair.calibrated:
+            zero, infinite = (torch.tensor(d, dtype=torch.float64) for d in (NEAREST, torch.inf))
+            return _between(pair, zero, infinite, x)
+        F, (h, w) = pair.fundamental, pair.beta.hw
+
+        def across(x: Tensor) -> Segments:
+            middle = x.new_tensor([(w - 1) / 2, (h - 1) / 2])
+            return line_piece(epipolar_lines(F, x), middle, x.new_tensor(float(h + w)), (h, w))
+
+        return in_chunks(across, x)
+
+
+NEAREST = 1e-4
+"""Where a line that has no near bound begins, metres from alpha."""
+
+
+@dataclass(frozen=True)
+class HomographyDisplacement:
+    """The part of the epipolar line within +-`displacement` pixels of H x; from F and H, or from calibration.
+
+    The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the depth
+    range (`approximated` fits a better one), and `displacement=None` takes the smallest that covers near to far
+    all over alpha's picture. With calibration, the start is towards near and the end towards far.
+
+    Where there is no line (at the epipole, and without a baseline) the segment is the point H x.
+    """
+
+    displacement: float | None = None
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+        """Segments centred on the point of the line nearest to H x, then clipped to beta's picture."""
+        F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
+        given = self.displacement
+        reach = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
+
+        def around(x: Tensor) -> Segments:
+            centre, placed = apply_homography(H, x)
+            piece = line_piece(epipolar_lines(F, x), centre, reach, hw)
+            return Segments(piece.start, piece.end, piece.valid & placed)
+
+        return in_chunks(around, x)
+
+
+def covering_displacement(pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Float[Tensor, ""]:
+    """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta.
+
+    Of depth-bounded segments as beta's picture clips them; 0 if there are none. Without x: for every 16th pixel
+    of alpha, which is within a pixel of that for all. Raises ValueError for an uncalibrated pair.
+    """
+    if x is None:
+        grid = coarse_grid(pair.alpha.hw).to(pair.cameras[0].K)
+        x = grid.reshape(*[1] * (pair.cameras[0].K.ndim - 2), *grid.shape)
+    exact = Epipolar()(pair, x)
+    centre, placed = apply_homography(pair.homography, x)
+    foot = foot_on_line(epipolar_lines(pair.fundamental, x), centre)
+    squared = torch.stack([(end - foot).square().sum(-1) for end in (exact.start, exact.end)])
+    largest = torch.where(exact.valid & placed, squared, 0.0).max()
+    return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
+
+
+@dataclass(frozen=True)
+class Rectified:
+    """A horizontal run of up to `max_disparity` pixels of beta; from nothing but the two sizes (the PAM case).
+
+    Alpha is the "left" or the "right" camera of a rectified pair ("either": the run goes both ways). Without
+    `max_disparity`, the whole row.
+    """
+
+    max_disparity: float | None = None
+    alpha_is: Literal["left", "right", "either"] = "left"
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+        """Segments from the largest disparity (near) to none (far)."""
+        (ha, wa), (hb, wb) = pair.alpha.hw, pair.beta.hw
+        column = (x[..., 0] + 0.5) * (wb / wa) - 0.5
+        row = (x[..., 1] + 0.5) * (hb / ha) - 0.5
+        near, far = self._run(column, wb)
+        low, high = -0.5 if self.max_disparity is not None else 0.0, wb - 0.5
+        overlaps = (torch.minimum(near, far) <= high) & (torch.maximum(near, far) >= low)
+        start, end = (torch.stack([c.clamp(low, high), row], -1) for c in (near, far))
+        return Segments(start, end, overlaps & (row >= -0.5) & (row <= hb - 0.5))
+
+    def _run(self, column: Tensor, width: int) -> tuple[Tensor, Tensor]:
+        if self.max_disparity is None:
+            return torch.zeros_like(column), torch.full_like(column, width - 1)
+        left, right = column - self.max_disparity, column + self.max_disparity
+        return {"left": (left, column), "right": (right, column), "either": (left, right)}[self.alpha_is]
+
+
+def pinhole_track(pair: Pair, x: Float[Tensor, "*n 2"]) -> Track:
+    """The track in beta of alpha's pixels. Raises ValueError unless both cameras are pinholes."""
+    alpha, beta = require_pinholes(pair)
+    return track(alpha.K, beta.K, pair.beta_from_alpha, x)
+
+
+def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
+    """Both cameras. Raises ValueError unless they are calibrated and without lenses."""
+    alpha, beta = pair.cameras
+    if alpha.distortion is not None or beta.distortion is not None:
+        raise ValueError("a straight field needs pinhole cameras: use Curved, or undistort the pictures first")
+    return alpha, beta
+
+
+def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) -> Float[Tensor, "*n 2"]:
+    """The point of a line (scaled as `epipolar_lines` does) nearest to a point; without a line, the point."""
+    l0, l1, l2 = line.unbind(-1)
+    u, v = point.unbind(-1)
+    off = l2 + l0 * u + l1 * v
+    return torch.stack([u - off * l0, v - off * l1], -1)
+
+
+def line_piece(
+    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, ""], hw: HW
+) -> Segments:
+    """The piece of each line within `reach` of the foot of `point`, clipped to the picture.
+
+    It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
+    """
+    foot = foot_on_line(line, point)
+    along = reach * torch.stack([-line[..., 1], line[..., 0]], -1)
+    return clip_to_picture(foot + along, foot - along, hw)
+
+
+def _between(pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> Segments:
+    return in_chunks(lambda x: segments_between(pinhole_track(pair, x), near, far, pair.beta.hw), x)

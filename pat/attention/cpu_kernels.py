@@ -1,0 +1,1007 @@
+"""The compiled loops of the CPU backend. All in one file: numba's cache watches only the file of the entry point.
+
+The work on one alpha pixel is done on *taps*, the pixels of beta that its samples touch. Neighbouring samples share
+them (a bilinear look-up has four, of which the next sample usually needs two again), so all work along the
+channels is done once a tap: inner products of the query with its taps, sums of taps with weights, and in backward
+the addition of the query to the taps' gradients. Everything else is scalar work on samples.
+
+Pictures come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as integers:
+uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the others.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, overload, register_model
+
+LANES = 8
+TAP_BLOCK = 4
+LEAST_SPREAD = np.float32(1e-4)
+ONE, HALF = np.float32(1), np.float32(0.5)
+"""In float32, so that they make a float64 of nothing that is not."""
+
+
+# ---- eight numbers at a time ---------------------------------------------------------------------------------
+
+
+class Vector(types.Type):
+    """`LANES` numbers of the accumulation type in one register (or two)."""
+
+    def __init__(self, scalar):
+        self.scalar = scalar
+        super().__init__(name=f"Vector({scalar})")
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        lane = ir.DoubleType() if kind.scalar == types.float64 else ir.FloatType()
+        super().__init__(manager, kind, ir.VectorType(lane, LANES))
+
+
+def _accumulated(dtype):
+    return types.float64 if dtype == types.float64 else types.float32
+
+
+def _widen(builder, stored, dtype, lanes):
+    """A stored number, or a vector of them, in the accumulation type."""
+
+    def shape(lane):
+        return ir.VectorType(lane, lanes) if lanes > 1 else lane
+
+    if dtype == types.uint16:
+        sixteen = shape(ir.IntType(32))(([16] * lanes) if lanes > 1 else 16)
+        return builder.bitcast(
+            builder.shl(builder.zext(stored, shape(ir.IntType(32))), sixteen), shape(ir.FloatType())
+        )
+    if dtype == types.int16:
+        return builder.fpext(builder.bitcast(stored, shape(ir.HalfType())), shape(ir.FloatType()))
+    return stored
+
+
+@intrinsic
+def pointer(typing, array):
+    """Where the numbers of a flat array begin. What works on pointers counts no references (a fifth of the time
+    otherwise); the caller keeps the array."""
+
+    def code(context, builder, signature, args):
+        return context.make_array(array)(context, builder, args[0]).data
+
+    return types.CPointer(array.dtype)(array), code
+
+
+@intrinsic
+def from_index(typing, place, index):
+    """The pointer to an index."""
+
+    def code(context, builder, signature, args):
+        return builder.gep(args[0], [args[1]])
+
+    return place(place, types.intp), code
+
+
+@intrinsic
+def zero(typing, place):
+    """Nothing, in the accumulation type of the numbers at a pointer."""
+    kind = _accumulated(place.dtype)
+
+    def code(context, builder, signature, args):
+        return context.get_constant(kind, 0)
+
+    return kind(place), code
+
+
+def _at(builder, place, index, lane):
+    return builder.bitcast(builder.gep(place, [index]), lane.as_pointer())
+
+
+@intrinsic
+def load(typing, array, index):
+    """The vector at an index, in the accumulation type."""
+    kind = Vector(_accumulated(array.dtype))
+
+    def code(context, builder, signature, args):
+        lane = ir.VectorType(context.get_data_type(array.dtype), LANES)
+        place = _at(builder, args[0], args[1], lane)
+        stored = builder.load(place, align=array.dtype.bitwidth // 8)
+        return _widen(builder, stored, array.dtype, LANES)
+
+    return kind(array, types.intp), code
+
+
+@intrinsic
+def store(typing, array, index, vector):
+    """Puts a vector at an index."""
+
+    def code(context, builder, signature, args):
+        lane = ir.VectorType(context.get_data_type(array.dtype), LANES)
+        place = _at(builder, args[0], args[1], lane)
+        builder.store(args[2], place, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, vector), code
+
+
+@intrinsic
+def load_one(typing, array, index):
+    """The number at an index, in the accumulation type."""
+
+    def code(context, builder, signature, args):
+        lane = context.get_data_type(array.dtype)
+        stored = builder.load(_at(builder, args[0], args[1], lane))
+        return _widen(builder, stored, array.dtype, 1)
+
+    return _accumulated(array.dtype)(array, types.intp), code
+
+
+@intrinsic
+def splat(typing, number):
+    """A vector of one number repeated."""
+
+    def code(context, builder, signature, args):
+        lane = ir.VectorType(context.get_data_type(number), LANES)
+        first = builder.insert_element(ir.Constant(lane, ir.Undefined), args[0], ir.IntType(32)(0))
+        return builder.shuffle_vector(first, first, _mask([0] * LANES))
+
+    return Vector(number)(number), code
+
+
+@intrinsic
+def fma(typing, a, b, c):
+    """a b + c, rounded once."""
+
+    def code(context, builder, signature, args):
+        vector = args[0].type
+        name = f"llvm.fma.v{LANES}{'f64' if a.scalar == types.float64 else 'f32'}"
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector] * 3), name)
+        return builder.call(function, args)
+
+    return a(a, b, c), code
+
+
+def _arithmetic(instruction):
+    """The intrinsic of one instruction on two vectors."""
+
+    @intrinsic
+    def operation(typing, a, b):
+        def code(context, builder, signature, args):
+            return getattr(builder, instruction)(*args)
+
+        return a(a, b), code
+
+    return operation
+
+
+add, sub, mul = _arithmetic("fadd"), _arithmetic("fsub"), _arithmetic("fmul")
+
+
+@intrinsic
+def larger(typing, a, b):
+    """The larger of the numbers of two vectors; that of b if either is NaN."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return a(a, b), code
+
+
+@intrinsic
+def keep_above(typing, a, limit, b):
+    """The numbers of b; 0 where those of a are below the limit."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered("<", *args[:2]), ir.Constant(args[2].type, None), args[2])
+
+    return a(a, limit, b), code
+
+
+@intrinsic
+def two_to(typing, a):
+    """2 to the power of whole numbers in float32."""
+
+    def code(context, builder, signature, args):
+        def repeat(number):
+            return ir.Constant(whole, [number] * LANES)
+
+        whole = ir.VectorType(ir.IntType(32), LANES)
+        exponent = builder.add(builder.fptosi(args[0], whole), repeat(127))
+        return builder.bitcast(builder.shl(exponent, repeat(23)), args[0].type)
+
+    return a(a), code
+
+
+@intrinsic
+def total(typing, a):
+    """The sum of a vector's numbers."""
+    return a.scalar(a), _reduction("fadd", 0.0)
+
+
+@intrinsic
+def largest(typing, a):
+    """The largest of a vector's numbers."""
+    return a.scalar(a), _reduction("fmax", None)
+
+
+def _reduction(name, start):
+    def code(context, builder, signature, args):
+        vector = args[0].type
+        first = [] if start is None else [ir.Constant(vector.element, start)]
+        kind = ir.FunctionType(vector.element, [vector.element] * len(first) + [vector])
+        full = f"llvm.vector.reduce.{name}.v{LANES}{'f64' if vector.element == ir.DoubleType() else 'f32'}"
+        function = cgutils.get_or_insert_function(builder.module, kind, full)
+        return builder.call(function, [*first, args[0]], fastmath=["reassoc"])
+
+    return code
+
+
+@intrinsic
+def store_totals(typing, array, index, a, b, c, d):
+    """Puts the sums of four vectors side by side."""
+
+    def code(context, builder, signature, args):
+        def pairs(p, q):
+            halves = [[0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]]
+            even, odd = (builder.shuffle_vector(p, q, _mask(half)) for half in halves)
+            return builder.fadd(even, odd)
+
+        v = pairs(pairs(args[2], args[3]), pairs(args[4], args[5]))
+        low, high = (builder.shuffle_vector(v, v, _mask(half)) for half in ([0, 1, 2, 3], [4, 5, 6, 7]))
+        lane = ir.VectorType(args[2].type.element, TAP_BLOCK)
+        place = _at(builder, args[0], args[1], lane)
+        builder.store(builder.fadd(low, high), place, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, a, b, c, d), code
+
+
+def _mask(lanes):
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
+
+
+@intrinsic
+def _half_bits(typing, number):
+    """float32 to the bits of float16, to nearest even."""
+
+    def code(context, builder, signature, args):
+        return builder.bitcast(builder.fptrunc(args[0], ir.HalfType()), ir.IntType(16))
+
+    return types.int16(types.float32), code
+
+
+def narrow(array, number):
+    """A number as the array stores it."""
+
+
+@overload(narrow)
+def _narrow(array, number):
+    if array.dtype == types.uint16:
+        return _brain_float_bits
+    if array.dtype == types.int16:
+        return lambda array, number: _half_bits(number)
+    return lambda array, number: number
+
+
+def _brain_float_bits(array, number):
+    bits = np.float32(number).view(np.uint32)
+    if math.isnan(number):
+        return np.uint16(0x7FC0)
+    return np.uint16((bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16))
+
+
+def exponentials(x):
+    """exp of a vector of numbers at most 0; 0 below exp(-87), a hair above the least of float32."""
+
+
+@overload(exponentials)
+def _exponentials(x):
+    return (lambda x: _exponentials64(x)) if x.scalar == types.float64 else _exponentials32
+
+
+@intrinsic
+def _exponentials64(typing, x):
+    def code(context, builder, signature, args):
+        vector = args[0].type
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector]), "llvm.exp.v8f64")
+        return builder.call(function, args)
+
+    return x(x), code
+
+
+def _exponentials32(x):
+    """Cephes' expf; 1 to 2 units in the last place."""
+    low = splat(np.float32(-87.0))
+    shift = splat(np.float32(12582912.0))
+    y = larger(low, x)
+    n = sub(fma(y, splat(np.float32(1.44269504)), shift), shift)
+    y = fma(n, splat(np.float32(-0.693359375)), y)
+    y = fma(n, splat(np.float32(2.12194440e-4)), y)
+    p = fma(splat(np.float32(1.9875691500e-4)), y, splat(np.float32(1.3981999507e-3)))
+    p = fma(p, y, splat(np.float32(8.3334519073e-3)))
+    p = fma(p, y, splat(np.float32(4.1665795894e-2)))
+    p = fma(p, y, splat(np.float32(1.6666665459e-1)))
+    p = fma(p, y, splat(np.float32(5.0000001201e-1)))
+    p = add(fma(mul(p, y), y, y), splat(np.float32(1.0)))
+    return keep_above(x, low, mul(p, two_to(n)))
+
+
+# ---- along the channels ---------------------------------------------------------------------------------------
+
+
+@njit
+def inner_products(x, rows, n, picture, channels, out):
+    """out[t] = x . picture[rows[t]], for t < n; rows is padded to a multiple of TAP_BLOCK."""
+    whole = channels // LANES * LANES
+    nothing = splat(zero(x))
+    for t in range(0, n, TAP_BLOCK):
+        r0, r1, r2, r3 = (
+            rows[t] * channels,
+            rows[t + 1] * channels,
+            rows[t + 2] * channels,
+            rows[t + 3] * channels,
+        )
+        a0 = a1 = a2 = a3 = nothing
+        for c in range(0, whole, LANES):
+            q = load(x, c)
+            a0 = fma(q, load(picture, r0 + c), a0)
+            a1 = fma(q, load(picture, r1 + c), a1)
+            a2 = fma(q, load(picture, r2 + c), a2)
+            a3 = fma(q, load(picture, r3 + c), a3)
+        store_totals(out, t, a0, a1, a2, a3)
+        for c in range(whole, channels):
+            out[t] += x[c] * load_one(picture, r0 + c)
+            out[t + 1] += x[c] * load_one(picture, r1 + c)
+            out[t + 2] += x[c] * load_one(picture, r2 + c)
+            out[t + 3] += x[c] * load_one(picture, r3 + c)
+
+
+@njit
+def weighted_sum(weights, rows, n, picture, channels, out):
+    """out = sum over t < n of weights[t] picture[rows[t]]; both are padded to a multiple of TAP_BLOCK."""
+    c = 0
+    while c + 8 * LANES <= channels:
+        _weighted_sum_64(weights, rows, n, picture, channels, c, out)
+        c += 8 * LANES
+    while c + 2 * LANES <= channels:
+        _weighted_sum_16(weights, rows, n, picture, channels, c, out)
+        c += 2 * LANES
+    while c + LANES <= channels:
+        _weighted_sum_8(weights, rows, n, picture, channels, c, out)
+        c += LANES
+    for c in range(c, channels):
+        s = zero(weights)
+        for t in range(n):
+            s += weights[t] * load_one(picture, rows[t] * channels + c)
+        out[c] = s
+
+
+@njit
+def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(zero(weights))
+    for t in range(n):
+        w = splat(weights[t])
+        r = rows[t] * channels + c
+        a0 = fma(w, load(picture, r), a0)
+        a1 = fma(w, load(picture, r + 8), a1)
+        a2 = fma(w, load(picture, r + 16), a2)
+        a3 = fma(w, load(picture, r + 24), a3)
+        a4 = fma(w, load(picture, r + 32), a4)
+        a5 = fma(w, load(picture, r + 40), a5)
+        a6 = fma(w, load(picture, r + 48), a6)
+        a7 = fma(w, load(picture, r + 56), a7)
+    store(out, c, a0)
+    store(out, c + 8, a1)
+    store(out, c + 16, a2)
+    store(out, c + 24, a3)
+    store(out, c + 32, a4)
+    store(out, c + 40, a5)
+    store(out, c + 48, a6)
+    store(out, c + 56, a7)
+
+
+@njit
+def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
+    one = splat(zero(weights) + ONE)
+    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
+    for t in range(0, n, TAP_BLOCK):
+        w0, r0 = splat(weights[t]), rows[t] * channels + c
+        w1, r1 = splat(weights[t + 1]), rows[t + 1] * channels + c
+        w2, r2 = splat(weights[t + 2]), rows[t + 2] * channels + c
+        w3, r3 = splat(weights[t + 3]), rows[t + 3] * channels + c
+        a0, b0 = fma(w0, load(picture, r0), a0), fma(w0, load(picture, r0 + 8), b0)
+        a1, b1 = fma(w1, load(picture, r1), a1), fma(w1, load(picture, r1 + 8), b1)
+        a2, b2 = fma(w2, load(picture, r2), a2), fma(w2, load(picture, r2 + 8), b2)
+        a3, b3 = fma(w3, load(picture, r3), a3), fma(w3, load(picture, r3 + 8), b3)
+    store(out, c, fma(one, fma(one, a0, a1), fma(one, a2, a3)))
+    store(out, c + 8, fma(one, fma(one, b0, b1), fma(one, b2, b3)))
+
+
+@njit
+def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
+    one = splat(zero(weights) + ONE)
+    a0 = a1 = a2 = a3 = splat(zero(weights))
+    for t in range(0, n, TAP_BLOCK):
+        a0 = fma(splat(weights[t]), load(picture, rows[t] * channels + c), a0)
+        a1 = fma(splat(weights[t + 1]), load(picture, rows[t + 1] * channels + c), a1)
+        a2 = fma(splat(weights[t + 2]), load(picture, rows[t + 2] * channels + c), a2)
+        a3 = fma(splat(weights[t + 3]), load(picture, rows[t + 3] * channels + c), a3)
+    store(out, c, fma(one, fma(one, a0, a1), fma(one, a2, a3)))
+
+
+@njit(nogil=True, cache=True)
+def scatter(counts, rows, weights, stride, x, channels, first, last, first_channel, last_channel, out):
+    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels first .. last, in their order.
+
+    `counts` says how many taps each of the pixels has; theirs start at multiples of `stride`. One caller owns
+    the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the same however
+    many callers share the work.
+    """
+    counts, rows, weights, x, out = pointer(counts), pointer(rows), pointer(weights), pointer(x), pointer(out)
+    for p in range(first, last):
+        begin = (p - first) * stride
+        end = begin + counts[p - first]
+        c = first_channel
+        while c + 4 * LANES <= last_channel:
+            _scatter_32(rows, weights, begin, end, x, p * channels + c, channels, c, out)
+            c += 4 * LANES
+        while c + LANES <= last_channel:
+            q = load(x, p * channels + c)
+            for t in range(begin, end):
+                r = rows[t] * channels + c
+                store(out, r, fma(splat(weights[t]), q, load(out, r)))
+            c += LANES
+        for c in range(c, last_channel):
+            one = load_one(x, p * channels + c)
+            for t in range(begin, end):
+                out[rows[t] * channels + c] += weights[t] * one
+
+
+@njit
+def _scatter_32(rows, weights, begin, end, x, at, channels, c, out):
+    q0, q1, q2, q3 = load(x, at), load(x, at + 8), load(x, at + 16), load(x, at + 24)
+    for t in range(begin, end):
+        w = splat(weights[t])
+        r = rows[t] * channels + c
+        store(out, r, fma(w, q0, load(out, r)))
+        store(out, r + 8, fma(w, q1, load(out, r + 8)))
+        store(out, r + 16, fma(w, q2, load(out, r + 16)))
+        store(out, r + 24, fma(w, q3, load(out, r + 24)))
+
+
+# ---- where one alpha pixel looks -------------------------------------------------------------------------------
+
+
+class Look(NamedTuple):
+    """The geometry of a call. The numbers are arrays outside and pointers inside."""
+
+    points: Any
+    mask: Any
+    fractions: Any
+    samples: int
+    straight: bool
+    nearest: bool
+    alpha_pixels: int
+    shared: bool
+    height: int
+    width: int
+    last_x: Any
+    last_y: Any
+    slack: Any
+
+
+class Samples(NamedTuple):
+    """Room for the samples of one pixel that count: which they are, where, in which cell, with what weight."""
+
+    index: Any
+    tap: Any
+    x: Any
+    y: Any
+    right: Any
+    down: Any
+    score: Any
+    weight: Any
+    slope: Any
+    score_slope: Any
+
+
+class Taps(NamedTuple):
+    """Room for the taps of one pixel: their pixels in beta, and numbers for each."""
+
+    row: Any
+    by_key: Any
+    by_value: Any
+    weight: Any
+
+
+@njit
+def _look(look):
+    return Look(
+        pointer(look.points),
+        pointer(look.mask),
+        pointer(look.fractions),
+        look.samples,
+        look.straight,
+        look.nearest,
+        look.alpha_pixels,
+        look.shared,
+        look.height,
+        look.width,
+        look.last_x,
+        look.last_y,
+        look.slack,
+    )
+
+
+def room(samples, channels):
+    """How many integers and how many numbers of scratch a task needs."""
+    n, m = samples + LANES, 4 * samples + LANES
+    return 5 * n + m, 8 * n + 3 * m + channels
+
+
+@njit
+def _room(n, integers, numbers):
+    """Scratch, cut up. What is left of it is for channels."""
+    n, m = n + LANES, 4 * n + LANES
+    i, f = pointer(integers), pointer(numbers)
+    samples = Samples(
+        i,
+        from_index(i, n),
+        f,
+        from_index(f, n),
+        from_index(f, 2 * n),
+        from_index(f, 3 * n),
+        from_index(f, 4 * n),
+        from_index(f, 5 * n),
+        from_index(f, 6 * n),
+        from_index(f, 7 * n),
+    )
+    t = from_index(f, 8 * n)
+    taps = Taps(from_index(i, 5 * n), t, from_index(t, m), from_index(t, 2 * m))
+    return samples, taps, from_index(t, 3 * m)
+
+
+@njit
+def _on_picture(x, y, look, slack):
+    low = -HALF - slack
+    return (x >= low) & (y >= low) & (x <= look.last_x - low) & (y <= look.last_y - low)
+
+
+@njit
+def _walk(start, along, look, out):
+    """start + fraction along, rounded as torch rounds it (no fused multiply-add)."""
+    for i in range(0, look.samples, LANES):
+        store(out, i, add(start, mul(load(look.fractions, i), along)))
+
+
+@njit
+def _collect(p, look, samples):
+    """Positions of the samples of pixel p that count; how many."""
+    place = p % look.alpha_pixels if look.shared else p
+    if look.straight:
+        return _collect_segment(place, look, samples) if look.mask[place] else 0
+    points, mask = from_index(look.points, 2 * place * look.samples), from_index(look.mask, place * look.samples)
+    n = 0
+    for i in range(look.samples):
+        x, y = points[2 * i], points[2 * i + 1]
+        samples.index[n], samples.x[n], samples.y[n] = i, x, y
+        n += (mask[i] != 0) & _on_picture(x, y, look, look.slack)
+    return n
+
+
+@njit
+def _collect_segment(place, look, samples):
+    x0, y0 = look.points[4 * place], look.points[4 * place + 1]
+    dx, dy = look.points[4 * place + 2] - x0, look.points[4 * place + 3] - y0
+    _walk(splat(x0), splat(dx), look, samples.x)
+    _walk(splat(y0), splat(dy), look, samples.y)
+    sure = look.slack - look.slack
+    if _on_picture(x0, y0, look, sure) & _on_picture(x0 + dx, y0 + dy, look, sure):
+        for i in range(look.samples):
+            samples.index[i] = i
+        return look.samples
+    n = 0
+    for i in range(look.samples):
+        x, y = samples.x[i], samples.y[i]
+        samples.index[n], samples.x[n], samples.y[n] = i, x, y
+        n += _on_picture(x, y, look, look.slack)
+    return n
+
+
+@njit
+def _tap(n, first, look, samples, taps):
+    """Finds the taps of n samples; how many. `first` is the index of the first pixel of this beta."""
+    if look.nearest:
+        m = _tap_nearest(n, np.int32(first), look, samples, taps)
+    else:
+        m = _tap_cells(n, np.int32(first), look, samples, taps)
+    for t in range(m, m + TAP_BLOCK):
+        taps.row[t] = taps.row[m - 1]
+    return m
+
+
+@njit
+def _tap_nearest(n, first, look, samples, taps):
+    """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
+    last_x, last_y, width = np.int32(look.width - 1), np.int32(look.height - 1), np.int32(look.width)
+    for j in range(n):
+        x = min(np.int32(samples.x[j] + HALF), last_x)
+        y = min(np.int32(samples.y[j] + HALF), last_y)
+        taps.row[j] = first + y * width + x
+    if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
+        return n
+    m = 0
+    row = np.int32(-1)
+    for j in range(n):
+        here = taps.row[j]
+        m += here != row
+        row = here
+        taps.row[m - 1] = row
+        samples.tap[j] = m - 1
+    return m
+
+
+@njit
+def _tap_cells(n, first, look, samples, taps):
+    """Each cell has four taps, of which those that the cell before had, too, are taken from there."""
+    nothing = zero(samples.x)
+    width = np.int32(look.width)
+    cell_x, cell_y = np.int32(max(look.width - 2, 0)), np.int32(max(look.height - 2, 0))
+    step_x, step_y = np.int32(min(1, look.width - 1)), np.int32(min(1, look.height - 1)) * width
+    x = y = np.int32(-2)
+    t00 = t10 = t01 = t11 = m = np.int32(0)
+    for j in range(n):
+        right = min(max(samples.x[j], nothing), look.last_x)
+        down = min(max(samples.y[j], nothing), look.last_y)
+        new_x, new_y = min(np.int32(right), cell_x), min(np.int32(down), cell_y)
+        if new_x != x or new_y != y:
+            row = first + new_y * width + new_x
+            if new_y == y and new_x == x + 1:
+                t00, t01 = t10, t11
+                t10, t11, m = _fresh(row + step_x, row + step_x + step_y, m, taps)
+            elif new_y == y and new_x == x - 1:
+                t10, t11 = t00, t01
+                t00, t01, m = _fresh(row, row + step_y, m, taps)
+            elif new_x == x and new_y == y + 1:
+                t00, t10 = t01, t11
+                t01, t11, m = _fresh(row + step_y, row + step_x + step_y, m, taps)
+            elif new_x == x and new_y == y - 1:
+                t01, t11 = t00, t10
+                t00, t10, m = _fresh(row, row + step_x, m, taps)
+            else:
+                t00, t10, m = _fresh(row, row + step_x, m, taps)
+                t01, t11, m = _fresh(row + step_y, row + step_x + step_y, m, taps)
+            x, y = new_x, new_y
+        samples.right[j], samples.down[j] = right - np.float32(x), down - np.float32(y)
+        samples.tap[4 * j], samples.tap[4 * j + 1] = t00, t10
+        samples.tap[4 * j + 2], samples.tap[4 * j + 3] = t01, t11
+    return np.int64(m)
+
+
+@njit
+def _fresh(row, other, m, taps):
+    taps.row[m], taps.row[m + 1] = row, other
+    return m, np.int32(m + 1), np.int32(m + 2)
+
+
+@njit
+def _interpolate(n, m, look, samples, by_tap, out):
+    """From numbers on taps to numbers on samples."""
+    if look.nearest:
+        if m == n:
+            for j in range(0, n, LANES):
+                store(out, j, load(by_tap, j))
+        else:
+            for j in range(n):
+                out[j] = by_tap[samples.tap[j]]
+        return
+    for j in range(n):
+        u, v = samples.right[j], samples.down[j]
+        a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
+        c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
+        upper, lower = a + u * (b - a), c + u * (d - c)
+        out[j] = upper + v * (lower - upper)
+
+
+@njit
+def _distribute(n, m, look, samples, numbers, by_tap):
+    """From numbers on samples to numbers on taps: the transpose of `_interpolate`."""
+    if look.nearest and m == n:
+        for j in range(0, n, LANES):
+            store(by_tap, j, load(numbers, j))
+        _fill(by_tap, n, n + TAP_BLOCK, zero(by_tap))
+        return
+    _fill(by_tap, 0, m + TAP_BLOCK, zero(by_tap))
+    if look.nearest:
+        for j in range(n):
+            by_tap[samples.tap[j]] += numbers[j]
+        return
+    for j in range(n):
+        u, v = samples.right[j], samples.down[j]
+        lower = v * numbers[j]
+        upper = numbers[j] - lower
+        by_tap[samples.tap[4 * j]] += upper - u * upper
+        by_tap[samples.tap[4 * j + 1]] += u * upper
+        by_tap[samples.tap[4 * j + 2]] += lower - u * lower
+        by_tap[samples.tap[4 * j + 3]] += u * lower
+
+
+@njit
+def _fill(numbers, first, last, filler):
+    for j in range(first, last):
+        numbers[j] = filler
+
+
+@njit
+def _slopes(j, samples, by_tap):
+    """How the interpolated number changes with x and with y, at sample j."""
+    u, v = samples.right[j], samples.down[j]
+    a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
+    c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
+    return (ONE - v) * (b - a) + v * (d - c), (ONE - u) * (c - a) + u * (d - b)
+
+
+# ---- forward and backward ----------------------------------------------------------------------------------------
+
+
+@njit
+def _unpack(array, at, n, out):
+    for c in range(n):
+        out[c] = load_one(array, at + c)
+
+
+@njit
+def _pack(numbers, n, array, at):
+    for c in range(n):
+        array[at + c] = narrow(array, numbers[c])
+
+
+@njit
+def _score(p, q, key, channels, look, bias, biased, samples, taps):
+    """Collects pixel p's samples and scores them: how many samples, how many taps."""
+    n = _collect(p, look, samples)
+    if n == 0:
+        return 0, 0
+    m = _tap(n, p // look.alpha_pixels * (look.height * look.width), look, samples, taps)
+    inner_products(q, taps.row, m, key, channels, taps.by_key)
+    _interpolate(n, m, look, samples, taps.by_key, samples.score)
+    if biased:
+        for j in range(n):
+            samples.score[j] += bias[p * look.samples + samples.index[j]]
+    _fill(samples.score, n, n + LANES, zero(q) - np.float32(np.inf))
+    return n, m
+
+
+@njit
+def _softmax(n, samples):
+    """Weights of n scores, and the logarithm of the sum of exponentials (-inf if there is none)."""
+    score, weight = samples.score, samples.weight
+    best = load(score, 0)
+    for j in range(LANES, n, LANES):
+        best = larger(load(score, j), best)
+    top = largest(best)
+    if top == -np.inf:
+        return top
+    mass = _exponentiate(n, samples, top)
+    scale = splat(ONE / mass)
+    for j in range(0, n, LANES):
+        store(weight, j, mul(load(weight, j), scale))
+    return top + math.log(mass)
+
+
+@njit
+def _exponentiate(n, samples, top):
+    """weight = exp(score - top), and the sum; scores are padded with -inf."""
+    minus_top = splat(-top)
+    mass = splat(zero(samples.score))
+    for j in range(0, n, LANES):
+        e = exponentials(add(load(samples.score, j), minus_top))
+        store(samples.weight, j, e)
+        mass = add(mass, e)
+    return total(mass)
+
+
+@njit
+def _measure(n, samples, statistics):
+    """Expected position, spread and largest of the weights, which are padded with 0."""
+    nothing = zero(samples.x)
+    _fill(samples.x, n, n + LANES, nothing)
+    _fill(samples.y, n, n + LANES, nothing)
+    x = y = squared = peak = splat(nothing)
+    for j in range(0, n, LANES):
+        w = load(samples.weight, j)
+        x = fma(w, load(samples.x, j), x)
+        y = fma(w, load(samples.y, j), y)
+    statistics[0], statistics[1] = total(x), total(y)
+    x, y = splat(statistics[0]), splat(statistics[1])
+    for j in range(0, n, LANES):
+        w = load(samples.weight, j)
+        dx, dy = sub(load(samples.x, j), x), sub(load(samples.y, j), y)
+        squared = fma(w, fma(dx, dx, mul(dy, dy)), squared)
+        peak = larger(w, peak)
+    spread = math.sqrt(total(squared))
+    statistics[2] = spread if spread > LEAST_SPREAD else nothing
+    statistics[3] = largest(peak)
+
+
+@njit(nogil=True, cache=True)
+def forward(
+    query,
+    key,
+    value,
+    look,
+    bias,
+    channels,
+    value_channels,
+    integers,
+    numbers,
+    first,
+    last,
+    out,
+    statistics,
+    logsum,
+):
+    """The alpha pixels first .. last: values out, statistics (pixel, 4) and log of the sum of exponentials."""
+    biased = len(bias) > 0
+    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
+    out, statistics = pointer(out), pointer(statistics)
+    samples, taps, q = _room(look.samples, integers, numbers)
+    for p in range(first, last):
+        _unpack(query, p * channels, channels, q)
+        n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
+        logsum[p] = _softmax(n, samples) if n > 0 else -np.inf
+        if logsum[p] == -np.inf:
+            _fill(q, 0, value_channels, zero(q))
+            _fill(statistics, 4 * p, 4 * p + 4, zero(q))
+        else:
+            _distribute(n, m, look, samples, samples.weight, taps.weight)
+            weighted_sum(taps.weight, taps.row, m, value, value_channels, q)
+            _measure(n, samples, from_index(statistics, 4 * p))
+        _pack(q, value_channels, out, p * value_channels)
+
+
+class Scratch(NamedTuple):
+    """What backward leaves for `scatter`: for each pixel of a piece of alpha its taps and their weights."""
+
+    counts: np.ndarray
+    rows: np.ndarray
+    by_key: np.ndarray
+    by_value: np.ndarray
+
+
+@njit
+def _blame(n, samples, statistics, upstream):
+    """From gradients by the weights to gradients by the scores. Samples' slopes hold those of the values."""
+    nothing = zero(upstream)
+    x, y, spread, gx, gy, gspread = _six(statistics, upstream)
+    pull = HALF * gspread / spread if spread > 0 else nothing
+    if gx != 0 or gy != 0 or pull != 0:
+        for j in range(n):
+            away = (samples.x[j] - x) ** 2 + (samples.y[j] - y) ** 2
+            samples.slope[j] += gx * samples.x[j] + gy * samples.y[j] + pull * away
+    if upstream[3] != 0:
+        best = 0
+        for j in range(1, n):
+            best = j if samples.weight[j] > samples.weight[best] else best
+        samples.slope[best] += upstream[3]
+    _fill(samples.slope, n, n + LANES, nothing)
+    mean = splat(nothing)
+    for j in range(0, n, LANES):
+        mean = fma(load(samples.weight, j), load(samples.slope, j), mean)
+    mean = splat(total(mean))
+    for j in range(0, n, LANES):
+        store(samples.score_slope, j, mul(load(samples.weight, j), sub(load(samples.slope, j), mean)))
+
+
+@njit
+def _six(statistics, upstream):
+    return statistics[0], statistics[1], statistics[2], upstream[0], upstream[1], upstream[2]
+
+
+@njit
+def _move(n, p, look, samples, taps, statistics, upstream, out):
+    """Gradients by the positions of the samples, and by the points that made them."""
+    nothing = zero(upstream)
+    centre_x, centre_y, spread, gx, gy, gspread = _six(statistics, upstream)
+    pull = gspread / spread if spread > 0 else nothing
+    x0 = y0 = x1 = y1 = nothing
+    for j in range(n):
+        x, y, w = samples.x[j], samples.y[j], samples.weight[j]
+        dx, dy = w * (gx + pull * (x - centre_x)), w * (gy + pull * (y - centre_y))
+        if not look.nearest:
+            kx, ky = _slopes(j, samples, taps.by_key)
+            vx, vy = _slopes(j, samples, taps.by_value)
+            dx += samples.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= look.last_x) else nothing
+            dy += samples.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= look.last_y) else nothing
+        i = samples.index[j]
+        if look.straight:
+            u = look.fractions[i]
+            x1, y1 = x1 + u * dx, y1 + u * dy
+            x0, y0 = x0 + dx - u * dx, y0 + dy - u * dy
+        else:
+            out[2 * (p * look.samples + i)], out[2 * (p * look.samples + i) + 1] = dx, dy
+    if look.straight:
+        out[4 * p], out[4 * p + 1], out[4 * p + 2], out[4 * p + 3] = x0, y0, x1, y1
+
+
+@njit(nogil=True, cache=True)
+def backward(
+    query,
+    key,
+    value,
+    look,
+    bias,
+    channels,
+    value_channels,
+    logsum,
+    statistics,
+    value_upstream,
+    statistics_upstream,
+    integers,
+    numbers,
+    first,
+    last,
+    scratch_first,
+    stride,
+    scratch,
+    query_out,
+    points_out,
+    bias_out,
+):
+    """The alpha pixels first .. last: gradients by query, points and bias, and what `scatter` needs for the rest.
+
+    Outputs that are not wanted have length 0; points_out and bias_out come zeroed.
+    """
+    biased, wants_query, wants_points = len(bias) > 0, len(query_out) > 0, len(points_out) > 0
+    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
+    statistics, value_upstream = pointer(statistics), pointer(value_upstream)
+    statistics_upstream, query_out, points_out = (
+        pointer(statistics_upstream),
+        pointer(query_out),
+        pointer(points_out),
+    )
+    counts, rows = pointer(scratch.counts), pointer(scratch.rows)
+    by_key, by_value = pointer(scratch.by_key), pointer(scratch.by_value)
+    samples, taps, q = _room(look.samples, integers, numbers)
+    for p in range(first, last):
+        slot = p - scratch_first
+        _unpack(query, p * channels, channels, q)
+        n, m = 0, 0
+        if logsum[p] > -np.inf:
+            n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
+        counts[slot] = m
+        if n == 0:
+            if wants_query:
+                _fill(q, 0, channels, zero(q))
+                _pack(q, channels, query_out, p * channels)
+            continue
+        _exponentiate(n, samples, logsum[p])
+        _unpack(value_upstream, p * value_channels, value_channels, q)
+        inner_products(q, taps.row, m, value, value_channels, taps.by_value)
+        _interpolate(n, m, look, samples, taps.by_value, samples.slope)
+        _blame(n, samples, from_index(statistics, 4 * p), from_index(statistics_upstream, 4 * p))
+        if wants_points:
+            _move(
+                n,
+                p,
+                look,
+                samples,
+                taps,
+                from_index(statistics, 4 * p),
+                from_index(statistics_upstream, 4 * p),
+                points_out,
+            )
+        if len(bias_out) > 0:
+            for j in range(n):
+                bias_out[p * look.samples + samples.index[j]] = samples.score_slope[j]
+        _distribute(n, m, look, samples, samples.weight, from_index(by_value, slot * stride))
+        _distribute(n, m, look, samples, samples.score_slope, from_index(by_key, slot * stride))
+        for t in range(m):
+            rows[slot * stride + t] = taps.row[t]
+        if wants_query:
+            weighted_sum(from_index(by_key, slot * stride), taps.row, m, key, channels, q)
+            _pack(q, channels, query_out, p * channels)

@@ -1,0 +1,169 @@
+"""The compiled backends as one operator of torch, `pat::attend`, with its gradient, `pat::attend_backward`.
+
+Both are registered with shapes and derivatives, so that torch.compile and autograd see through them. Saved for
+backward are the inputs, four statistics and one log of a sum of exponentials per alpha pixel. The gradient of the
+gradient is the reference's.
+"""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import torch
+from torch import Tensor
+
+from pat.attention import reference
+from pat.attention.reference import Attended, Look
+
+
+def attend(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    look: Look,
+    bias: Tensor | None,
+    nearest: bool,
+    *,
+    backend: str,
+    strict: bool,
+) -> Attended:
+    """As `reference.attend`, by the `cpu` or the `triton` backend. `strict`: no second order by the reference."""
+    out, statistics, _ = _attend(
+        query, key, value, look.points, look.mask, bias, look.samples, look.straight, nearest, backend, strict
+    )
+    return Attended(out, statistics[..., :2].permute(0, 3, 1, 2), statistics[..., 2], statistics[..., 3])
+
+
+def _kernels(backend: str) -> ModuleType:
+    """The module of a backend, imported when first needed: compilers take their time to load."""
+    if backend == "cpu":
+        from pat.attention import cpu
+
+        return cpu
+    from pat.attention import gpu
+
+    return gpu
+
+
+@torch.library.custom_op("pat::attend", mutates_args=())
+def _attend(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    points: Tensor,
+    mask: Tensor,
+    bias: Tensor | None,
+    samples: int,
+    straight: bool,
+    nearest: bool,
+    backend: str,
+    strict: bool,
+) -> tuple[Tensor, Tensor, Tensor]:
+    look = Look(points, mask, samples, straight)
+    return _kernels(backend).forward(query, key, value, look, bias, nearest)
+
+
+@_attend.register_fake
+def _(query, key, value, points, mask, bias, samples, straight, nearest, backend, strict):
+    b, _, ha, wa = query.shape
+    out = query.new_empty(b, ha, wa, value.shape[1]).permute(0, 3, 1, 2)
+    return out, points.new_empty(b, ha, wa, 4), points.new_empty(b, ha, wa)
+
+
+@torch.library.custom_op("pat::attend_backward", mutates_args=())
+def _attend_backward(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    points: Tensor,
+    mask: Tensor,
+    bias: Tensor | None,
+    statistics: Tensor,
+    logsum: Tensor,
+    value_cotangent: Tensor,
+    statistics_cotangent: Tensor,
+    samples: int,
+    straight: bool,
+    nearest: bool,
+    backend: str,
+    strict: bool,
+    wanted: list[bool],
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    look = Look(points, mask, samples, straight)
+    saved, cotangents = (statistics, logsum), (value_cotangent, statistics_cotangent)
+    return _kernels(backend).backward(query, key, value, look, bias, nearest, saved, cotangents, wanted)
+
+
+@_attend_backward.register_fake
+def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
+    wanted = rest[-1]
+    pictures = (
+        _channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted)
+    )
+    weights = (*logsum.shape, rest[2])
+    return (
+        *pictures,
+        torch.empty_like(points, memory_format=torch.contiguous_format) if wanted[3] else points.new_empty(0),
+        points.new_empty(weights if wanted[4] else 0),
+    )
+
+
+def _channels_last_like(picture: Tensor) -> Tensor:
+    b, d, h, w = picture.shape
+    return picture.new_empty(b, h, w, d).permute(0, 3, 1, 2)
+
+
+def _keep(ctx, inputs, output) -> None:
+    query, key, value, points, mask, bias, *ctx.options = inputs
+    ctx.save_for_backward(query, key, value, points, mask, bias, *output[1:])
+
+
+def _differentiate(ctx, value_cotangent, statistics_cotangent, _):
+    query, key, value, points, mask, bias, statistics, logsum = ctx.saved_tensors
+    needed = ctx.needs_input_grad
+    wanted = [*needed[:4], needed[5]]
+    gradients = _attend_backward(
+        *(query, key, value, points, mask, bias, statistics, logsum, value_cotangent, statistics_cotangent),
+        *ctx.options,
+        wanted,
+    )
+    q, k, v, p, b = (g if want else None for g, want in zip(gradients, wanted))
+    return q, k, v, p, None, None if bias is None or b is None else b.to(bias.dtype), *[None] * len(ctx.options)
+
+
+_attend.register_autograd(_differentiate, setup_context=_keep)
+
+
+def _keep_again(ctx, inputs, output) -> None:
+    ctx.save_for_backward(*inputs[:10])
+    ctx.options = inputs[10:]
+
+
+def _differentiate_again(ctx, *cotangents):
+    """The gradient of the gradient: of the reference's gradient, made anew with a graph."""
+    samples, straight, nearest, backend, strict, wanted = ctx.options
+    if strict:
+        raise RuntimeError(f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'")
+    query, key, value, points, mask, bias, _, _, *upstream = (
+        t if t is None or not t.is_floating_point() else t.detach().requires_grad_() for t in ctx.saved_tensors
+    )
+    inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
+    with torch.enable_grad():
+        out = reference.attend(query, key, value, Look(points, mask, samples, straight), bias, nearest)
+        outputs = [out.value, _side_by_side(out)]
+        first = torch.autograd.grad(outputs, inputs, upstream, create_graph=True, materialize_grads=True)
+        cotangents = [c for c, want in zip(cotangents, wanted) if want]
+        leaves = [t for t in (query, key, value, points, bias, *upstream) if t is not None]
+        outputs, cotangents = zip(*[(f, c) for f, c in zip(first, cotangents) if f.requires_grad])
+        second = iter(torch.autograd.grad(outputs, leaves, cotangents, allow_unused=True))
+    q, k, v, p = (next(second) for _ in range(4))
+    b = None if bias is None else next(second)
+    return q, k, v, p, None, b, None, None, *second, *[None] * len(ctx.options)
+
+
+def _side_by_side(out: Attended) -> Tensor:
+    """Position, spread and peak as the operator gives them: (b, ha, wa, 4)."""
+    return torch.cat([out.position.permute(0, 2, 3, 1), out.spread[..., None], out.peak[..., None]], -1)
+
+
+_attend_backward.register_autograd(_differentiate_again, setup_context=_keep_again)

@@ -1,0 +1,58 @@
+"""Rigs that the tests look at."""
+
+import math
+
+import torch
+from torch import Tensor
+
+from arraygeom import Camera, Pose, Rig, intrinsics, rotation_from_vector
+
+HW_ALPHA, HW_BETA = (48, 64), (40, 60)
+
+
+def uniform(g: torch.Generator, low: float, high: float, *shape: int) -> Tensor:
+    return low + (high - low) * torch.rand(shape, generator=g, dtype=torch.float64)
+
+
+def random_camera(g: torch.Generator, hw: tuple[int, int], *, turn: float = 0.25, baseline: float = 0.4) -> Camera:
+    """A camera near the origin that looks roughly ahead, of about 60 degrees."""
+    focal = (hw[1] * float(uniform(g, 0.7, 1.1)), hw[1] * float(uniform(g, 0.7, 1.1)))
+    centre = (hw[1] * float(uniform(g, 0.4, 0.6)), hw[0] * float(uniform(g, 0.4, 0.6)))
+    R = rotation_from_vector(uniform(g, -turn, turn, 3))
+    return Camera(
+        K=intrinsics(focal, hw, centre), cam_from_world=Pose(R, uniform(g, -baseline, baseline, 3)), hw=hw
+    )
+
+
+def random_rig(seed: int, *, near: float = 1.5, far: float = 10.0, **camera: float) -> Rig:
+    """Two unlike cameras, alpha and beta, none of them in the world's own frame."""
+    g = torch.Generator().manual_seed(seed)
+    cameras = {"alpha": random_camera(g, HW_ALPHA, **camera), "beta": random_camera(g, HW_BETA, **camera)}
+    return Rig(cameras, depth=(near, far))
+
+
+def scene_points(rig: Rig, n: int = 200, *, seed: int = 0) -> Tensor:
+    """World points that alpha sees, between the rig's depth bounds."""
+    g = torch.Generator().manual_seed(seed)
+    alpha, (near, far) = rig["alpha"], rig.depth
+    h, w = alpha.hw
+    x = torch.stack([uniform(g, 0, w - 1, n), uniform(g, 0, h - 1, n)], -1)
+    inverse = torch.lerp(1 / far, 1 / near, torch.rand(n, generator=g, dtype=torch.float64))
+    return alpha.unproject(x, 1 / inverse)
+
+
+def two_cameras(R: Tensor | None = None, centre: tuple[float, float, float] = (0.0, 0.0, 0.0), **rig: object) -> Rig:
+    """Alpha in the world's frame, beta turned by R with its centre where told; both of 90 degrees."""
+    K = intrinsics(32.0, (48, 64))
+    R = torch.eye(3, dtype=torch.float64) if R is None else R
+    beta = Pose.from_centre(R, torch.tensor(centre, dtype=torch.float64))
+    cameras = {
+        "alpha": Camera(K=K, cam_from_world=Pose.identity(), hw=(48, 64)),
+        "beta": Camera(K=K, cam_from_world=beta, hw=(48, 64)),
+    }
+    return Rig(cameras, depth=rig.get("depth", (1.0, 10.0)))
+
+
+def half_turn() -> Tensor:
+    """Looking back: half a turn about y."""
+    return rotation_from_vector(torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64))

@@ -1,0 +1,90 @@
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from arraygeom import Pose, rotation_from_vector
+from arraygeom.pose import rotation_error
+
+vectors = st.lists(st.floats(-4, 4), min_size=3, max_size=3)
+
+
+def random_pose(seed: int, *batch: int) -> Pose:
+    g = torch.Generator().manual_seed(seed)
+    w, t = (torch.randn(*batch, 3, generator=g, dtype=torch.float64) for _ in range(2))
+    return Pose(rotation_from_vector(w), t)
+
+
+def close(a: Pose, b: Pose) -> None:
+    torch.testing.assert_close(a.R, b.R, atol=1e-12, rtol=0)
+    torch.testing.assert_close(a.t, b.t, atol=1e-12, rtol=0)
+
+
+@given(vectors)
+def test_exponential_is_scipys(w):
+    R = rotation_from_vector(torch.tensor(w, dtype=torch.float64))
+    np.testing.assert_allclose(R.numpy(), Rotation.from_rotvec(w).as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-8, 1e-5, 1e-3, 0.5])
+def test_exponential_in_float32_near_zero_angle(angle):
+    w = angle * torch.tensor([1.0, -2.0, 3.0], dtype=torch.float64) / 14**0.5
+    expected = rotation_from_vector(w)
+    R = rotation_from_vector(w.float())
+    assert R.dtype == torch.float32
+    torch.testing.assert_close(R, expected.float(), atol=2e-7, rtol=0)
+    torch.testing.assert_close(R - R.T, (expected - expected.T).float(), atol=2e-7 * angle, rtol=1e-6)
+
+
+def test_exponentials_derivative_in_float32_at_zero_is_the_generators():
+    w = torch.zeros(3, requires_grad=True)
+    (gradient,) = torch.autograd.grad(rotation_from_vector(w)[2, 1], w)
+    assert gradient.tolist() == [1.0, 0.0, 0.0]
+
+
+def test_group_axioms():
+    a, b, c = (random_pose(i) for i in range(3))
+    close((a @ b) @ c, a @ (b @ c))
+    close(a @ a.inverse(), Pose.identity())
+    close(a.inverse() @ a, Pose.identity())
+    X = torch.randn(7, 3, dtype=torch.float64)
+    torch.testing.assert_close((a @ b).apply(X), a.apply(b.apply(X)))
+
+
+def test_batches_agree_with_singles():
+    a, b = random_pose(0, 4), random_pose(1, 4)
+    X = torch.randn(4, 5, 3, dtype=torch.float64)
+    together = (a @ b).apply(X)
+    for i in range(4):
+        torch.testing.assert_close(together[i], Pose(a.R[i], a.t[i]).apply(Pose(b.R[i], b.t[i]).apply(X[i])))
+
+
+def test_centre_is_where_the_camera_is():
+    R, centre = random_pose(3).R, torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    pose = Pose.from_centre(R, centre)
+    torch.testing.assert_close(pose.centre, centre)
+    assert pose.apply(centre[None]).abs().max() < 1e-12
+
+
+@pytest.mark.parametrize(("dtype", "drift"), [(torch.float64, 1e-15), (torch.float32, 5e-7)])
+def test_a_thousand_steps_stay_on_the_manifold(dtype, drift):
+    g = torch.Generator().manual_seed(0)
+    pose = random_pose(0).to(dtype)
+    for _ in range(1000):
+        pose = pose.perturbed(0.1 * torch.randn(3, generator=g, dtype=dtype))
+    assert rotation_error(pose.R) < drift
+
+
+def test_gradients():
+    w = torch.tensor([[0.0, 0, 0], [0.3, -0.2, 0.5]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(rotation_from_vector, w)
+    assert torch.autograd.gradgradcheck(rotation_from_vector, w)
+
+
+def test_rotation_error_tells_reflections_and_scales():
+    R = random_pose(5).R
+    assert rotation_error(R) < 1e-12
+    assert rotation_error(1.01 * R) == pytest.approx(0.0201, abs=1e-6)
+    assert rotation_error(-R) == 2

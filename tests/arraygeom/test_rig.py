@@ -1,0 +1,125 @@
+import pytest
+import torch
+
+from arraygeom import Link, Rig, View, epipolar_distance, resize_matrix
+from arraygeom.pose import rotation_error
+from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
+
+EVERYTHING = ("rotation", "translation", "focal", "centre")
+
+
+def uncalibrated() -> Rig:
+    """The same pair as `random_rig(0)`, known by F and H only."""
+    rig = random_rig(0)
+    pair = rig.pair("alpha", "beta")
+    views = {n: View(hw=rig[n].hw) for n in rig.names}
+    return Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda r, n: r.resize(n, (30, 31)),
+        lambda r, n: r.crop(n, 2, -5, (20, 90)),
+        lambda r, n: r.turn(n, 1),
+        lambda r, n: r.turn(n, 2),
+    ],
+)
+@pytest.mark.parametrize("name", ["alpha", "beta"])
+def test_links_follow_what_happens_to_pictures(change, name):
+    """The calibrated rig is the oracle of the uncalibrated one."""
+    known, unknown = change(random_rig(0), name), change(uncalibrated(), name)
+    assert known[name].hw == unknown[name].hw
+    X = scene_points(random_rig(0))
+    x_alpha, x_beta = (known[n].project(X).x for n in ("alpha", "beta"))
+    F = unknown.pair("alpha", "beta").fundamental
+    assert epipolar_distance(F, x_alpha, x_beta).abs().max() < 1e-9
+    H = unknown.pair("alpha", "beta").homography
+    expected = known.pair("alpha", "beta").homography
+    torch.testing.assert_close(H / H[2, 2], expected / expected[2, 2])
+
+
+def test_a_link_serves_both_ways():
+    forth, back = (uncalibrated().pair(*names) for names in (("alpha", "beta"), ("beta", "alpha")))
+    torch.testing.assert_close(back.fundamental, forth.fundamental.T)
+    torch.testing.assert_close(back.homography @ forth.homography, torch.eye(3, dtype=torch.float64))
+
+
+def test_what_is_not_free_stays_bit_identical():
+    rig = random_rig(0)
+    changes = rig.parameters(free=["beta.rotation", "beta.focal", "depth.near"])
+    moved = rig.perturbed({name: v + 0.01 for name, v in changes.items()})
+    assert torch.equal(moved["alpha"].K, rig["alpha"].K)
+    assert torch.equal(moved["alpha"].R, rig["alpha"].R)
+    assert torch.equal(moved["alpha"].t, rig["alpha"].t)
+    assert torch.equal(moved["beta"].t, rig["beta"].t)
+    assert torch.equal(moved["beta"].K[:, 2], rig["beta"].K[:, 2])
+    assert torch.equal(moved.depth[1], rig.depth[1])
+    torch.testing.assert_close(moved["beta"].K.diagonal()[:2], rig["beta"].K.diagonal()[:2] + 0.01)
+    assert moved.depth[0] == rig.depth[0] + 0.01
+    assert not torch.equal(moved["beta"].R, rig["beta"].R)
+
+
+@pytest.mark.parametrize("turns", range(4))
+def test_focal_lengths_of_turned_pictures(turns):
+    """Changing the focal length and turning commute."""
+    rig = random_rig(0)
+    change = {"beta.focal": torch.tensor([1.0, 2.0], dtype=torch.float64)}
+    a, b = rig.perturbed(change).turn("beta", turns), rig.turn("beta", turns).perturbed(change)
+    torch.testing.assert_close(a["beta"].K, b["beta"].K)
+
+
+def test_an_optimiser_finds_a_disturbed_camera_and_stays_on_the_manifold():
+    """1,000 steps on rotation and translation of beta bring its projections back."""
+    rig = random_rig(1)
+    X = scene_points(rig, 50)
+    target = rig["beta"].project(X).x
+    g = torch.Generator().manual_seed(0)
+    names = [f"beta.{p}" for p in ("rotation", "translation")]
+    guess = rig.perturbed({n: 0.03 * torch.randn(3, generator=g, dtype=torch.float64) for n in names})
+    before = (guess["beta"].project(X).x - target).abs().max()
+    for _ in range(1000):
+        changes = guess.parameters(free=names)
+        loss = (guess.perturbed(changes)["beta"].project(X).x - target).square().mean()
+        slopes = torch.autograd.grad(loss, list(changes.values()))
+        guess = guess.perturbed({n: -2e-5 * s for n, s in zip(names, slopes)})
+    assert rotation_error(guess["beta"].R) < 1e-15
+    assert (guess["beta"].project(X).x - target).abs().max() < 0.2 * before
+
+
+def test_patterns_choose_parameters():
+    rig = random_rig(0)
+    assert set(rig.parameters(free=["beta.*"])) == {f"beta.{p}" for p in EVERYTHING}
+    assert set(rig.parameters(free=["*.focal", "depth.*"])) == {"alpha.focal", "beta.focal", "depth.near", "depth.far"}
+    assert all(v.requires_grad and not v.any() for v in rig.parameters(free=["*"]).values())
+
+
+def test_wrong_names_are_told():
+    rig = random_rig(0)
+    with pytest.raises(ValueError, match="did you mean 'beta'"):
+        rig["bta"]
+    with pytest.raises(ValueError, match="no rig parameter matches 'gamma"):
+        rig.parameters(free=["gamma.*"])
+    with pytest.raises(ValueError, match=r"no such rig parameter: beta\.zoom"):
+        rig.perturbed({"beta.zoom": torch.zeros(2)})
+
+
+@pytest.mark.parametrize("depth", [(0, 1), (3, 2), (-1, 2), (float("nan"), 2)])
+def test_impossible_depths_are_refused(depth):
+    with pytest.raises(ValueError, match="0 < near <= far"):
+        two_cameras(depth=depth)
+
+
+def test_pairs_say_what_they_lack():
+    rig = Rig({"a": View(hw=(4, 6)), "b": View(hw=(8, 12))})
+    pair = rig.pair("a", "b")
+    torch.testing.assert_close(pair.homography, resize_matrix((4, 6), (8, 12)))
+    for wanted, words in (("cameras", "calibrated"), ("depth_range", "depth range"), ("fundamental", "link")):
+        with pytest.raises(ValueError, match=words):
+            getattr(pair, wanted)
+
+
+def test_betas_and_replacement():
+    rig = random_rig(0).with_camera("third", View(hw=(5, 5)))
+    assert rig.betas("beta") == ("alpha", "third")
+    assert rig.to(torch.float32).pair("alpha", "beta").fundamental.dtype == torch.float32

@@ -1,0 +1,198 @@
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom.camera import Camera, intrinsics
+from arraygeom.pose import Pose
+from arraygeom.sensor import Band
+from pat.sensors import (
+    BoxBlur,
+    Case,
+    Clip,
+    Coded,
+    DiscBlur,
+    Exposure,
+    GaussianBlur,
+    Jitter,
+    Linear,
+    Noise,
+    Quantise,
+    Resample,
+    Spectral,
+    augment,
+    paper_cases,
+    record,
+)
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def noise_picture(*shape: int) -> torch.Tensor:
+    return torch.rand(*shape, generator=generator(), dtype=torch.float64)
+
+
+def run(image: torch.Tensor, *steps, seed: int = 0) -> torch.Tensor:
+    return record(image, steps, generator(seed)).image
+
+
+def test_linear_and_coded_are_inverses_and_match_the_standard():
+    x = torch.linspace(0, 1, 101, dtype=torch.float64).view(1, 1, 1, -1)
+    torch.testing.assert_close(run(x, Linear(), Coded()), x, atol=1e-12, rtol=0)
+    assert run(torch.full((1, 1, 1, 1), 0.5), Linear()).item() == pytest.approx(0.214041, abs=1e-6)
+
+
+def test_noise_follows_the_mean_variance_line():
+    full_well, read = 1000.0, 8.0
+    signal = torch.linspace(0.05, 0.95, 10, dtype=torch.float64).view(10, 1, 1, 1).expand(10, 1, 300, 300)
+    noisy = run(signal, Noise(full_well, read))
+    electrons = noisy.flatten(1) * full_well
+    slope, offset = np.polyfit(electrons.mean(1).numpy(), electrons.var(1).numpy(), 1)
+    assert slope == pytest.approx(1, abs=0.03)
+    assert offset == pytest.approx(read**2, abs=10)
+
+
+def test_noise_is_seeded_and_differs_between_pictures():
+    flat = torch.full((2, 1, 4, 4), 0.5)
+    a, b, c = (run(flat, Noise(100), seed=s) for s in (1, 1, 2))
+    assert torch.equal(a, b)
+    assert not torch.equal(a, c)
+    assert not torch.equal(a[0], a[1])
+
+
+@pytest.mark.parametrize("to", [0.5, 0.25, (20, 33), (50, 90), 2.0])
+def test_area_resampling_keeps_the_mean(to):
+    image = noise_picture(2, 3, 40, 72)
+    torch.testing.assert_close(run(image, Resample(to)).mean((2, 3)), image.mean((2, 3)))
+
+
+def test_bicubic_resampling_keeps_the_mean_of_smooth_pictures():
+    image = run(noise_picture(1, 1, 80, 80), GaussianBlur(3.0))
+    for to in (0.5, 2.0, (37, 61)):
+        assert run(image, Resample(to, "bicubic")).mean() == pytest.approx(image.mean().item(), abs=1e-3)
+
+
+def test_area_resampling_agrees_with_opencv():
+    image = noise_picture(1, 1, 60, 90)
+    for hw in ((30, 45), (24, 60), (17, 29)):
+        wanted = cv2.resize(image[0, 0].numpy(), hw[::-1], interpolation=cv2.INTER_AREA)
+        np.testing.assert_allclose(run(image, Resample(hw))[0, 0].numpy(), wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("method", ["area", "bicubic"])
+@pytest.mark.parametrize("to", [0.5, 0.25, (31, 70), 2.0])
+def test_points_stay_where_the_camera_of_the_resampled_picture_puts_them(method, to):
+    """A soft dot drawn where a point projects is found where the mapped camera projects the point."""
+    K = intrinsics(90.0, (64, 96))
+    camera = Camera(K=K, cam_from_world=Pose.identity(), hw=(64, 96))
+    X = torch.tensor([0.13, -0.07, 1.0], dtype=torch.float64)
+    x, y = camera.project(X).x
+    rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
+    dot = torch.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 4**2)).double()[None, None]
+    image, pixels = record(dot, [GaussianBlur(1.0), Resample(to, method)], generator())
+    new = camera.mapped(pixels, tuple(image.shape[-2:]))
+    rows, columns = torch.meshgrid(*(torch.arange(float(n)) for n in image.shape[-2:]), indexing="ij")
+    found = [(image[0, 0] * c).sum() / image.sum() for c in (columns, rows)]
+    torch.testing.assert_close(torch.stack(found), new.project(X).x, atol=0.01, rtol=0)
+
+
+def test_maps_of_several_steps_compose():
+    image = noise_picture(1, 1, 60, 80)
+    pixels = record(image, [Resample(0.5), BoxBlur(3), Resample((45, 20))], generator()).pixels
+    direct = Resample((45, 20)).pixel_matrix((60, 80))
+    torch.testing.assert_close(pixels, direct)
+
+
+def test_blurs_keep_flat_pictures_and_spread_a_point_as_stated():
+    point = torch.zeros(1, 1, 41, 41, dtype=torch.float64)
+    point[..., 20, 20] = 1
+    x = torch.arange(41.0).double() - 20
+    for step, variance in ((BoxBlur(5), 2.0), (GaussianBlur(2.0), 4.0), (DiscBlur(6.0), 36 / 4)):
+        assert torch.allclose(run(torch.ones(1, 2, 9, 9), step), torch.ones(1, 2, 9, 9))
+        spread = run(point, step)[0, 0]
+        assert spread.sum().item() == pytest.approx(1)
+        assert (spread.sum(0) * x**2).sum().item() == pytest.approx(variance, rel=0.03)
+        assert (spread.sum(1) * x**2).sum().item() == pytest.approx(variance, rel=0.03)
+
+
+def test_blurs_agree_with_opencv():
+    image = noise_picture(1, 1, 30, 40)
+    box = cv2.blur(image[0, 0].numpy(), (5, 5), borderType=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(run(image, BoxBlur(5))[0, 0].numpy(), box, atol=1e-12)
+    gauss = cv2.GaussianBlur(image[0, 0].numpy(), (13, 13), 1.5, borderType=cv2.BORDER_REPLICATE)
+    np.testing.assert_allclose(run(image, GaussianBlur(1.5))[0, 0].numpy(), gauss, atol=1e-12)
+
+
+def test_spectral_responses():
+    image = noise_picture(2, 3, 4, 5)
+    assert torch.equal(run(image, Spectral("rgb")), image)
+    grey = run(image, Spectral("luminance"))
+    wanted = np.stack([cv2.cvtColor(i.movedim(0, -1).float().numpy(), cv2.COLOR_RGB2GRAY) for i in image])
+    np.testing.assert_allclose(grey[:, 0].numpy(), wanted, atol=1e-4)
+    white = torch.ones(1, 3, 1, 1)
+    for centre in (450, 550, 600):
+        assert run(white, Spectral(Band(centre, 40))).item() == pytest.approx(1)
+    red = torch.tensor([1.0, 0, 0]).view(1, 3, 1, 1)
+    assert run(red, Spectral(Band(620, 20))).item() > 0.85 > 0.1 > run(red, Spectral(Band(450, 20))).item()
+
+
+def test_quantise_rounds_to_levels():
+    image = noise_picture(1, 1, 8, 8) * 1.2 - 0.1
+    levels = run(image, Quantise(4)) * 15
+    torch.testing.assert_close(levels, levels.round())
+    assert (run(image, Quantise(8)) - image.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-12
+
+
+def test_jitter_changes_each_picture_by_about_what_is_asked():
+    grey = torch.full((4000, 3, 1, 1), 0.4)
+    jittered = run(grey, Jitter(gain=0.05, gamma=0.0, balance=0.0))
+    assert (jittered / 0.4).log().std().item() == pytest.approx(0.05, rel=0.05)
+    assert (jittered.std(1) < 1e-6).all()
+    assert (run(grey, Jitter(0.0, 0.0, 0.05)).std(1) > 1e-3).float().mean() > 0.9
+
+
+@pytest.mark.parametrize(
+    "step",
+    [Linear(), Coded(), Exposure(1.7), Spectral("luminance"), Spectral(Band(560, 50)), BoxBlur(3), GaussianBlur(0.8)]
+    + [DiscBlur(1.3), Resample(0.5), Resample((5, 9)), Resample(2.0, "bicubic"), Noise(500, 3), Jitter()],
+    ids=lambda s: type(s).__name__,
+)
+def test_gradients_in_the_picture(step):
+    image = (0.1 + 0.8 * noise_picture(1, 3, 6, 8)).requires_grad_()
+    assert torch.autograd.gradcheck(lambda x: run(x, step), image)
+
+
+@pytest.mark.parametrize("step", [GaussianBlur, DiscBlur, Exposure])
+def test_gradients_in_the_parameter(step):
+    image = noise_picture(1, 1, 9, 9)
+    parameter = torch.tensor(1.23, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda p: run(image, step(p)), parameter)
+
+
+def test_quantise_lets_the_gradient_pass_where_not_clipped():
+    image = torch.tensor([-0.5, 0.3, 1.5]).view(1, 1, 1, 3).requires_grad_()
+    run(image, Quantise(8)).sum().backward()
+    assert image.grad.flatten().tolist() == [0, 1, 0]
+
+
+def test_the_four_cases_are_equally_likely_and_do_what_they_say():
+    alpha, beta = noise_picture(400, 1, 8, 16), noise_picture(400, 3, 8, 16)
+    pairs = augment(alpha, beta, paper_cases(), generator())
+    assert (torch.bincount(pairs.case, minlength=4) - 100).abs().max() < 35
+    changed = torch.stack([(a != b).flatten(1).any(1) for a, b in ((pairs.alpha, alpha), (pairs.beta, beta))], 1)
+    wanted = torch.tensor([[True, False], [False, True], [False, True], [False, True]])
+    assert torch.equal(changed, wanted[pairs.case])
+    for case, steps in ((1, [BoxBlur(5)]), (2, [Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip()])):
+        met = pairs.case == case
+        torch.testing.assert_close(pairs.beta[met], run(beta[met], *steps))
+
+
+def test_mistakes_are_told():
+    with pytest.raises(ValueError, match="odd"):
+        BoxBlur(4)
+    with pytest.raises(ValueError, match="900 nm"):
+        Spectral(Band(900, 20))
+    with pytest.raises(ValueError, match='"halve".*keep the size'):
+        augment(noise_picture(1, 1, 8, 8), noise_picture(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator())
