@@ -17,10 +17,24 @@ from ..camera import Camera
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
-from . import aniposelib, boofcv, colmap, kalibr, kitti, matlab, middlebury, multical, native, nerfstudio
-from . import opencv, pycalib, ros, syntim
+from . import (
+    aniposelib,
+    boofcv,
+    colmap,
+    kalibr,
+    kitti,
+    matlab,
+    middlebury,
+    multical,
+    native,
+    nerfstudio,
+    opencv,
+    pycalib,
+    ros,
+    syntim,
+)
 from .errors import RigFileError
-from .source import RigFileWarning, Source
+from .source import RigFileWarning, Source, unit_doubt
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -52,9 +66,7 @@ WRITERS: dict[str, Any] = {
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
 
 
-def read_rig(
-    path: str | Path, *, format: str | None = None, scale: float = 1.0, hw: HW | None = None
-) -> Rig:
+def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0, hw: HW | None = None) -> Rig:
     """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
 
     `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the pictures' (height,
@@ -75,7 +87,10 @@ def read_rig(
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
-    return rig if scale == 1.0 else _scaled(rig, scale)
+    rig = rig if scale == 1.0 else _scaled(rig, scale)
+    if doubt := unit_doubt(rig):
+        Source(path).warn(doubt)
+    return rig
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:

@@ -26,9 +26,7 @@ def read(source: Source) -> Rig:
     """Every camera that is not marked `ignore`, under its name, or else that of its table."""
     document = source.toml()
     tables = document.get("cameras") if isinstance(document.get("cameras"), dict) else document
-    cameras = {
-        key: fields for key, fields in (tables or {}).items() if isinstance(fields, dict) and key != "metadata"
-    }
+    cameras = {key: fields for key, fields in (tables or {}).items() if isinstance(fields, dict) and key != "metadata"}
     if not any("matrix" in fields for fields in cameras.values()):
         raise source.fail("matrix", "is in no table; is this a camera array of aniposelib or caliscope?")
     used = {key: fields for key, fields in cameras.items() if not fields.get("ignore", False)}

@@ -170,7 +170,9 @@ class _Text:
             i = _id(source, fields[0], entry)
             if i in found:
                 raise source.fail(entry, f"camera {i} occurs twice; keep one")
-            found[i] = _intrinsics(source, entry, fields[1], (_float(fields[2]), _float(fields[3])), _floats(fields[4:]))
+            found[i] = _intrinsics(
+                source, entry, fields[1], (_float(fields[2]), _float(fields[3])), _floats(fields[4:])
+            )
         _check_count(source, "cameras", len(found))
         return found
 

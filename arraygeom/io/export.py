@@ -14,9 +14,7 @@ def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
     cameras = []
     for name, camera in rig.cameras.items():
         if not isinstance(camera, Camera):
-            raise ValueError(
-                f"{format} files hold calibrated cameras and '{name}' is not one: use the native format"
-            )
+            raise ValueError(f"{format} files hold calibrated cameras and '{name}' is not one: use the native format")
         if camera.K.ndim != 2:
             raise ValueError(f"camera '{name}' is a batch of cameras; rig files hold one of each: write one rig each")
         cameras.append((name, camera))

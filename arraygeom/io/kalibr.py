@@ -11,6 +11,7 @@ import re
 from pathlib import Path
 from typing import Any
 
+import torch
 import yaml
 
 from ..camera import Camera
@@ -49,7 +50,7 @@ def write(rig: Rig) -> str:
     """
     cameras = calibrated(rig, "Kalibr")
     first = cameras[0][1].cam_from_world
-    at_origin = bool((first.R == first.R.new_tensor([[1, 0, 0], [0, 1, 0], [0, 0, 1]])).all() and (first.t == 0).all())
+    at_origin = pose_rows(first.R, first.t) == torch.eye(4).tolist()
     document, before = {}, None
     for i, (name, camera) in enumerate(cameras):
         entry = _entry(name, camera)

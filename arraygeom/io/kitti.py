@@ -39,8 +39,8 @@ def _rectified(source: Source, entries: dict[str, Tensor], name: str) -> Camera:
     P = source.numbers(entries[name], (3, 4), name)
     K = source.intrinsics(P[:, :3], name)
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.linalg.solve(K, P[:, 3]))
-    size = entries.get(name.replace("P_rect", "S_rect"))
-    hw = source.size_unstated(K) if size is None or name.startswith("P0") else _size(source, size, name)
+    size = entries.get(name.replace("P_", "S_")) if "_" in name else None
+    hw = source.size_unstated(K) if size is None else _size(source, size, name)
     return Camera(K=K, cam_from_world=pose, hw=hw)
 
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import scipy.io
-import torch
 from torch import Tensor
 
 from ..camera import Camera

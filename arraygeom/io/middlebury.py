@@ -37,9 +37,7 @@ def read(source: Source) -> Rig:
     if abs(doffs - float(Ks[1][0, 2] - Ks[0][0, 2])) > 0.5:
         raise source.fail("doffs", f"is {doffs:g}, which is not the difference of the principal points")
     hw = source.size(width, height, "width, height")
-    cameras = [
-        Camera(K=K, cam_from_world=_along_x(-metres), hw=hw) for K, metres in zip(Ks, (0.0, baseline * 1e-3))
-    ]
+    cameras = [Camera(K=K, cam_from_world=_along_x(-metres), hw=hw) for K, metres in zip(Ks, (0.0, baseline * 1e-3))]
     return source.rig(zip(("cam0", "cam1"), cameras), depth=_depth(source, entries, Ks[0], baseline * 1e-3, doffs))
 
 

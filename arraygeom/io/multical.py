@@ -41,8 +41,8 @@ def _poses(source: Source, entries: dict[str, Any], cameras: dict[str, Any]) -> 
     poses: dict[str, Pose] = {}
     for key, fields in entries.items():
         entry = f"camera_poses.{key}"
-        values = [source.get(source.mapping(fields, entry), letter, entry) for letter in ("R", "T")]
-        pose = source.pose(*values, entry)
+        R, T = (source.get(source.mapping(fields, entry), letter, entry) for letter in "RT")
+        pose = source.pose(R, T, entry)
         if key in cameras:
             poses[key] = pose
             continue

@@ -46,10 +46,11 @@ def _is_camera_info(text: str) -> bool:
 def _camera(source: Source) -> tuple[str, Camera]:
     info = source.yaml()
     K = source.intrinsics(_data(source, info, "camera_matrix"), "camera_matrix")
+    width, height = (source.get(info, f"image_{k}", "") for k in ("width", "height"))
     camera = Camera(
         K=K,
         cam_from_world=_pose(source, info),
-        hw=source.size(*(source.get(info, f"image_{k}", "") for k in ("width", "height")), "image_width"),
+        hw=source.size(width, height, "image_width, image_height"),
         distortion=_lens(source, info),
     )
     return str(info.get("camera_name") or source.path.stem), camera

@@ -102,7 +102,7 @@ class Source:
     def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str) -> Tensor:
         """Finite numbers as a float64 tensor of a shape (any order of nesting that has as many), or a vector."""
         try:
-            tensor = torch.as_tensor(value).to(torch.float64)
+            tensor = torch.as_tensor(value, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError):
             raise self.fail(entry, f"holds something other than numbers: {str(value)[:60]!r}") from None
         if shape is not None and tensor.numel() != torch.Size(shape).numel():
@@ -129,8 +129,7 @@ class Source:
             return self.hw
         w, h = (max(1, round(2 * c + 1)) for c in K[:2, 2].tolist())
         self.warn(
-            f"states no picture size: took {w} x {h}, twice the principal point; "
-            "say `hw=(height, width)` when reading"
+            f"states no picture size: took {w} x {h}, twice the principal point; say `hw=(height, width)` when reading"
         )
         return h, w
 
@@ -140,9 +139,7 @@ class Source:
         if K[2].tolist() != [0.0, 0.0, 1.0]:
             raise self.fail(entry, f"has last row {K[2].tolist()}, wanted [0, 0, 1]; is it transposed?")
         if not (K[0, 0] > 0 and K[1, 1] > 0):
-            raise self.fail(
-                entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels"
-            )
+            raise self.fail(entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels")
         return shift_matrix(first_pixel, first_pixel) @ K
 
     def focal_and_centre(self, numbers: Any, entry: str, *, first_pixel: float = 0.0) -> Tensor:
@@ -212,7 +209,7 @@ class Source:
         return Distortion("kannala-brandt", torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
-        """The rig, once no name occurs twice; warns of baselines that suggest another unit."""
+        """The rig, once no name occurs twice."""
         named: dict[str, Camera] = {}
         for name, camera in cameras:
             if name in named:
@@ -220,22 +217,7 @@ class Source:
             named[name] = camera
         if not named:
             raise self.fail(None, "holds no camera; is the file whole?")
-        self._check_unit(named)
         return Rig(named, **fields)
-
-    def _check_unit(self, cameras: Mapping[str, Camera]) -> None:
-        centres = torch.stack([camera.centre for camera in cameras.values()])
-        longest = float(torch.cdist(centres, centres).max())
-        if longest > LARGEST_BASELINE:
-            self.warn(
-                f"has cameras {longest:.3g} m apart: is this file in millimetres? "
-                "Read it with scale=0.001; if the scale is arbitrary, all is well"
-            )
-        elif 0 < longest < SMALLEST_BASELINE:
-            self.warn(
-                f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres and the format's "
-                "unit millimetres? Read it with scale=1000"
-            )
 
     def _unique(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         fields = dict(pairs)
@@ -243,6 +225,25 @@ class Source:
             names = [name for name, _ in pairs]
             raise self.fail(next(n for n in names if names.count(n) > 1), "occurs twice; keep one")
         return fields
+
+
+def unit_doubt(rig: Rig) -> str | None:
+    """What to say of baselines that suggest another unit than metres."""
+    centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
+    if len(centres) < 2:
+        return None
+    longest = float(torch.pdist(torch.stack(centres)).max())
+    if longest > LARGEST_BASELINE:
+        return (
+            f"has cameras {longest:.3g} m apart: is this file in millimetres? "
+            "Then read it with scale=0.001; if its scale is arbitrary, all is well"
+        )
+    if 0 < longest < SMALLEST_BASELINE:
+        return (
+            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as millimetres? "
+            "Then read it with scale=1000"
+        )
+    return None
 
 
 class _UniqueKeys(yaml.SafeLoader):

@@ -37,8 +37,7 @@ def _camera(source: Source) -> Camera:
     text = source.text()
     values = {k: _value(source, text, k) for k in ("u0", "v0", "au", "av", "dimx", "dimy")}
     K = source.focal_and_centre([values[k] for k in ("au", "av", "u0", "v0")], "au, av, u0, v0")
-    intrinsic, _, after = text.partition("Rotation:")
-    rotation, _, translation = after.partition("Translation:")
+    rotation, _, translation = text.partition("Rotation:")[2].partition("Translation:")
     R = source.numbers(_numbers(rotation), (3, 3), "Rotation")
     t = source.numbers(_numbers(translation), (3,), "Translation")
     world_from_cam = source.pose(R, t, "Rotation, Translation:", metres=1e-3)
