@@ -1,34 +1,142 @@
-"""Rig files: one module a format, one registry."""
+"""Rig files: one module a format, one registry.
+
+Each reader's module states the convention of its format and the shift that it applies, in its docstring and in
+one line as `CONVENTION`.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
+from ..camera import Camera
+from ..pixels import HW
+from ..pose import Pose
 from ..rig import Rig
-from . import native
+from . import (
+    aniposelib,
+    boofcv,
+    colmap,
+    kalibr,
+    kitti,
+    matlab,
+    middlebury,
+    multical,
+    native,
+    nerfstudio,
+    opencv,
+    pycalib,
+    ros,
+    syntim,
+)
 from .errors import RigFileError
+from .source import RigFileWarning, Source, unit_doubt
 
-READERS: dict[str, ModuleType] = {"native": native}
-WRITERS: dict[str, ModuleType] = {"native": native}
+# In the order in which they are asked whether they recognise a file.
+READERS: dict[str, Any] = {
+    "colmap": colmap,
+    "opencv": opencv,
+    "kalibr": kalibr,
+    "boofcv": boofcv,
+    "ros": ros,
+    "native": native,
+    "matlab": matlab,
+    "kitti-raw": kitti.Raw,
+    "kitti": kitti,
+    "middlebury": middlebury,
+    "syntim": syntim,
+    "nerfstudio": nerfstudio,
+    "multical": multical,
+    "aniposelib": aniposelib,
+    "pycalib": pycalib,
+}
+READERS["caliscope"] = aniposelib
+WRITERS: dict[str, Any] = {
+    "native": native,
+    "opencv": opencv,
+    "colmap": colmap,
+    "kalibr": kalibr,
+    "nerfstudio": nerfstudio,
+}
 
-__all__ = ["READERS", "WRITERS", "RigFileError", "read_rig", "write_rig"]
+__all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
 
 
-def read_rig(path: str | Path, *, format: str | None = None) -> Rig:
-    """The rig of a file; its format is recognised unless named. Raises RigFileError, FileNotFoundError."""
+def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0, hw: HW | None = None) -> Rig:
+    """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
+
+    `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the pictures' (height,
+    width), for formats that do not state it. What looks odd but can be read gives a RigFileWarning.
+    Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown format.
+    """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such rig file")
-    return _reader(path, format).read(path)
+    format = recognise(path) if format is None else format
+    if format not in READERS:
+        raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")
+    reader = READERS[format]
+    try:
+        rig = reader.read(path) if reader is native else reader.read(Source(path, hw=hw))
+    except (RigFileError, FileNotFoundError):
+        raise
+    except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
+        cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
+    rig = rig if scale == 1.0 else _scaled(rig, scale)
+    if doubt := unit_doubt(rig):
+        Source(path).warn(doubt)
+    return rig
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig; the file appears whole or not at all."""
+    """Write a rig; each file appears whole or not at all. Formats of several files make a folder.
+
+    Raises ValueError for an unknown format, and for a rig that the format cannot hold.
+    """
+    if format not in WRITERS:
+        raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
+    path, contents = Path(path), WRITERS[format].write(rig)
+    if isinstance(contents, Mapping):
+        path.mkdir(parents=True, exist_ok=True)
+        for name, text in contents.items():
+            _write_whole(path / name, text)
+    else:
+        _write_whole(path, contents)
+
+
+def recognise(path: str | Path) -> str:
+    """The name of a file's or folder's format. Raises RigFileError if it is none that is known."""
     path = Path(path)
-    text = WRITERS[format].write(rig)
+    head = path.read_bytes()[:4096].decode("utf-8", errors="replace") if path.is_file() else ""
+    if path.is_file() and not head.strip():
+        raise RigFileError(path, None, "is empty")
+    for name, reader in READERS.items():
+        if reader.recognises(path, head):
+            return name
+    raise RigFileError(path, None, f"is not a rig file of a known format ({', '.join(READERS)}); or name its format")
+
+
+def convention(format: str) -> str:
+    """What a format's file means and the shift of pixels applied when reading it, in one line."""
+    return getattr(READERS[format], "CONVENTION", "stated in the file: units and first_pixel_centre")
+
+
+def _scaled(rig: Rig, scale: float) -> Rig:
+    """The rig with all lengths multiplied."""
+    cameras = {
+        name: camera.replace(cam_from_world=Pose(camera.R, camera.t * scale)) if isinstance(camera, Camera) else camera
+        for name, camera in rig.cameras.items()
+    }
+    depth = None if rig.depth is None else tuple(bound * scale for bound in rig.depth)
+    return dataclasses.replace(rig, cameras=cameras, depth=depth)
+
+
+def _write_whole(path: Path, text: str) -> None:
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
     try:
         with os.fdopen(handle, "w", encoding="utf-8") as file:
@@ -37,15 +145,3 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
-
-
-def _reader(path: Path, format: str | None) -> ModuleType:
-    if format is not None:
-        if format not in READERS:
-            raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")
-        return READERS[format]
-    head = path.read_bytes()[:4096].decode("utf-8", errors="replace") if path.is_file() else ""
-    for module in READERS.values():
-        if module.recognises(path, head):
-            return module
-    raise RigFileError(path, None, f"not a rig file of a known format ({', '.join(READERS)})")

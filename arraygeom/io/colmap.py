@@ -1,0 +1,370 @@
+"""COLMAP models, text and binary, with rigs (COLMAP 3.12 and later) or without.
+
+Source convention: pixels with the first centre at 0.5 (shift -0.5); OpenCV axes; world->camera, quaternions
+scalar first. The scale of a COLMAP model is arbitrary unless it was set; it is taken as metres.
+
+Without rigs every *image* becomes a camera, named as the image is. Where the model has a rig of several cameras,
+those become the cameras, named "camera1" after their ids (or the folder of their images), and the world is the rig's
+frame.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
+from ..pixels import HW
+from ..pose import Pose
+from ..rig import Rig
+from .export import brown_conrady, calibrated, focal_and_centre
+from .source import Source
+
+CONVENTION = "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
+
+
+class _Model(NamedTuple):
+    """How a camera model's parameters are laid out: how many focal lengths, then cx cy, then the lens."""
+
+    id: int
+    focals: int
+    lens: str | None
+    coefficients: int
+
+
+MODELS = {
+    "SIMPLE_PINHOLE": _Model(0, 1, None, 0),
+    "PINHOLE": _Model(1, 2, None, 0),
+    "SIMPLE_RADIAL": _Model(2, 1, BROWN_CONRADY, 1),
+    "RADIAL": _Model(3, 1, BROWN_CONRADY, 2),
+    "OPENCV": _Model(4, 2, BROWN_CONRADY, 4),
+    "OPENCV_FISHEYE": _Model(5, 2, KANNALA_BRANDT, 4),
+    "FULL_OPENCV": _Model(6, 2, BROWN_CONRADY, 8),
+    "SIMPLE_RADIAL_FISHEYE": _Model(8, 1, KANNALA_BRANDT, 1),
+    "RADIAL_FISHEYE": _Model(9, 1, KANNALA_BRANDT, 2),
+}
+
+
+class _Intrinsics(NamedTuple):
+    K: Tensor
+    hw: HW
+    lens: Distortion | None
+
+
+class _Image(NamedTuple):
+    name: str
+    camera: int
+    pose: Pose
+
+
+class _Sensor(NamedTuple):
+    camera: int
+    pose: Pose
+
+
+def recognises(path: Path, head: str) -> bool:
+    """Whether a file or folder looks like this format, from its name."""
+    return _folder(path) is not None
+
+
+def read(source: Source) -> Rig:
+    """The cameras of a model's rig, or one for each image. Name the folder or any file in it."""
+    folder = _folder(source.path)
+    if folder is None:
+        raise source.fail(None, "is no COLMAP model: wanted a folder with cameras.txt and images.txt, or .bin")
+    reader = _Binary if (folder / "cameras.bin").exists() else _Text
+    cameras = reader.cameras(_file(folder, "cameras", reader.suffix))
+    images = reader.images(_file(folder, "images", reader.suffix))
+    rigs = folder / f"rigs{reader.suffix}"
+    sensors = [s for s in (reader.rigs(Source(rigs)) if rigs.exists() else []) if len(s) > 1]
+    if len(sensors) > 1:
+        raise Source(rigs).fail(None, f"has {len(sensors)} rigs of several cameras; keep one")
+    if sensors:
+        named = ((_sensor_name(s.camera, images), s.camera, s.pose) for s in sensors[0])
+    else:
+        named = ((image.name, image.camera, image.pose) for image in images)
+    return source.rig((name, _camera(source, cameras, i, pose)) for name, i, pose in named)
+
+
+def write(rig: Rig) -> dict[str, str]:
+    """A text model: every camera of the rig as one camera and one image, no points.
+
+    Raises ValueError for what the format cannot hold.
+    """
+    cameras, images = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"], ["# IMAGE_ID, QW..QZ, TX..TZ, CAMERA_ID, NAME"]
+    for i, (name, camera) in enumerate(calibrated(rig, "COLMAP"), 1):
+        h, w = camera.hw
+        model, parameters = _parameters(name, camera)
+        cameras.append(f"{i} {model} {w} {h} {_joined(parameters)}")
+        images += [f"{i} {_joined(_wxyz(camera.R))} {_joined(camera.t.tolist())} {i} {name}", ""]
+    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR"]}
+    return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
+
+
+def _folder(path: Path) -> Path | None:
+    """The folder with the model, from itself, one of its files, or the project folder."""
+    files = {f"{stem}{suffix}" for stem in ("cameras", "images", "rigs", "frames") for suffix in (".txt", ".bin")}
+    if path.is_file():
+        return path.parent if path.name in files else None
+    for folder in (path, path / "sparse" / "0", path / "sparse"):
+        if any((folder / f"cameras{suffix}").exists() for suffix in (".txt", ".bin")):
+            return folder
+    return None
+
+
+def _file(folder: Path, stem: str, suffix: str) -> Source:
+    source = Source(folder / f"{stem}{suffix}")
+    if not source.path.exists():
+        raise source.fail(None, "is missing; a COLMAP model has cameras and images, both .txt or both .bin")
+    return source
+
+
+def _camera(source: Source, cameras: dict[int, _Intrinsics], i: int, pose: Pose) -> Camera:
+    if i not in cameras:
+        raise source.fail(f"camera {i}", "is used by an image or a rig and not defined; do the files belong together?")
+    K, hw, lens = cameras[i]
+    return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens)
+
+
+def _sensor_name(camera: int, images: list[_Image]) -> str:
+    """The folder that all images of the camera are in, if they are in one; else after its id."""
+    folders = {str(Path(image.name).parent) for image in images if image.camera == camera}
+    return folders.pop() if len(folders) == 1 and "." not in folders else f"camera{camera}"
+
+
+def _intrinsics(source: Source, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> _Intrinsics:
+    if model not in MODELS:
+        raise source.fail(entry, f"has model {model}, which is not supported (known: {', '.join(MODELS)})")
+    kind = MODELS[model]
+    p = source.numbers(parameters, (kind.focals + 2 + kind.coefficients,), f"{entry} ({model})").tolist()
+    K = source.focal_and_centre([p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5)
+    hw, c = source.size(*wh, entry), p[kind.focals + 2 :]
+    if kind.lens is None:
+        return _Intrinsics(K, hw, None)
+    lens = source.brown_conrady(c, entry) if kind.lens == BROWN_CONRADY else source.kannala_brandt(c, entry)
+    return _Intrinsics(K, hw, lens)
+
+
+def _pose(source: Source, entry: str, numbers: list[Any]) -> Pose:
+    return source.pose(source.quaternion(numbers[:4], f"{entry} QW QX QY QZ"), numbers[4:7], entry)
+
+
+class _Text:
+    """The text files."""
+
+    suffix = ".txt"
+
+    @staticmethod
+    def cameras(source: Source) -> dict[int, _Intrinsics]:
+        found: dict[int, _Intrinsics] = {}
+        for number, line in _lines(source):
+            fields, entry = line.split(), f"line {number}"
+            if len(fields) < 5:
+                raise source.fail(entry, "wanted CAMERA_ID MODEL WIDTH HEIGHT PARAMS; is the file whole?")
+            i = _id(source, fields[0], entry)
+            if i in found:
+                raise source.fail(entry, f"camera {i} occurs twice; keep one")
+            found[i] = _intrinsics(
+                source, entry, fields[1], (_float(fields[2]), _float(fields[3])), _floats(fields[4:])
+            )
+        _check_count(source, "cameras", len(found))
+        return found
+
+    @staticmethod
+    def images(source: Source) -> list[_Image]:
+        """Every other line; those between hold the points, and may be blank."""
+        lines = [(n, line) for n, line in enumerate(source.text().split("\n"), 1) if not line.startswith("#")]
+        while lines and not lines[0][1].strip():
+            lines.pop(0)
+        found = [_Text._image(source, n, line) for n, line in lines[::2] if line.strip()]
+        _check_count(source, "images", len(found))
+        return found
+
+    @staticmethod
+    def _image(source: Source, number: int, line: str) -> _Image:
+        fields, entry = line.split(maxsplit=9), f"line {number}"
+        if len(fields) != 10:
+            raise source.fail(entry, "wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
+        pose = _pose(source, entry, _floats(fields[1:8]))
+        return _Image(fields[9].strip(), _id(source, fields[8], entry), pose)
+
+    @staticmethod
+    def rigs(source: Source) -> list[list[_Sensor]]:
+        return [list(_Text._sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
+
+    @staticmethod
+    def _sensors(source: Source, entry: str, fields: list[str]) -> Iterator[_Sensor]:
+        """RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for the others."""
+        tokens = iter(fields[1:])
+        try:
+            count = int(next(tokens))
+            for k in range(count):
+                kind, i = next(tokens), _id(source, next(tokens), entry)
+                posed = k == 0 or next(tokens) == "1"
+                numbers = _floats([next(tokens) for _ in range(7)]) if k and posed else [1.0] + 6 * [0.0]
+                if kind == "CAMERA":
+                    yield _sensor(source, entry, i, numbers if posed else None)
+        except (StopIteration, ValueError, RuntimeError) as error:
+            if isinstance(error, RuntimeError | StopIteration) or not hasattr(error, "entry"):
+                raise source.fail(entry, "is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
+            raise
+
+
+class _Binary:
+    """The binary files, little-endian."""
+
+    suffix = ".bin"
+
+    @staticmethod
+    def cameras(source: Source) -> dict[int, _Intrinsics]:
+        names = {model.id: name for name, model in MODELS.items()}
+        data, found = _Bytes(source), dict[int, _Intrinsics]()
+        for _ in range(data.count()):
+            i, model, w, h = data.take("<IiQQ")
+            entry = f"camera {i}"
+            if i in found:
+                raise source.fail(entry, "occurs twice; keep one")
+            if model not in names:
+                raise source.fail(entry, f"has model number {model}, which is not supported")
+            kind = MODELS[names[model]]
+            parameters = list(data.take(f"<{kind.focals + 2 + kind.coefficients}d"))
+            found[i] = _intrinsics(source, entry, names[model], (w, h), parameters)
+        return found
+
+    @staticmethod
+    def images(source: Source) -> list[_Image]:
+        data, found = _Bytes(source), []
+        for _ in range(data.count()):
+            i, *numbers, camera = data.take("<I7dI")
+            name = data.string()
+            data.skip(24 * data.count())
+            found.append(_Image(name, camera, _pose(source, f"image {i}", numbers)))
+        return found
+
+    @staticmethod
+    def rigs(source: Source) -> list[list[_Sensor]]:
+        data, rigs = _Bytes(source), []
+        for _ in range(data.count()):
+            rig, count = data.take("<II")
+            sensors = []
+            for k in range(count):
+                kind, i = data.take("<iI")
+                posed = k == 0 or bool(data.take("<B")[0])
+                numbers = list(data.take("<7d")) if k and posed else [1.0] + 6 * [0.0]
+                if kind == 0:
+                    sensors.append(_sensor(source, f"rig {rig}", i, numbers if posed else None))
+            rigs.append(sensors)
+        return rigs
+
+
+class _Bytes:
+    """A binary file read from front to back."""
+
+    def __init__(self, source: Source) -> None:
+        self.source, self.data, self.at = source, source.path.read_bytes(), 0
+
+    def take(self, layout: str) -> tuple[Any, ...]:
+        """The next values."""
+        try:
+            values = struct.unpack_from(layout, self.data, self.at)
+        except struct.error:
+            raise self.source.fail(f"byte {self.at}", "the file ends too early; was it cut off?") from None
+        self.at += struct.calcsize(layout)
+        return values
+
+    def count(self) -> int:
+        """The next count of entries."""
+        (n,) = self.take("<Q")
+        if n > len(self.data):
+            raise self.source.fail(f"byte {self.at}", f"counts {n} entries, more than fit; is this a COLMAP file?")
+        return int(n)
+
+    def string(self) -> str:
+        """The next zero-terminated text."""
+        end = self.data.find(b"\0", self.at)
+        if end < 0:
+            raise self.source.fail(f"byte {self.at}", "the file ends within a name; was it cut off?")
+        text, self.at = self.data[self.at : end].decode("utf-8", errors="replace"), end + 1
+        return text
+
+    def skip(self, n: int) -> None:
+        """Pass over bytes."""
+        if self.at + n > len(self.data):
+            raise self.source.fail(f"byte {self.at}", "the file ends too early; was it cut off?")
+        self.at += n
+
+
+def _sensor(source: Source, entry: str, camera: int, numbers: list[Any] | None) -> _Sensor:
+    if numbers is None:
+        raise source.fail(entry, f"camera {camera} has no pose in its rig; calibrate the rig first")
+    return _Sensor(camera, _pose(source, entry, numbers))
+
+
+def _lines(source: Source) -> Iterator[tuple[int, str]]:
+    """The numbered lines that are neither blank nor comments."""
+    for number, line in enumerate(source.text().splitlines(), 1):
+        if line.strip() and not line.startswith("#"):
+            yield number, line
+
+
+def _check_count(source: Source, what: str, found: int) -> None:
+    """COLMAP's comment says how many entries follow."""
+    for line in source.text().splitlines()[:8]:
+        head, _, rest = line.partition(f"Number of {what}:")
+        stated = rest.split(",")[0].strip()
+        if head.startswith("#") and stated.isdigit() and int(stated) != found:
+            raise source.fail(None, f"announces {stated} {what} and holds {found}; was it cut off?")
+
+
+def _id(source: Source, text: str, entry: str) -> int:
+    if not text.isdigit():
+        raise source.fail(entry, f"wanted a number as id, got '{text[:40]}'")
+    return int(text)
+
+
+def _float(text: str) -> float | str:
+    try:
+        return float(text)
+    except ValueError:
+        return text
+
+
+def _floats(texts: list[str]) -> list[Any]:
+    return [_float(text) for text in texts]
+
+
+def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:
+    lens, pinhole = camera.distortion, list(focal_and_centre(name, camera, first_pixel=0.5))
+    if lens is None:
+        return "PINHOLE", pinhole
+    if lens.model == KANNALA_BRANDT:
+        return "OPENCV_FISHEYE", pinhole + lens.coefficients.tolist()
+    c = brown_conrady(name, lens, at_most=8)
+    return ("OPENCV", pinhole + c) if len(c) == 4 else ("FULL_OPENCV", pinhole + c + [0.0] * (8 - len(c)))
+
+
+def _wxyz(R: Tensor) -> list[float]:
+    """The quaternion of a rotation, scalar first and not negative: from the largest of its entries (Shepperd)."""
+    d = R.diagonal()
+    squares = torch.stack([1 + d.sum(), *(1 + 2 * d - d.sum())])
+    i = int(squares.argmax())
+    (a, b, c), (e, f, g), (h, k, m) = R.tolist()
+    rows = [
+        [1 + a + f + m, k - g, c - h, e - b],
+        [k - g, 1 + a - f - m, e + b, c + h],
+        [c - h, e + b, 1 - a + f - m, g + k],
+        [e - b, c + h, g + k, 1 - a - f + m],
+    ]
+    q = R.new_tensor(rows[i])
+    q = q / q.norm()
+    return (q if q[0] >= 0 else -q).tolist()
+
+
+def _joined(numbers: list[float]) -> str:
+    return " ".join(map(repr, numbers))

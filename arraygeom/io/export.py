@@ -1,0 +1,51 @@
+"""What every writer shares: the numbers of a camera, or an error that says what the format cannot hold."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import BROWN_CONRADY, Distortion
+from ..rig import Rig
+
+
+def calibrated(rig: Rig, format: str) -> list[tuple[str, Camera]]:
+    """The rig's cameras. Raises ValueError if there are none, or one is uncalibrated or a batch."""
+    cameras = []
+    for name, camera in rig.cameras.items():
+        if not isinstance(camera, Camera):
+            raise ValueError(f"{format} files hold calibrated cameras and '{name}' is not one: use the native format")
+        if camera.K.ndim != 2:
+            raise ValueError(f"camera '{name}' is a batch of cameras; rig files hold one of each: write one rig each")
+        cameras.append((name, camera))
+    if not cameras:
+        raise ValueError("the rig has no cameras to write")
+    return cameras
+
+
+def focal_and_centre(name: str, camera: Camera, *, first_pixel: float = 0.0) -> tuple[float, float, float, float]:
+    """fx, fy, cx, cy with the first pixel's centre at `first_pixel`. Raises ValueError if K has other entries."""
+    (fx, skew, cx), (other, fy, cy) = camera.K[:2].tolist()
+    if skew != 0 or other != 0:
+        raise ValueError(
+            f"camera '{name}' has a skewed or turned K, which this format cannot hold: use the native format"
+        )
+    return fx, fy, cx + first_pixel, cy + first_pixel
+
+
+def brown_conrady(name: str, lens: Distortion | None, *, at_most: int) -> list[float]:
+    """Brown-Conrady coefficients, four or more and no more than `at_most`; zeros for no lens."""
+    if lens is None:
+        return [0.0] * 4
+    c = lens.coefficients.tolist()
+    if lens.model != BROWN_CONRADY or any(c[at_most:]):
+        raise ValueError(
+            f"camera '{name}' has a {lens.model} lens of {len(c)} coefficients, which this format cannot hold "
+            f"(brown-conrady with {at_most}): use the native format"
+        )
+    return c[:at_most]
+
+
+def pose_rows(R: Tensor, t: Tensor) -> list[list[float]]:
+    """The 4 x 4 matrix of a pose."""
+    return [[*row, x] for row, x in zip(R.tolist(), t.tolist())] + [[0.0, 0.0, 0.0, 1.0]]

@@ -1,0 +1,118 @@
+"""Kalibr camchain files.
+
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `T_cn_cnm1` takes points of camera n-1
+into camera n, so poses are chained products; metres. The world is camera 0, or the IMU where every camera states
+`T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time offset.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+
+from ..camera import Camera
+from ..distortion import KANNALA_BRANDT, Distortion
+from ..pose import Pose
+from ..rig import Rig
+from ..sensor import Sensor
+from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
+from .source import Source
+
+CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
+
+
+def recognises(path: Path, head: str) -> bool:
+    """Whether a file looks like this format, from its first kilobytes."""
+    return "cam0:" in head and "camera_model" in head
+
+
+def read(source: Source) -> Rig:
+    """Cameras cam0, cam1, ..."""
+    chain = {name: fields for name, fields in source.yaml().items() if re.fullmatch(r"cam\d+", str(name))}
+    if not chain:
+        raise source.fail("cam0", "is missing; is this a Kalibr camchain?")
+    names = sorted(chain, key=lambda name: int(name[3:]))
+    if names != [f"cam{i}" for i in range(len(names))]:
+        raise source.fail(names[-1], f"the chain has a gap: it holds {', '.join(names)}")
+    poses = _poses(source, {name: source.mapping(chain[name], name) for name in names})
+    return source.rig((name, _camera(source, name, chain[name], poses[name])) for name in names)
+
+
+def write(rig: Rig) -> str:
+    """Cameras cam0, cam1, ... in the rig's order, the names kept in `rostopic`.
+
+    Kalibr's chain has no world: if cam0 is not at the origin, the world is written as the IMU.
+    Raises ValueError for what the format cannot hold.
+    """
+    cameras = calibrated(rig, "Kalibr")
+    first = cameras[0][1].cam_from_world
+    at_origin = pose_rows(first.R, first.t) == torch.eye(4).tolist()
+    document, before = {}, None
+    for i, (name, camera) in enumerate(cameras):
+        entry = _entry(name, camera)
+        pose = camera.cam_from_world
+        if before is not None:
+            relative = pose @ before.inverse()
+            entry["T_cn_cnm1"] = pose_rows(relative.R, relative.t)
+        if not at_origin:
+            entry["T_cam_imu"] = pose_rows(pose.R, pose.t)
+        if camera.sensor.time_offset:
+            entry["timeshift_cam_imu"] = camera.sensor.time_offset
+        document[f"cam{i}"], before = entry, pose
+    return yaml.safe_dump(document, default_flow_style=None, sort_keys=False)
+
+
+def _poses(source: Source, chain: dict[str, dict[str, Any]]) -> dict[str, Pose]:
+    if all("T_cam_imu" in fields for fields in chain.values()):
+        return {n: source.pose_matrix(fields["T_cam_imu"], f"{n}.T_cam_imu") for n, fields in chain.items()}
+    poses, pose = {}, Pose.identity()
+    for i, (name, fields) in enumerate(chain.items()):
+        if i > 0:
+            pose = source.pose_matrix(source.get(fields, "T_cn_cnm1", name), f"{name}.T_cn_cnm1") @ pose
+        poses[name] = pose
+    return poses
+
+
+def _camera(source: Source, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
+    model = source.get(fields, "camera_model", name)
+    if model != "pinhole":
+        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: pinhole")
+    width, height = source.numbers(source.get(fields, "resolution", name), (2,), f"{name}.resolution").tolist()
+    K = source.focal_and_centre(source.get(fields, "intrinsics", name), f"{name}.intrinsics")
+    offset = source.number(fields.get("timeshift_cam_imu", 0.0), f"{name}.timeshift_cam_imu")
+    return Camera(
+        K=K,
+        cam_from_world=pose,
+        hw=source.size(width, height, f"{name}.resolution"),
+        distortion=_lens(source, name, fields),
+        sensor=Sensor(time_offset=offset),
+    )
+
+
+def _lens(source: Source, name: str, fields: dict[str, Any]) -> Distortion | None:
+    model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
+    if model == "none":
+        return None
+    coefficients = source.get(fields, "distortion_coeffs", name)
+    if model == "radtan":
+        return source.brown_conrady(source.numbers(coefficients, (4,), entry), entry)
+    if model == "equidistant":
+        return source.kannala_brandt(source.numbers(coefficients, (4,), entry), entry)
+    raise source.fail(f"{name}.distortion_model", f"is '{model}'; supported: radtan, equidistant, none")
+
+
+def _entry(name: str, camera: Camera) -> dict[str, Any]:
+    h, w = camera.hw
+    entry: dict[str, Any] = {"camera_model": "pinhole", "intrinsics": list(focal_and_centre(name, camera))}
+    lens = camera.distortion
+    if lens is None:
+        entry |= {"distortion_model": "none", "distortion_coeffs": []}
+    elif lens.model == KANNALA_BRANDT:
+        entry |= {"distortion_model": "equidistant", "distortion_coeffs": lens.coefficients.tolist()}
+    else:
+        entry |= {"distortion_model": "radtan", "distortion_coeffs": brown_conrady(name, lens, at_most=4)}
+    return entry | {"resolution": [w, h], "rostopic": f"/{name}/image_raw"}

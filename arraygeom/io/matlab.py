@@ -1,0 +1,139 @@
+"""MATLAB's stereoParameters and cameraParameters: the struct (`toStruct`) saved to .mat, or as JSON (`jsonencode`).
+
+Source convention: pixels with the first centre at 1 (shift -1); OpenCV-like axes; lengths in `WorldUnits`, by
+default millimetres. The old names are of row vectors (x2 = x1 R + t, [x y 1] ~ X K): `IntrinsicMatrix` and
+`RotationOfCamera2` are transposed. The new ones (`K`, `PoseCamera2`, since R2022b) are of columns and are not. The
+world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose: that catches a transposed one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import Distortion
+from ..epipolar import fundamental_matrix, shift_origin
+from ..pose import Pose
+from ..rig import Rig
+from .source import Source
+
+CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
+UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254}
+UNITS |= {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0, "inches": 0.0254}
+
+
+def recognises(path: Path, head: str) -> bool:
+    """Whether a file looks like this format, from its name and its first kilobytes."""
+    names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion")
+    return path.suffix == ".mat" or head.startswith("MATLAB ") or any(f'"{name}"' in head for name in names)
+
+
+def read(source: Source) -> Rig:
+    """The pair, named "camera1" and "camera2", or a single camera "camera1"."""
+    fields = _outermost(source, _document(source))
+    if "CameraParameters1" not in fields:
+        return source.rig([("camera1", _camera(source, fields, "", Pose.identity()))])
+    poses = Pose.identity(), _pose(source, fields)
+    cameras = [
+        _camera(source, source.mapping(source.get(fields, name, ""), name), name, pose)
+        for name, pose in zip(("CameraParameters1", "CameraParameters2"), poses)
+    ]
+    if fields.get("FundamentalMatrix") is not None:
+        _check_fundamental(source, source.numbers(fields["FundamentalMatrix"], (3, 3), "FundamentalMatrix"), *cameras)
+    return source.rig(zip(("camera1", "camera2"), cameras))
+
+
+def _document(source: Source) -> dict[str, Any]:
+    try:
+        data = source.path.read_bytes()
+    except OSError as error:
+        raise source.fail(None, f"cannot be read: {error.strerror}") from None
+    if not data.startswith(b"MATLAB ") and source.path.suffix != ".mat":
+        return source.json()
+    if not data:
+        raise source.fail(None, "is empty")
+    if data.startswith(b"MATLAB 7.3"):
+        raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
+    try:
+        loaded = scipy.io.loadmat(source.path, simplify_cells=True)
+    except Exception:
+        # Whatever the parser trips over in a damaged file, the cause is the file.
+        raise source.fail(None, "is not a .mat file that can be read; was it cut off?") from None
+    return {name: value for name, value in loaded.items() if not name.startswith("__")}
+
+
+def _outermost(source: Source, fields: dict[str, Any]) -> dict[str, Any]:
+    """The struct itself, or the first variable of the file that holds one."""
+    if "CameraParameters1" in fields or _is_camera(fields):
+        return fields
+    for value in fields.values():
+        if isinstance(value, dict) and ("CameraParameters1" in value or _is_camera(value)):
+            return value
+    raise source.fail(
+        "CameraParameters1",
+        "is missing: MATLAB objects cannot be read, save the struct, s = toStruct(stereoParams); save(f, 's', '-v7')",
+    )
+
+
+def _is_camera(fields: dict[str, Any]) -> bool:
+    return "IntrinsicMatrix" in fields or "K" in fields
+
+
+def _camera(source: Source, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+    if "K" in fields:
+        K = source.intrinsics(fields["K"], f"{entry}.K", first_pixel=1.0)
+    else:
+        rows = source.numbers(source.get(fields, ("IntrinsicMatrix", "K"), entry), (3, 3), f"{entry}.IntrinsicMatrix")
+        K = source.intrinsics(rows.T, f"{entry}.IntrinsicMatrix", first_pixel=1.0)
+    lens = _lens(source, fields, entry)
+    size = fields.get("ImageSize")
+    if size is None or np.size(size) == 0:
+        hw = source.size_unstated(K)
+    else:
+        height, width = source.numbers(size, (2,), f"{entry}.ImageSize").tolist()
+        hw = source.size(width, height, f"{entry}.ImageSize")
+    return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens)
+
+
+def _lens(source: Source, fields: dict[str, Any], entry: str) -> Distortion | None:
+    radial = source.numbers(fields.get("RadialDistortion", []), None, f"{entry}.RadialDistortion").tolist()
+    tangential = source.numbers(fields.get("TangentialDistortion", []), None, f"{entry}.TangentialDistortion").tolist()
+    if not radial and not tangential:
+        return None
+    if len(radial) not in (2, 3) or len(tangential) not in (0, 2):
+        raise source.fail(f"{entry}.RadialDistortion", "wanted 2 or 3 radial and 2 tangential coefficients")
+    return source.brown_conrady([*radial[:2], *(tangential or [0.0, 0.0]), *radial[2:]], entry)
+
+
+def _pose(source: Source, fields: dict[str, Any]) -> Pose:
+    """X_2 = R X_1 + t, in metres."""
+    unit = str(fields.get("WorldUnits") or "mm").strip().lower()
+    if unit not in UNITS:
+        raise source.fail("WorldUnits", f"is '{unit}'; known: {', '.join(UNITS)}")
+    if "PoseCamera2" not in fields:
+        R = source.numbers(source.get(fields, "RotationOfCamera2", ""), (3, 3), "RotationOfCamera2")
+        return source.pose(R.T, source.get(fields, "TranslationOfCamera2", ""), "camera 2", metres=UNITS[unit])
+    pose = source.mapping(fields["PoseCamera2"], "PoseCamera2")
+    if "A" in pose:
+        return source.pose_matrix(pose["A"], "PoseCamera2.A", metres=UNITS[unit])
+    R, t = source.get(pose, ("R", "Rotation"), "PoseCamera2"), source.get(pose, "Translation", "PoseCamera2")
+    return source.pose(R, t, "PoseCamera2", metres=UNITS[unit])
+
+
+def _check_fundamental(source: Source, F: Tensor, one: Camera, two: Camera) -> None:
+    """F as stated, of pixels counted from 1, has to be that of the cameras, up to its scale."""
+    relative = two.cam_from_world @ one.cam_from_world.inverse()
+    ours, stated = fundamental_matrix(one.K, two.K, relative), shift_origin(F, 1.0)
+    with contextlib.suppress(ZeroDivisionError):
+        ours, stated = ours / ours.norm(), stated / stated.norm()
+    if min((ours - stated).norm(), (ours + stated).norm()) > 1e-2:
+        raise source.fail(
+            "FundamentalMatrix",
+            "contradicts the rotation and translation of camera 2; is the rotation transposed, or the pose inverted?",
+        )

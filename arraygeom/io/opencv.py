@@ -1,0 +1,155 @@
+"""OpenCV FileStorage (YAML, XML or JSON): one camera, or a stereo pair in one file or two.
+
+Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; X_2 = R X_1 + T, so the world is
+camera 1; lengths in the unit of the calibration board, taken as metres. OpenCV's stereo sample writes
+`intrinsics.yml` (M1 D1 M2 D2) and `extrinsics.yml` (R T ...): name either, or their folder. It states no picture
+size.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import cv2
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import KANNALA_BRANDT
+from ..pixels import HW
+from ..pose import Pose
+from ..rig import Rig
+from .export import brown_conrady, calibrated, focal_and_centre
+from .source import Source
+
+CONVENTION = "first pixel's centre at 0 (shift 0); X_2 = R X_1 + T, world = camera 1; metres"
+K_NAMES = ("M{}", "cameraMatrix{}", "camera_matrix{}", "Camera_Matrix{}", "K{}", "CM{}", "intrinsicMatrix{}")
+D_NAMES = (
+    *("D{}", "distCoeffs{}", "distortion_coefficients{}", "Distortion_Coefficients{}"),
+    *("dist_coeffs{}", "distortionCoefficients{}"),
+)
+PARTS = ("intrinsic", "extrinsic")
+
+
+def recognises(path: Path, head: str) -> bool:
+    """Whether a file looks like this format, from its name and its first kilobytes."""
+    if path.is_dir():
+        return any(_named(path, part) for part in PARTS)
+    return "opencv-matrix" in head or "<opencv_storage>" in head
+
+
+def read(source: Source) -> Rig:
+    """One camera at the origin, named "camera"; or a pair, named "left" and "right" unless the file says."""
+    nodes: dict[str, Any] = {}
+    for path in _files(source.path):
+        nodes |= _nodes(Source(path))
+    if not any(name.format(1) in nodes for name in K_NAMES):
+        if "R" in nodes and "T" in nodes:
+            raise source.fail("M1", "is missing: a pair's R and T are here without its intrinsics.yml beside them")
+        return source.rig([(str(nodes.get("camera_name", "camera")), _camera(source, nodes, "", Pose.identity()))])
+    if "R" not in nodes or "T" not in nodes:
+        raise source.fail("R, T", "are missing: put the pair's extrinsics.yml beside its intrinsics.yml")
+    poses = Pose.identity(), source.pose(nodes["R"], nodes["T"], "R, T:")
+    names = [str(nodes.get(f"name{i}", default)) for i, default in ((1, "left"), (2, "right"))]
+    return source.rig((name, _camera(source, nodes, i, pose)) for i, name, pose in zip("12", names, poses))
+
+
+def write(rig: Rig) -> str | dict[str, str]:
+    """One camera as a file; two as `intrinsics.yml` and `extrinsics.yml` of a folder, the world becoming camera 1.
+
+    Raises ValueError for more cameras, and for what the format cannot hold.
+    """
+    cameras = calibrated(rig, "OpenCV")
+    if len(cameras) == 1:
+        return _HEADER + f'camera_name: "{cameras[0][0]}"\n' + _camera_text(*cameras[0], "")
+    if len(cameras) != 2:
+        raise ValueError(f"OpenCV files hold one camera or two and the rig has {len(cameras)}: use the native format")
+    (_, one), (_, two) = cameras
+    relative = two.cam_from_world @ one.cam_from_world.inverse()
+    names = "".join(f'name{i}: "{name}"\n' for i, (name, _) in enumerate(cameras, 1))
+    return {
+        "intrinsics.yml": _HEADER
+        + names
+        + "".join(_camera_text(name, camera, str(i)) for i, (name, camera) in enumerate(cameras, 1)),
+        "extrinsics.yml": _HEADER + _matrix_text("R", relative.R) + _matrix_text("T", relative.t[:, None]),
+    }
+
+
+_HEADER = "%YAML:1.0\n---\n"
+
+
+def _camera(source: Source, nodes: dict[str, Any], i: str, pose: Pose) -> Camera:
+    K = source.intrinsics(source.get(nodes, [n.format(i) for n in K_NAMES], ""), f"camera matrix {i}".strip())
+    c = next((nodes[n.format(i)] for n in D_NAMES if n.format(i) in nodes), None)
+    entry = f"distortion coefficients {i}".strip()
+    fisheye = bool(nodes.get(f"fisheye_model{i}", nodes.get("fisheye_model", 0)))
+    lens = source.kannala_brandt(c, entry) if fisheye else source.brown_conrady(c, entry)
+    return Camera(K=K, cam_from_world=pose, hw=_size(source, nodes, i, K), distortion=lens)
+
+
+def _size(source: Source, nodes: dict[str, Any], i: str, K: Tensor) -> HW:
+    for suffix in (i, ""):
+        if f"image_width{suffix}" in nodes and f"image_height{suffix}" in nodes:
+            return source.size(nodes[f"image_width{suffix}"], nodes[f"image_height{suffix}"], "image_width")
+        for name in ("image_size", "imageSize", "size"):
+            if f"{name}{suffix}" in nodes:
+                width, height = source.numbers(nodes[f"{name}{suffix}"], (2,), name).tolist()
+                return source.size(width, height, name)
+    return source.size_unstated(K)
+
+
+def _files(path: Path) -> list[Path]:
+    """The file, or the two files of a pair."""
+    if path.is_dir():
+        return [file for part in PARTS if (file := _named(path, part))]
+    for part, other in (PARTS, PARTS[::-1]):
+        if part in path.stem and (beside := path.with_name(path.name.replace(part, other))).exists():
+            return [path, beside]
+    return [path]
+
+
+def _named(folder: Path, part: str) -> Path | None:
+    found = [folder / f"{part}s{suffix}" for suffix in (".yml", ".yaml", ".xml", ".json")]
+    return next((path for path in found if path.exists()), None)
+
+
+def _nodes(source: Source) -> dict[str, Any]:
+    text = source.text()
+    try:
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        root = storage.root()
+        return {name: _value(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
+    except (cv2.error, SystemError):
+        raise source.fail(None, "is not an OpenCV FileStorage (YAML, XML or JSON); is the file whole?") from None
+
+
+def _value(node: cv2.FileNode) -> Any:
+    if node.isString():
+        return node.string()
+    if node.isInt() or node.isReal():
+        return node.real()
+    if node.isSeq():
+        return [_value(node.at(i)) for i in range(node.size())]
+    if node.isMap() and not node.getNode("data").empty():
+        return node.mat()
+    return None
+
+
+def _camera_text(name: str, camera: Camera, i: str) -> str:
+    fx, fy, cx, cy = focal_and_centre(name, camera)
+    lens, (h, w) = camera.distortion, camera.hw
+    fisheye = lens is not None and lens.model == KANNALA_BRANDT
+    text = f"image_width{i}: {w}\nimage_height{i}: {h}\n" + (f"fisheye_model{i}: 1\n" if fisheye else "")
+    text += _matrix_text(f"M{i}" if i else "camera_matrix", camera.K.new_tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]]))
+    if lens is None:
+        return text
+    c = lens.coefficients if fisheye else camera.K.new_tensor(brown_conrady(name, lens, at_most=14))
+    return text + _matrix_text(f"D{i}" if i else "distortion_coefficients", c[None])
+
+
+def _matrix_text(name: str, M: Tensor) -> str:
+    numbers = [repr(x) for x in M.double().flatten().tolist()]
+    lines = [", ".join(numbers[i : i + 3]) for i in range(0, len(numbers), 3)]
+    rows, columns = M.shape
+    data = ",\n       ".join(lines)
+    return f"{name}: !!opencv-matrix\n   rows: {rows}\n   cols: {columns}\n   dt: d\n   data: [ {data} ]\n"

@@ -1,0 +1,257 @@
+"""What every reader shares: a file's text, its numbers, and checks that name the entry they fail on."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+import yaml
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import Distortion
+from ..pixels import HW, shift_matrix
+from ..pose import Pose, rotation_error, rotation_from_vector
+from ..rig import Rig
+from .errors import RigFileError
+
+# A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array.
+SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
+# Rotations in text files are rounded: this much of a deviation is put right, more is refused.
+ROUNDED = 1e-3
+
+
+class RigFileWarning(UserWarning):
+    """A rig file that was read, but holds something its user should look at."""
+
+
+class Source:
+    """One rig file being read. Every method that looks at it raises RigFileError with the entry's name.
+
+    `hw` is the pictures' size for files that do not state it.
+    """
+
+    def __init__(self, path: Path, *, hw: HW | None = None) -> None:
+        self.path, self.hw = path, hw
+
+    def fail(self, entry: str | None, message: str) -> RigFileError:
+        """The error to raise about an entry."""
+        return RigFileError(self.path, entry, message)
+
+    def warn(self, message: str) -> None:
+        """Warn about the file as a whole."""
+        warnings.warn(f"{self.path}: {message}", RigFileWarning, stacklevel=2)
+
+    def text(self) -> str:
+        """The file's text."""
+        try:
+            text = self.path.read_bytes().decode("utf-8-sig")
+        except UnicodeDecodeError:
+            raise self.fail(None, "is not a text file") from None
+        except OSError as error:
+            raise self.fail(None, f"cannot be read: {error.strerror}") from None
+        if not text.strip():
+            raise self.fail(None, "is empty")
+        return text
+
+    def json(self) -> dict[str, Any]:
+        """The file as a JSON object without repeated keys."""
+        text = self.text()
+        try:
+            return self.mapping(json.loads(text, object_pairs_hook=self._unique), None)
+        except json.JSONDecodeError as error:
+            raise self.fail(f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?") from None
+
+    def toml(self) -> dict[str, Any]:
+        """The file as TOML."""
+        text = self.text()
+        try:
+            return tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
+
+    def yaml(self) -> dict[str, Any]:
+        """The file as a YAML mapping without repeated keys."""
+        text = self.text()
+        try:
+            return self.mapping(yaml.load(text, _UniqueKeys), None)
+        except yaml.YAMLError as error:
+            mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
+            place = f"line {mark.line + 1}" if mark else None
+            raise self.fail(place, f"is not YAML ({problem or 'unreadable'}); is the file whole?") from None
+
+    def mapping(self, value: Any, entry: str | None) -> dict[str, Any]:
+        """A value that has to be a mapping with something in it."""
+        if not isinstance(value, dict) or not value:
+            raise self.fail(entry, "is not a mapping of names to values, or an empty one; is the file whole?")
+        return value
+
+    def get(self, fields: Mapping[str, Any], keys: str | Iterable[str], entry: str) -> Any:
+        """The value of the first of the keys that is there."""
+        keys = (keys,) if isinstance(keys, str) else tuple(keys)
+        for key in keys:
+            if fields.get(key) is not None:
+                return fields[key]
+        raise self.fail(entry or None, f"has no {' or '.join(keys)}")
+
+    def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str) -> Tensor:
+        """Finite numbers as a float64 tensor of a shape (any order of nesting that has as many), or a vector."""
+        try:
+            tensor = torch.as_tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError):
+            raise self.fail(entry, f"holds something other than numbers: {str(value)[:60]!r}") from None
+        if shape is not None and tensor.numel() != torch.Size(shape).numel():
+            wanted = " x ".join(map(str, shape))
+            raise self.fail(entry, f"has {tensor.numel()} numbers, wanted {wanted}; is the file whole?")
+        if not tensor.isfinite().all():
+            raise self.fail(entry, "holds NaN or infinity; did the calibration fail?")
+        return tensor.reshape(shape or (-1,))
+
+    def number(self, value: Any, entry: str) -> float:
+        """One finite number."""
+        return float(self.numbers(value, (1,), entry))
+
+    def size(self, width: Any, height: Any, entry: str) -> HW:
+        """(height, width), positive and whole."""
+        w, h = self.number(width, entry), self.number(height, entry)
+        if min(w, h) < 1 or w != int(w) or h != int(h):
+            raise self.fail(entry, f"is {w:g} x {h:g}, wanted a picture's width x height in whole pixels")
+        return int(h), int(w)
+
+    def size_unstated(self, K: Tensor) -> HW:
+        """The size for a format that states none: as given by the user, else guessed, with a warning."""
+        if self.hw is not None:
+            return self.hw
+        w, h = (max(1, round(2 * c + 1)) for c in K[:2, 2].tolist())
+        self.warn(
+            f"states no picture size: took {w} x {h}, twice the principal point; say `hw=(height, width)` when reading"
+        )
+        return h, w
+
+    def intrinsics(self, value: Any, entry: str, *, first_pixel: float = 0.0) -> Tensor:
+        """K (3, 3) with the first pixel's centre moved from `first_pixel` to 0."""
+        K = self.numbers(value, (3, 3), entry)
+        if K[2].tolist() != [0.0, 0.0, 1.0]:
+            raise self.fail(entry, f"has last row {K[2].tolist()}, wanted [0, 0, 1]; is it transposed?")
+        if not (K[0, 0] > 0 and K[1, 1] > 0):
+            raise self.fail(entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels")
+        return shift_matrix(first_pixel, first_pixel) @ K
+
+    def focal_and_centre(self, numbers: Any, entry: str, *, first_pixel: float = 0.0) -> Tensor:
+        """K from [fx, fy, cx, cy]."""
+        fx, fy, cx, cy = self.numbers(numbers, (4,), entry).tolist()
+        return self.intrinsics([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], entry, first_pixel=first_pixel)
+
+    def rotation(self, value: Any, entry: str) -> Tensor:
+        """A rotation matrix from nine numbers, or three (a rotation vector in radians).
+
+        A deviation below 1e-3, as rounding in text files makes, is removed (nearest rotation).
+        """
+        numbers = self.numbers(value, None, entry)
+        if numbers.numel() == 3:
+            return rotation_from_vector(numbers)
+        R = self.numbers(numbers, (3, 3), entry)
+        error = float(rotation_error(R))
+        if torch.linalg.det(R) < 0:
+            raise self.fail(entry, "is a reflection (determinant -1), not a rotation; was an axis flipped?")
+        if error > ROUNDED:
+            raise self.fail(entry, f"is not a rotation (R R^T is off by {error:.2g}); were all rows copied?")
+        U, _, Vh = torch.linalg.svd(R)
+        return R if error < 1e-12 else U @ Vh
+
+    def pose(self, R: Any, t: Any, entry: str, *, metres: float = 1.0) -> Pose:
+        """X_to = R X_from + t with t given in units of `metres`."""
+        return Pose(self.rotation(R, f"{entry} rotation"), self.numbers(t, (3,), f"{entry} translation") * metres)
+
+    def pose_matrix(self, T: Any, entry: str, *, metres: float = 1.0) -> Pose:
+        """A pose from a 4 x 4 or 3 x 4 matrix."""
+        numbers = self.numbers(T, None, entry)
+        M = self.numbers(numbers, (3, 4) if numbers.numel() == 12 else (4, 4), entry)
+        if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
+            raise self.fail(entry, f"has last row {M[3].tolist()}, wanted [0, 0, 0, 1]; is it transposed?")
+        return self.pose(M[:3, :3], M[:3, 3], entry, metres=metres)
+
+    def quaternion(self, wxyz: Any, entry: str) -> Tensor:
+        """A rotation from a quaternion, scalar first, of length 1 to 1e-3."""
+        q = self.numbers(wxyz, (4,), entry)
+        if not (q.norm() - 1).abs() < ROUNDED:
+            raise self.fail(entry, f"is a quaternion of length {q.norm():.4g}, not 1; is the order w x y z?")
+        w, x, y, z = (q / q.norm()).tolist()
+        return torch.tensor(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ],
+            dtype=torch.float64,
+        )
+
+    def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
+        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if empty."""
+        c = self.numbers([] if value is None else value, None, entry)
+        if c.numel() == 0:
+            return None
+        if c.numel() > 14:
+            raise self.fail(entry, f"has {c.numel()} coefficients; OpenCV's model has at most 14")
+        count = next(n for n in (4, 5, 8, 12, 14) if n >= c.numel())
+        return Distortion("brown-conrady", torch.nn.functional.pad(c, (0, count - c.numel())))
+
+    def kannala_brandt(self, value: Any, entry: str) -> Distortion:
+        """A fisheye lens from one to four coefficients."""
+        c = self.numbers(value, None, entry)
+        if not 1 <= c.numel() <= 4:
+            raise self.fail(entry, f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
+        return Distortion("kannala-brandt", torch.nn.functional.pad(c, (0, 4 - c.numel())))
+
+    def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
+        """The rig, once no name occurs twice."""
+        named: dict[str, Camera] = {}
+        for name, camera in cameras:
+            if name in named:
+                raise self.fail(name, "occurs twice; give every camera its own name")
+            named[name] = camera
+        if not named:
+            raise self.fail(None, "holds no camera; is the file whole?")
+        return Rig(named, **fields)
+
+    def _unique(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        fields = dict(pairs)
+        if len(fields) < len(pairs):
+            names = [name for name, _ in pairs]
+            raise self.fail(next(n for n in names if names.count(n) > 1), "occurs twice; keep one")
+        return fields
+
+
+def unit_doubt(rig: Rig) -> str | None:
+    """What to say of baselines that suggest another unit than metres."""
+    centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
+    if len(centres) < 2:
+        return None
+    longest = float(torch.pdist(torch.stack(centres)).max())
+    if longest > LARGEST_BASELINE:
+        return (
+            f"has cameras {longest:.3g} m apart: is this file in millimetres? "
+            "Then read it with scale=0.001; if its scale is arbitrary, all is well"
+        )
+    if 0 < longest < SMALLEST_BASELINE:
+        return (
+            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as millimetres? "
+            "Then read it with scale=1000"
+        )
+    return None
+
+
+class _UniqueKeys(yaml.SafeLoader):
+    """YAML in which a repeated key is an error, not silently the last one."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
+        for i, key in enumerate(keys):
+            if key in keys[:i]:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key}' occurs twice", node.start_mark)
+        return super().construct_mapping(node, deep)
