@@ -4,6 +4,7 @@ Cameras, rigs, two-view geometry and receptive fields as tensor operations; see 
 """
 
 from .camera import Camera, Projected, View, intrinsics
+from .distortion import Distortion
 from .epipolar import (
     Depth,
     Track,
@@ -18,6 +19,7 @@ from .epipolar import (
     track,
 )
 from .fields import (
+    Curved,
     Dense,
     Epipolar,
     EpipolarLine,
@@ -26,6 +28,7 @@ from .fields import (
     NearestVoxels,
     ReceptiveField,
     Rectified,
+    Widened,
     lazily,
     look,
 )
@@ -41,8 +44,10 @@ __all__ = [
     "Band",
     "Camera",
     "Curve",
+    "Curved",
     "Dense",
     "Depth",
+    "Distortion",
     "Epipolar",
     "EpipolarLine",
     "HomographyDisplacement",
@@ -60,6 +65,7 @@ __all__ = [
     "Sensor",
     "Track",
     "View",
+    "Widened",
     "apply_homography",
     "depth_from_track",
     "epipolar_distance",
