@@ -29,16 +29,19 @@ from .fields import (
     ReceptiveField,
     Rectified,
     Widened,
+    approximated,
     lazily,
     look,
 )
-from .homography import apply_homography, infinite_homography, plane_homography
+from .homography import apply_homography, fit_homography, fit_similarity, infinite_homography, plane_homography
 from .pixels import pixel_grid, resize_matrix
 from .pose import Pose, rotation_from_vector
+from .rectification import Rectification, rectify
 from .rig import Link, Pair, Rig
 from .sampling import sample, to_grid
 from .segments import Positions, Segments
 from .sensor import Band, Curve, Sensor
+from .triangulation import Triangulated, depth_of, triangulate
 
 __all__ = [
     "Band",
@@ -59,19 +62,25 @@ __all__ = [
     "Positions",
     "Projected",
     "ReceptiveField",
+    "Rectification",
     "Rectified",
     "Rig",
     "Segments",
     "Sensor",
     "Track",
+    "Triangulated",
     "View",
     "Widened",
     "apply_homography",
+    "approximated",
     "depth_from_track",
+    "depth_of",
     "epipolar_distance",
     "epipolar_lines",
     "epipoles",
     "essential_matrix",
+    "fit_homography",
+    "fit_similarity",
     "fundamental_matrix",
     "infinite_homography",
     "intrinsics",
@@ -79,6 +88,7 @@ __all__ = [
     "look",
     "pixel_grid",
     "plane_homography",
+    "rectify",
     "resize_matrix",
     "rotation_from_vector",
     "sample",
@@ -86,4 +96,5 @@ __all__ = [
     "shift_origin",
     "to_grid",
     "track",
+    "triangulate",
 ]

@@ -12,6 +12,7 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 import torch
 
 from ..segments import Segments
+from .approximation import approximated, placement_error
 from .curved import Curved
 from .explicit import Dense, Local, NearestVoxels
 from .protocol import Look, ReceptiveField, lazily, look
@@ -37,8 +38,10 @@ __all__ = [
     "ReceptiveField",
     "Rectified",
     "Widened",
+    "approximated",
     "covering_displacement",
     "lazily",
     "look",
     "pinhole_track",
+    "placement_error",
 ]
