@@ -54,6 +54,8 @@ class Pair:
     beta: View
     depth: Depths | None = None
     link: Link | None = None
+    memo: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False, repr=False)
+    """What fields have found out about the pair once and need again for the next pixels; never copied."""
 
     @property
     def calibrated(self) -> bool:
