@@ -195,4 +195,6 @@ def test_mistakes_are_told():
     with pytest.raises(ValueError, match="900 nm"):
         Spectral(Band(900, 20))
     with pytest.raises(ValueError, match='"halve".*keep the size'):
-        augment(noise_picture(1, 1, 8, 8), noise_picture(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator())
+        augment(
+            noise_picture(1, 1, 8, 8), noise_picture(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator()
+        )
