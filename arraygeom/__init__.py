@@ -4,6 +4,7 @@ Cameras, rigs, two-view geometry and receptive fields as tensor operations; see 
 """
 
 from .camera import Camera, Projected, View, intrinsics
+from .distortion import Distortion
 from .epipolar import (
     Depth,
     Track,
@@ -18,6 +19,7 @@ from .epipolar import (
     track,
 )
 from .fields import (
+    Curved,
     Dense,
     Epipolar,
     EpipolarLine,
@@ -26,23 +28,29 @@ from .fields import (
     NearestVoxels,
     ReceptiveField,
     Rectified,
+    Widened,
+    approximated,
     lazily,
     look,
 )
-from .homography import apply_homography, infinite_homography, plane_homography
+from .homography import apply_homography, fit_homography, fit_similarity, infinite_homography, plane_homography
 from .pixels import pixel_grid, resize_matrix
 from .pose import Pose, rotation_from_vector
+from .rectification import Rectification, rectify
 from .rig import Link, Pair, Rig
 from .sampling import sample, to_grid
 from .segments import Positions, Segments
 from .sensor import Band, Curve, Sensor
+from .triangulation import Triangulated, depth_of, triangulate
 
 __all__ = [
     "Band",
     "Camera",
     "Curve",
+    "Curved",
     "Dense",
     "Depth",
+    "Distortion",
     "Epipolar",
     "EpipolarLine",
     "HomographyDisplacement",
@@ -54,18 +62,25 @@ __all__ = [
     "Positions",
     "Projected",
     "ReceptiveField",
+    "Rectification",
     "Rectified",
     "Rig",
     "Segments",
     "Sensor",
     "Track",
+    "Triangulated",
     "View",
+    "Widened",
     "apply_homography",
+    "approximated",
     "depth_from_track",
+    "depth_of",
     "epipolar_distance",
     "epipolar_lines",
     "epipoles",
     "essential_matrix",
+    "fit_homography",
+    "fit_similarity",
     "fundamental_matrix",
     "infinite_homography",
     "intrinsics",
@@ -73,6 +88,7 @@ __all__ = [
     "look",
     "pixel_grid",
     "plane_homography",
+    "rectify",
     "resize_matrix",
     "rotation_from_vector",
     "sample",
@@ -80,4 +96,5 @@ __all__ = [
     "shift_origin",
     "to_grid",
     "track",
+    "triangulate",
 ]

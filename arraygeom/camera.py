@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
 from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
-from .pixels import HW, resize_matrix, shift_matrix, to_homogeneous, turn_matrix
+from .distortion import Distortion
+from .pixels import HW, map_homogeneous, resize_matrix, shift_matrix, to_homogeneous, turn_matrix
 from .pose import Pose, matvec
 from .sensor import Sensor
-
-if TYPE_CHECKING:
-    from .distortion import Distortion
 
 
 class Projected(NamedTuple):
@@ -108,8 +106,7 @@ class Camera(View):
     def project_local(self, X: Float[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
         normalised, valid = self._through_lens(X)
-        x = (to_homogeneous(normalised) @ self.K.transpose(-1, -2))[..., :2]
-        return Projected(x, X[..., 2], valid)
+        return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
     def unproject(self, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
         """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
@@ -123,11 +120,11 @@ class Camera(View):
         X = torch.where(valid[..., None], X, torch.nan)
         return self.cam_from_world.inverse().apply(X)
 
-    def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
+    def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
         """The direction in the camera's frame of what pixels see, z = 1 for pinholes, and its validity."""
-        normalised = (to_homogeneous(x) @ torch.linalg.inv(self.K).transpose(-1, -2))[..., :2]
+        normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
-            return to_homogeneous(normalised), torch.ones_like(x[..., 0], dtype=torch.bool)
+            return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
     def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Camera:

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from .pixels import map_homogeneous
+from .pixels import map_homogeneous, to_homogeneous
 
 
 class MappedPoints(NamedTuple):
@@ -64,3 +64,54 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Ma
 
 SMALLEST_SCALE = 1e-9
 """Homogeneous scales from here on count as positive: for a plane's homography, the ratio of depths."""
+
+
+def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
+    """The similarity (turn, scale, shift) that takes x nearest to y, least squares; n >= 2.
+
+    Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
+    """
+    x_mean, y_mean = x.mean(0), y.mean(0)
+    u, v = x - x_mean, y - y_mean
+    spread = u.square().sum()
+    a = (u * v).sum() / spread
+    b = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / spread
+    linear = torch.stack([torch.stack([a, -b]), torch.stack([b, a])])
+    return _affine(linear, y_mean - linear @ x_mean)
+
+
+def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: int = 10) -> Float[Tensor, "3 3"]:
+    """The homography that takes x nearest to y, least squares in the pixels of y; n >= 4.
+
+    Gauss-Newton from the affine fit, on points centred and scaled (Hartley & Zisserman, section 4.4); oriented
+    so that the scale is positive at the points. Differentiable, through the steps.
+    """
+    A, B = _normalising(x), _normalising(y)
+    u, v = x @ A[:2, :2].T + A[:2, 2], y @ B[:2, :2].T + B[:2, 2]
+    u1 = to_homogeneous(u)
+    H = torch.cat([torch.linalg.lstsq(u1, v).solution.T, u.new_tensor([[0.0, 0.0, 1.0]])])
+    for _ in range(steps):
+        w = u1 @ H[2]
+        mapped = (u1 @ H[:2].T) / w[:, None]
+        p = u1 / w[:, None]
+        zero = torch.zeros_like(p)
+        slopes = [
+            torch.cat(block + [-m * p[:, :2]], -1)
+            for block, m in (([p, zero], mapped[:, :1]), ([zero, p], mapped[:, 1:]))
+        ]
+        J, residual = torch.cat(slopes), (v - mapped).T.reshape(-1)
+        step = torch.linalg.solve(J.T @ J + 1e-12 * torch.eye(8).to(J), J.T @ residual)
+        H = H + torch.nn.functional.pad(step, (0, 1)).reshape(3, 3)
+    return torch.linalg.inv(B) @ H @ A
+
+
+def _normalising(x: Tensor) -> Tensor:
+    """The similarity that centres points and gives them unit spread; a constant of the fit."""
+    mean = x.detach().mean(0)
+    spread = (x.detach() - mean).square().mean().sqrt().clamp(min=1e-6)
+    return _affine(torch.eye(2).to(x) / spread, -mean / spread)
+
+
+def _affine(linear: Tensor, shift: Tensor) -> Tensor:
+    top = torch.cat([linear, shift[:, None]], 1)
+    return torch.cat([top, top.new_tensor([[0.0, 0.0, 1.0]])])

@@ -54,6 +54,8 @@ class Pair:
     beta: View
     depth: Depths | None = None
     link: Link | None = None
+    memo: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False, repr=False)
+    """What fields have found out about the pair once and need again for the next pixels; never copied."""
 
     @property
     def calibrated(self) -> bool:
@@ -106,6 +108,13 @@ class Pair:
         if self.calibrated:
             return self.homography_at(torch.tensor(torch.inf, dtype=torch.float64))
         return resize_matrix(self.alpha.hw, self.beta.hw)
+
+    def resize_beta(self, hw: HW) -> Pair:
+        """The pair whose beta records pictures of another size."""
+        A = resize_matrix(self.beta.hw, hw)
+        eye = torch.eye(3, dtype=A.dtype)
+        link = None if self.link is None else self.link.mapped(eye, A)
+        return dataclasses.replace(self, beta=self.beta.mapped(A, hw), link=link)
 
     def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
         """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""

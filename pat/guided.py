@@ -78,8 +78,10 @@ class GuidedPAT(nn.Module):
 
     multiple = 16
     equal_pitch = True
-    halo = 448
-    """Encoder 160, judge 120, propagation 120, head 20, upsampling: the sum, rounded up to a multiple."""
+    halo = 464
+    """Encoder 85, judge 176, propagation 180 and head 12: the sum, rounded up."""
+    beta_halo = 96
+    bytes_per_pixel = 700.0
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()

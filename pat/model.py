@@ -65,13 +65,19 @@ class FusionNetwork(Protocol):
     """What `fuse` asks of a network."""
 
     halo: int
-    """How far around a pixel of alpha (and around where it looks in beta) pictures can matter, pixels."""
+    """How far around a pixel alpha's picture, and where it looks, can matter, pixels."""
+    beta_halo: int
+    """How far around where it is looked at beta's picture can matter, pixels."""
+    bytes_per_pixel: float
+    """Working memory for each pixel of alpha and of the betas, measured."""
     multiple: int
     """Pictures are padded to multiples of this, and cut at them."""
     equal_pitch: bool
     """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
 
-    def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> Fused: ...
+    def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> Fused:
+        """Fuse alpha (B, C, H, W) with betas of any sizes."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -99,8 +105,12 @@ class PAT(nn.Module):
     2
     """
 
+    halo = 80
+    """Features reach 59 pixels and post-fusion 10; the sum, rounded up."""
+    beta_halo = 64
     multiple = 1
     equal_pitch = False
+    bytes_per_pixel = 3000.0
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
@@ -109,9 +119,6 @@ class PAT(nn.Module):
         self.features = Features(c.in_channels, d)
         self.engine = AttentionEngine(c.betas, d, c.interpolation)
         self.post = PostFusion((c.betas + 1) * d, d, c.out_channels, c.scale)
-
-    halo = 128
-    """Features reach 86 pixels and post-fusion 11; the sum, rounded up."""
 
     def forward(
         self, alpha: Float[Tensor, "b c h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks

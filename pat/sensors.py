@@ -154,7 +154,7 @@ class GaussianBlur(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The blurred pictures."""
-        r = math.ceil(4 * float(self.sigma))
+        r = math.ceil(4 * _value(self.sigma))
         x = torch.arange(-r, r + 1, dtype=image.dtype, device=image.device)
         kernel = torch.exp(-0.5 * (x / max(self.sigma, 1e-6)) ** 2)
         kernel = kernel / kernel.sum()
@@ -169,10 +169,14 @@ class DiscBlur(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The blurred pictures."""
-        n = math.ceil(float(self.radius) + 0.5)
+        n = math.ceil(_value(self.radius) + 0.5)
         x = torch.arange(-n, n + 1, dtype=image.dtype, device=image.device)
         kernel = (self.radius + 0.5 - torch.hypot(x[:, None], x[None])).clamp(0, 1)
         return _convolved(image, kernel / kernel.sum())
+
+
+def _value(x: Number | Tensor) -> float:
+    return float(x.detach()) if isinstance(x, Tensor) else float(x)
 
 
 def _convolved(image: Tensor, kernel: Tensor) -> Tensor:

@@ -12,6 +12,8 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 import torch
 
 from ..segments import Segments
+from .approximation import approximated, placement_error
+from .curved import Curved
 from .explicit import Dense, Local, NearestVoxels
 from .protocol import Look, ReceptiveField, lazily, look
 from .straight import (
@@ -22,8 +24,10 @@ from .straight import (
     covering_displacement,
     pinhole_track,
 )
+from .widened import Widened
 
 __all__ = [
+    "Curved",
     "Dense",
     "Epipolar",
     "EpipolarLine",
@@ -33,8 +37,11 @@ __all__ = [
     "NearestVoxels",
     "ReceptiveField",
     "Rectified",
+    "Widened",
+    "approximated",
     "covering_displacement",
     "lazily",
     "look",
     "pinhole_track",
+    "placement_error",
 ]

@@ -12,10 +12,10 @@ from torch import Tensor
 from ..camera import Camera
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
-from ..pixels import HW, coarse_grid
+from ..pixels import HW
 from ..rig import Depths, Pair, depth_range
 from ..segments import Segments, clip_to_picture
-from .protocol import in_chunks
+from .protocol import CHUNK, all_pixels, in_chunks
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ class HomographyDisplacement:
 
     The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the depth
     range (`approximated` fits a better one), and `displacement=None` takes the smallest that covers near to far
-    all over alpha's picture. With calibration, the start is towards near and the end towards far.
+    at every pixel of alpha's picture. With calibration, the start is towards near and the end towards far.
 
     Where there is no line (at the epipole, and without a baseline) the segment is the point H x.
     """
@@ -102,18 +102,31 @@ class HomographyDisplacement:
 def covering_displacement(pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Float[Tensor, ""]:
     """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta.
 
-    Of depth-bounded segments as beta's picture clips them; 0 if there are none. Without x: for every 16th pixel
-    of alpha, which is within a pixel of that for all. Raises ValueError for an uncalibrated pair.
+    Of depth-bounded segments as beta's picture clips them; 0 if there are none. Without x: for all of alpha's
+    pixels. Raises ValueError for an uncalibrated pair.
     """
-    if x is None:
-        grid = coarse_grid(pair.alpha.hw).to(pair.cameras[0].K)
-        x = grid.reshape(*[1] * (pair.cameras[0].K.ndim - 2), *grid.shape)
+    largest = _squared_reach(pair, _widest(pair) if x is None else x).max()
+    return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
+
+
+def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
+    """The squared distance from the foot of H x to the farther end of the segment, 0 where there is none."""
     exact = Epipolar()(pair, x)
     centre, placed = apply_homography(pair.homography, x)
     foot = foot_on_line(epipolar_lines(pair.fundamental, x), centre)
-    squared = torch.stack([(end - foot).square().sum(-1) for end in (exact.start, exact.end)])
-    largest = torch.where(exact.valid & placed, squared, 0.0).max()
-    return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
+    squared = [(end - foot).square().sum(-1) for end in (exact.start, exact.end)]
+    return torch.where(exact.valid & placed, torch.maximum(*squared), 0.0)
+
+
+def _widest(pair: Pair) -> Tensor:
+    """The alpha pixel (*b, 1, 2) that needs the largest displacement: looked for once a pair."""
+    if "widest" not in pair.memo:
+        grid = all_pixels(pair)
+        with torch.no_grad():
+            reach = torch.cat([_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)], -2)
+        index = reach.flatten(-2).argmax(-1)
+        pair.memo["widest"] = grid.reshape(-1, 2)[index][..., None, :].to(pair.cameras[0].K)
+    return pair.memo["widest"]
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,8 @@ from arraygeom.segments import sample_fractions
 from pat.attention import cpu_kernels as kernels
 from pat.attention.reference import EDGE_SLACK, Look
 
-PIECE_SAMPLES = 2**15
-"""Samples of one task: about a millisecond."""
+PIECE_SAMPLES = 2**17
+"""Samples of one task: a millisecond or two."""
 SCRATCH_TAPS = 2**19
 """Taps that backward holds at a time, 12 bytes each (16 in float64)."""
 

@@ -22,6 +22,8 @@ from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 8
 TAP_BLOCK = 4
+BLOCK = 8
+"""Alpha pixels that are worked off together, step by step, as long as what they look up is still at hand."""
 LEAST_SPREAD = np.float32(1e-4)
 ONE, HALF = np.float32(1), np.float32(0.5)
 """In float32, so that they make a float64 of nothing that is not."""
@@ -361,19 +363,22 @@ def inner_products(x, rows, n, picture, channels, out):
 
 
 @njit
-def weighted_sum(weights, rows, n, picture, channels, out):
-    """out = sum over t < n of weights[t] picture[rows[t]]; both are padded to a multiple of TAP_BLOCK."""
+def weighted_sum(weights, rows, n, picture, channels, width, out):
+    """out[c] = sum over t < n of weights[t] picture[rows[t], c], for c < width.
+
+    Weights and rows are padded to a multiple of TAP_BLOCK.
+    """
     c = 0
-    while c + 8 * LANES <= channels:
-        _weighted_sum_64(weights, rows, n, picture, channels, c, out)
-        c += 8 * LANES
-    while c + 2 * LANES <= channels:
+    while c + 4 * LANES <= width:
+        _weighted_sum_32(weights, rows, n, picture, channels, c, out)
+        c += 4 * LANES
+    while c + 2 * LANES <= width:
         _weighted_sum_16(weights, rows, n, picture, channels, c, out)
         c += 2 * LANES
-    while c + LANES <= channels:
+    while c + LANES <= width:
         _weighted_sum_8(weights, rows, n, picture, channels, c, out)
         c += LANES
-    for c in range(c, channels):
+    for c in range(c, width):
         s = zero(weights)
         for t in range(n):
             s += weights[t] * load_one(picture, rows[t] * channels + c)
@@ -381,32 +386,27 @@ def weighted_sum(weights, rows, n, picture, channels, out):
 
 
 @njit
-def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(zero(weights))
-    for t in range(n):
-        w = splat(weights[t])
-        r = rows[t] * channels + c
+def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
+    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
+    for t in range(0, n, 2):
+        w, r = splat(weights[t]), rows[t] * channels + c
         a0 = fma(w, load(picture, r), a0)
         a1 = fma(w, load(picture, r + 8), a1)
         a2 = fma(w, load(picture, r + 16), a2)
         a3 = fma(w, load(picture, r + 24), a3)
-        a4 = fma(w, load(picture, r + 32), a4)
-        a5 = fma(w, load(picture, r + 40), a5)
-        a6 = fma(w, load(picture, r + 48), a6)
-        a7 = fma(w, load(picture, r + 56), a7)
-    store(out, c, a0)
-    store(out, c + 8, a1)
-    store(out, c + 16, a2)
-    store(out, c + 24, a3)
-    store(out, c + 32, a4)
-    store(out, c + 40, a5)
-    store(out, c + 48, a6)
-    store(out, c + 56, a7)
+        w, r = splat(weights[t + 1]), rows[t + 1] * channels + c
+        b0 = fma(w, load(picture, r), b0)
+        b1 = fma(w, load(picture, r + 8), b1)
+        b2 = fma(w, load(picture, r + 16), b2)
+        b3 = fma(w, load(picture, r + 24), b3)
+    store(out, c, add(a0, b0))
+    store(out, c + 8, add(a1, b1))
+    store(out, c + 16, add(a2, b2))
+    store(out, c + 24, add(a3, b3))
 
 
 @njit
 def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
-    one = splat(zero(weights) + ONE)
     a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
     for t in range(0, n, TAP_BLOCK):
         w0, r0 = splat(weights[t]), rows[t] * channels + c
@@ -417,20 +417,19 @@ def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
         a1, b1 = fma(w1, load(picture, r1), a1), fma(w1, load(picture, r1 + 8), b1)
         a2, b2 = fma(w2, load(picture, r2), a2), fma(w2, load(picture, r2 + 8), b2)
         a3, b3 = fma(w3, load(picture, r3), a3), fma(w3, load(picture, r3 + 8), b3)
-    store(out, c, fma(one, fma(one, a0, a1), fma(one, a2, a3)))
-    store(out, c + 8, fma(one, fma(one, b0, b1), fma(one, b2, b3)))
+    store(out, c, add(add(a0, a1), add(a2, a3)))
+    store(out, c + 8, add(add(b0, b1), add(b2, b3)))
 
 
 @njit
 def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
-    one = splat(zero(weights) + ONE)
     a0 = a1 = a2 = a3 = splat(zero(weights))
     for t in range(0, n, TAP_BLOCK):
         a0 = fma(splat(weights[t]), load(picture, rows[t] * channels + c), a0)
         a1 = fma(splat(weights[t + 1]), load(picture, rows[t + 1] * channels + c), a1)
         a2 = fma(splat(weights[t + 2]), load(picture, rows[t + 2] * channels + c), a2)
         a3 = fma(splat(weights[t + 3]), load(picture, rows[t + 3] * channels + c), a3)
-    store(out, c, fma(one, fma(one, a0, a1), fma(one, a2, a3)))
+    store(out, c, add(add(a0, a1), add(a2, a3)))
 
 
 @njit(nogil=True, cache=True)
@@ -498,6 +497,7 @@ class Samples(NamedTuple):
     """Room for the samples of one pixel that count: which they are, where, in which cell, with what weight."""
 
     index: Any
+    cell: Any
     tap: Any
     x: Any
     y: Any
@@ -540,17 +540,20 @@ def _look(look):
 def room(samples, channels):
     """How many integers and how many numbers of scratch a task needs."""
     n, m = samples + LANES, 4 * samples + LANES
-    return 5 * n + m, 8 * n + 3 * m + channels
+    return 6 * n + BLOCK * (m + 1), 8 * n + (BLOCK + 2) * m + channels
 
 
 @njit
 def _room(n, integers, numbers):
-    """Scratch, cut up. What is left of it is for channels."""
+    """Scratch, cut up: for samples, taps, channels. Taps' rows and weights are there for BLOCK pixels, the
+    numbers of taps behind those."""
     n, m = n + LANES, 4 * n + LANES
     i, f = pointer(integers), pointer(numbers)
+    t = from_index(f, 8 * n)
     samples = Samples(
         i,
         from_index(i, n),
+        from_index(i, 2 * n),
         f,
         from_index(f, n),
         from_index(f, 2 * n),
@@ -560,9 +563,15 @@ def _room(n, integers, numbers):
         from_index(f, 6 * n),
         from_index(f, 7 * n),
     )
-    t = from_index(f, 8 * n)
-    taps = Taps(from_index(i, 5 * n), t, from_index(t, m), from_index(t, 2 * m))
-    return samples, taps, from_index(t, 3 * m)
+    taps = Taps(from_index(i, 6 * n), t, from_index(t, m), from_index(t, 2 * m))
+    return samples, taps, from_index(t, (BLOCK + 2) * m), from_index(i, 6 * n + BLOCK * m)
+
+
+@njit
+def _slot(taps, slot, n):
+    """The taps of a pixel of a block."""
+    m = slot * (4 * n + LANES)
+    return Taps(from_index(taps.row, m), taps.by_key, taps.by_value, from_index(taps.weight, m))
 
 
 @njit
@@ -651,32 +660,35 @@ def _tap_cells(n, first, look, samples, taps):
     nothing = zero(samples.x)
     width = np.int32(look.width)
     cell_x, cell_y = np.int32(max(look.width - 2, 0)), np.int32(max(look.height - 2, 0))
-    step_x, step_y = np.int32(min(1, look.width - 1)), np.int32(min(1, look.height - 1)) * width
-    x = y = np.int32(-2)
-    t00 = t10 = t01 = t11 = m = np.int32(0)
+    right, down = np.int32(min(1, look.width - 1)), np.int32(min(1, look.height - 1)) * width
     for j in range(n):
-        right = min(max(samples.x[j], nothing), look.last_x)
-        down = min(max(samples.y[j], nothing), look.last_y)
-        new_x, new_y = min(np.int32(right), cell_x), min(np.int32(down), cell_y)
-        if new_x != x or new_y != y:
-            row = first + new_y * width + new_x
-            if new_y == y and new_x == x + 1:
+        x, y = min(max(samples.x[j], nothing), look.last_x), min(max(samples.y[j], nothing), look.last_y)
+        cx, cy = min(np.int32(x), cell_x), min(np.int32(y), cell_y)
+        samples.right[j], samples.down[j] = x - np.float32(cx), y - np.float32(cy)
+        samples.cell[j] = first + cy * width + cx
+    t00 = t10 = t01 = t11 = m = np.int32(0)
+    cell = np.int32(0)
+    for j in range(n):
+        step, cell = samples.cell[j] - cell, samples.cell[j]
+        if j == 0 or step != 0:
+            if j == 0:
+                t00, t10, m = _fresh(cell, cell + right, m, taps)
+                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
+            elif step == right and right != 0:
                 t00, t01 = t10, t11
-                t10, t11, m = _fresh(row + step_x, row + step_x + step_y, m, taps)
-            elif new_y == y and new_x == x - 1:
+                t10, t11, m = _fresh(cell + right, cell + right + down, m, taps)
+            elif step == -right and right != 0:
                 t10, t11 = t00, t01
-                t00, t01, m = _fresh(row, row + step_y, m, taps)
-            elif new_x == x and new_y == y + 1:
+                t00, t01, m = _fresh(cell, cell + down, m, taps)
+            elif step == down and down != 0:
                 t00, t10 = t01, t11
-                t01, t11, m = _fresh(row + step_y, row + step_x + step_y, m, taps)
-            elif new_x == x and new_y == y - 1:
+                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
+            elif step == -down and down != 0:
                 t01, t11 = t00, t10
-                t00, t10, m = _fresh(row, row + step_x, m, taps)
+                t00, t10, m = _fresh(cell, cell + right, m, taps)
             else:
-                t00, t10, m = _fresh(row, row + step_x, m, taps)
-                t01, t11, m = _fresh(row + step_y, row + step_x + step_y, m, taps)
-            x, y = new_x, new_y
-        samples.right[j], samples.down[j] = right - np.float32(x), down - np.float32(y)
+                t00, t10, m = _fresh(cell, cell + right, m, taps)
+                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
         samples.tap[4 * j], samples.tap[4 * j + 1] = t00, t10
         samples.tap[4 * j + 2], samples.tap[4 * j + 3] = t01, t11
     return np.int64(m)
@@ -849,19 +861,27 @@ def forward(
     biased = len(bias) > 0
     look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
     out, statistics = pointer(out), pointer(statistics)
-    samples, taps, q = _room(look.samples, integers, numbers)
-    for p in range(first, last):
-        _unpack(query, p * channels, channels, q)
-        n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
-        logsum[p] = _softmax(n, samples) if n > 0 else -np.inf
-        if logsum[p] == -np.inf:
-            _fill(q, 0, value_channels, zero(q))
-            _fill(statistics, 4 * p, 4 * p + 4, zero(q))
-        else:
-            _distribute(n, m, look, samples, samples.weight, taps.weight)
-            weighted_sum(taps.weight, taps.row, m, value, value_channels, q)
-            _measure(n, samples, from_index(statistics, 4 * p))
-        _pack(q, value_channels, out, p * value_channels)
+    samples, taps, q, counts = _room(look.samples, integers, numbers)
+    for begin in range(first, last, BLOCK):
+        end = min(begin + BLOCK, last)
+        for p in range(begin, end):
+            _unpack(query, p * channels, channels, q)
+            own = _slot(taps, p - begin, look.samples)
+            n, m = _score(p, q, key, channels, look, bias, biased, samples, own)
+            logsum[p] = _softmax(n, samples) if n > 0 else -np.inf
+            if logsum[p] == -np.inf:
+                counts[p - begin] = 0
+                _fill(statistics, 4 * p, 4 * p + 4, zero(q))
+            else:
+                counts[p - begin] = m
+                _distribute(n, m, look, samples, samples.weight, own.weight)
+                _measure(n, samples, from_index(statistics, 4 * p))
+        for c in range(0, value_channels, 4 * LANES):
+            width = min(4 * LANES, value_channels - c)
+            for p in range(begin, end):
+                own = _slot(taps, p - begin, look.samples)
+                weighted_sum(own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q)
+                _pack(q, width, out, p * value_channels + c)
 
 
 class Scratch(NamedTuple):
@@ -966,7 +986,7 @@ def backward(
     )
     counts, rows = pointer(scratch.counts), pointer(scratch.rows)
     by_key, by_value = pointer(scratch.by_key), pointer(scratch.by_value)
-    samples, taps, q = _room(look.samples, integers, numbers)
+    samples, taps, q, _ = _room(look.samples, integers, numbers)
     for p in range(first, last):
         slot = p - scratch_first
         _unpack(query, p * channels, channels, q)
@@ -1003,5 +1023,5 @@ def backward(
         for t in range(m):
             rows[slot * stride + t] = taps.row[t]
         if wants_query:
-            weighted_sum(from_index(by_key, slot * stride), taps.row, m, key, channels, q)
+            weighted_sum(from_index(by_key, slot * stride), taps.row, m, key, channels, channels, q)
             _pack(q, channels, query_out, p * channels)

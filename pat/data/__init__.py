@@ -1,6 +1,7 @@
 """Pairs and arrays on disk."""
 
 from pat.data.pairs import (
+    PAPER_DISPARITY,
     Calibration,
     Disparity,
     StereoPair,
@@ -13,6 +14,7 @@ from pat.data.pairs import (
 from pat.data.protocol import MonoColourTask, mono_colour_task, reduce_by
 
 __all__ = [
+    "PAPER_DISPARITY",
     "Calibration",
     "Disparity",
     "MonoColourTask",

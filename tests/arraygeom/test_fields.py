@@ -30,7 +30,7 @@ from arraygeom import (
 from arraygeom.fields import covering_displacement
 from arraygeom.homography import apply_homography
 from arraygeom.pixels import pixel_grid
-from tests.arraygeom.rigs import half_turn, random_rig, scene_points, two_cameras, uniform
+from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
 
 STRAIGHT = [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), HomographyDisplacement()]
 ALL = [*STRAIGHT, Rectified(20.0), NearestVoxels(24, 12), Local(3), Dense(4)]
@@ -56,8 +56,11 @@ def by_link(pair: Pair) -> Pair:
 @pytest.mark.parametrize("field", STRAIGHT, ids=ids)
 @pytest.mark.parametrize("seed", range(4))
 def test_points_between_the_bounds_lie_on_their_segments(field, seed):
-    pair = pair_of(random_rig(seed))
-    X = scene_points(random_rig(seed))
+    rig = random_rig(seed)
+    pair = pair_of(rig)
+    x = pixel_grid(rig["alpha"].hw, dtype=torch.float64).reshape(-1, 2)
+    g = torch.Generator().manual_seed(seed)
+    X = rig["alpha"].unproject(x, 1 / uniform(g, 1 / 10.0, 1 / 1.5, len(x)))
     alpha, beta = (c.project(X) for c in pair.cameras)
     seen = beta.valid & pair.beta.contains(beta.x)
     if field == HomographyDisplacement(8.0):
@@ -65,7 +68,7 @@ def test_points_between_the_bounds_lie_on_their_segments(field, seed):
     segments = field(pair, alpha.x)
     assert segments.valid[seen].all()
     on = segments.at(segments.fraction(beta.x).clamp(0, 1))
-    assert (on - beta.x)[seen].norm(dim=-1).max() < (1.0 if field == HomographyDisplacement() else 1e-6)
+    assert (on - beta.x)[seen].norm(dim=-1).max() < 1e-6
 
 
 @pytest.mark.parametrize("field", STRAIGHT, ids=ids)
@@ -116,7 +119,7 @@ def test_the_covering_displacement_covers_and_is_the_least():
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)
     exact = Epipolar()(pair, x)
     reach = covering_displacement(pair, x)
-    assert covering_displacement(pair) == pytest.approx(reach.item(), abs=1)
+    assert covering_displacement(pair) == pytest.approx(reach.item(), abs=1e-9)
     centre = apply_homography(pair.homography, x).x
     ends = torch.stack([(centre - e).norm(dim=-1)[exact.valid] for e in (exact.start, exact.end)])
     # along the line; H x itself lies on it for a plane's homography
@@ -294,14 +297,14 @@ def test_gradients_in_every_rig_parameter(field):
     x = torch.tensor([[5.0, 40.0], [30.0, 20.0], [60.0, 3.0]], dtype=torch.float64)
     numbers = geometry(rig)
     assert ends(field, rig, x, numbers).numel() >= 8
-    assert torch.autograd.gradcheck(lambda *n: ends(field, rig, x, n), numbers, atol=1e-4, rtol=1e-4)
+    assert torch.autograd.gradcheck(lambda *n: ends(field, rig, x, n), numbers, atol=1e-4, rtol=1e-4, fast_mode=field == HomographyDisplacement())
 
 
 @pytest.mark.parametrize("field", STRAIGHT[:3], ids=ids)
 def test_second_derivatives_of_straight_fields(field):
     rig = random_rig(3)
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
-    assert torch.autograd.gradgradcheck(lambda *n: ends(field, rig, x, n), geometry(rig), atol=1e-3, rtol=1e-3)
+    assert torch.autograd.gradgradcheck(lambda *n: ends(field, rig, x, n), geometry(rig), atol=1e-3, rtol=1e-3, fast_mode=True)
 
 
 def test_gradients_of_an_uncalibrated_pair():
@@ -447,13 +450,13 @@ def sure_of(exact: Segments, hw: tuple[int, int]) -> torch.Tensor:
     return ~grazing.any(-1)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**9), st.sampled_from([0.2, 1.0, 3.0]))
 def test_float32_agrees_with_float64_on_a_thousand_rigs(seed, turn):
-    """50 times 20 rigs: no NaN, and no other `valid` than rounding at the picture's edge explains."""
+    """10 times 100 rigs: no NaN, and no other `valid` than rounding at the picture's edge explains."""
     g = torch.Generator().manual_seed(seed)
-    kinds = [disturbed(random_rig(seed + i, near=0.5, turn=turn, baseline=1.0), i, g) for i in range(20)]
-    rig, x = batch_of(kinds), uniform(g, 0, 47, 20, 50, 2)
+    kinds = [disturbed(random_rig(seed + i, near=0.5, turn=turn, baseline=1.0), i, g) for i in range(100)]
+    rig, x = batch_of(kinds), uniform(g, 0, 47, 100, 50, 2)
     exact, quick = Epipolar()(pair_of(rig), x), Epipolar()(pair_of(rig), x.float())
     roomy, tight = (Epipolar()(larger(rig, margin), x).valid for margin in (0.01, -0.01))
     assert quick.start.isfinite().all()

@@ -1,3 +1,4 @@
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -17,7 +18,7 @@ HW = (48, 128)
 def smooth() -> PhotoBank:
     """Textures without fine detail, so that differences between views are due to geometry alone."""
     rng = np.random.default_rng(0)
-    return PhotoBank([p for i, p in enumerate(patterns(rng, 40)) if i % 5 in (0, 4)])
+    return PhotoBank([cv2.GaussianBlur(p, (0, 0), 5) for i, p in enumerate(patterns(rng, 40)) if i % 5 in (0, 4)])
 
 
 @pytest.fixture(scope="module")
@@ -30,14 +31,13 @@ def draw(bank: PhotoBank, rigs: RigDistribution, batch: int = 4, seed: int = 0) 
 
 
 def mean_shift(batch: ArrayBatch) -> torch.Tensor:
-    """Least-squares displacement (x, y), in alpha's pixels, of beta's colours against alpha's."""
+    """Least-squares displacement (x, y), in alpha's pixels, of beta's colours against alpha's, off the outlines."""
     across = look_across(batch)
     dy, dx = torch.gradient(batch.images[0], dim=(-2, -1))
-    flat = (dx.abs() + dy.abs()).amax(1) < 0.05
-    keep = (across.visible & flat)[:, None].expand_as(dx)
+    difference = across.image - batch.images[0]
+    keep = (across.visible & (difference.abs().amax(1) < 0.03))[:, None].expand_as(dx)
     A = torch.stack([dx[keep], dy[keep]], -1).double()
-    difference = (across.image - batch.images[0])[keep].double()
-    return torch.linalg.lstsq(A, difference[:, None]).solution[:, 0]
+    return torch.linalg.lstsq(A, difference[keep].double()[:, None]).solution[:, 0]
 
 
 @pytest.mark.parametrize("mode", ["rectified", "general"])
@@ -47,15 +47,15 @@ def test_depth_and_cameras_foretell_the_other_view(smooth, mode, resolution):
     across = look_across(batch)
     assert across.visible.float().mean() > 0.3
     error = (across.image - batch.images[0]).abs().amax(1)[across.visible]
-    assert error.median() < 0.012
-    assert error.quantile(0.9) < 0.05
+    assert error.median() < 0.005
+    assert error.quantile(0.9) < 0.06
 
 
 @pytest.mark.parametrize("mode", ["rectified", "general"])
 @pytest.mark.parametrize("resolution", [1.0, 0.5, 0.25])
 def test_no_shift_between_views_of_different_resolution(smooth, mode, resolution):
     batch = draw(smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)), 12, 3)
-    assert mean_shift(batch).abs().max() < 0.03 / resolution
+    assert mean_shift(batch).abs().max() < 0.02
 
 
 def test_occlusion_is_seen_from_both_sides(rich):
@@ -108,7 +108,9 @@ def test_same_seed_same_samples(rich):
 def test_a_given_rig_keeps_its_cameras(rich):
     K = intrinsics(300.0, (60, 90))[None]
     still = Pose(torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64))
-    turned = Pose(rotation_from_vector(torch.tensor([[0.02, -0.03, 0.1]]).double()), torch.tensor([[0.2, 0.1, 0]]).double())
+    turned = Pose(
+        rotation_from_vector(torch.tensor([[0.02, -0.03, 0.1]]).double()), torch.tensor([[0.2, 0.1, 0]]).double()
+    )
     cameras = [Camera(K=K, cam_from_world=still, hw=(60, 90)), Camera(K=K * 1.0, cam_from_world=turned, hw=(50, 80))]
     rig = RigBatch(cameras, torch.tensor([2.0]).double(), torch.tensor([10.0]).double())
     scenes = LayeredScenes(rich, RigDistribution(), hw=HW)

@@ -14,7 +14,9 @@ def pictures() -> list[np.ndarray]:
 
 def look(bank: PhotoBank, texture: int, xy: list[list[float]], level: float) -> np.ndarray:
     n = len(xy)
-    return bank.lookup(torch.full((n,), texture), torch.tensor(xy, dtype=torch.float32), torch.full((n,), level)).T.numpy()
+    return bank.lookup(
+        torch.full((n,), texture), torch.tensor(xy, dtype=torch.float32), torch.full((n,), level)
+    ).T.numpy()
 
 
 def test_texel_centres_return_the_texels(pictures):

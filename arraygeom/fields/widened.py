@@ -1,0 +1,95 @@
+"""Room for what a field does not know: calibration that is a little off, and things that move."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..pixels import HW
+from ..rig import Pair
+from ..segments import Positions, Segments, clip_to_picture
+from .protocol import Look, ReceptiveField
+
+
+@dataclass(frozen=True)
+class Widened:
+    """Any field with `across` pixels to either side of it and `along` more pixels at either end.
+
+    Uncertain calibration moves lines sideways: `across` alone. Motion between cameras that are not synchronised
+    moves points anywhere: `across` and `along`, or `for_motion`.
+
+    Segments made longer stay segments. Made wider they become positions: `samples` along, on rows at most one
+    pixel apart, the rows following one another (the first `across` to the left of the way from start to end).
+    Positions (of `Curved`) are taken as ordered along a curve; each is stretched and widened about its own tangent.
+    A segment of no length widens to a window with sides along x and y.
+    """
+
+    field: ReceptiveField
+    across: float = 0.0
+    along: float = 0.0
+    samples: int = 96
+
+    def __post_init__(self) -> None:
+        if min(self.across, self.along) < 0:
+            raise ValueError(f"across and along are pixels, 0 or more; got {self.across} and {self.along}")
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
+        """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
+        found = self.field(pair, x)
+        if isinstance(found, Segments):
+            longer = self._longer(found)
+            if self.across == 0:
+                clipped = clip_to_picture(longer.start, longer.end, pair.beta.hw)
+                return Segments(clipped.start, clipped.end, clipped.valid & found.valid)
+            found = longer.positions(self.samples)
+        else:
+            found = self._stretched(found)
+        return self._band(found, pair.beta.hw)
+
+    @classmethod
+    def for_motion(cls, field: ReceptiveField, pixels: float, **options: int) -> Widened:
+        """Room for things that move by up to `pixels` between the cameras' exposures."""
+        return cls(field, across=pixels, along=pixels, **options)
+
+    @property
+    def rows(self) -> int:
+        """How many rows of samples a band has."""
+        return 2 * math.ceil(self.across) + 1
+
+    def _longer(self, s: Segments) -> Segments:
+        more = self.along * direction(s.end - s.start)
+        return Segments(s.start - more, s.end + more, s.valid)
+
+    def _stretched(self, p: Positions) -> Positions:
+        reach = torch.linspace(-self.along, self.along, p.xy.shape[-2], dtype=p.xy.dtype, device=p.xy.device)
+        return Positions(p.xy + reach[:, None] * tangents(p), p.mask)
+
+    def _band(self, p: Positions, hw: HW) -> Positions:
+        tangent = tangents(p)
+        left = torch.stack([tangent[..., 1], -tangent[..., 0]], -1)
+        rows = torch.linspace(self.across, -self.across, self.rows, dtype=p.xy.dtype, device=p.xy.device)
+        xy = p.xy[..., None, :, :] + rows[:, None, None] * left[..., None, :, :]
+        xy = xy.flatten(-3, -2)
+        inside = ((xy >= -0.5) & (xy <= xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]))).all(-1)
+        mask = inside & p.mask[..., None, :].expand(*p.mask.shape[:-1], self.rows, -1).flatten(-2, -1)
+        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+
+def direction(step: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+    """Unit vectors; along x for steps shorter than 1e-3 pixels."""
+    squared = step.square().sum(-1, keepdim=True)
+    moves = squared > 1e-6
+    return torch.where(moves, step / torch.where(moves, squared, 1.0).sqrt(), step.new_tensor([1.0, 0.0]))
+
+
+def tangents(p: Positions) -> Float[Tensor, "*n l 2"]:
+    """The direction of the curve at each position, from its neighbours."""
+    if p.xy.shape[-2] < 2:
+        return direction(torch.zeros_like(p.xy))
+    before, after = p.xy[..., :1, :], p.xy[..., -1:, :]
+    padded = torch.cat([before, p.xy, after], -2)
+    return direction(padded[..., 2:, :] - padded[..., :-2, :])

@@ -1,0 +1,97 @@
+"""Rectifying a pair: homographies after which a point has the same row in both pictures."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .camera import Camera, intrinsics
+from .pixels import HW
+from .pose import Pose, matvec, rotation_from_vector
+from .rig import Pair
+
+
+class Rectification(NamedTuple):
+    """What turns a pair into a rectified one.
+
+    `R_alpha` and `R_beta` turn the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones, `pair`
+    holds the rectified cameras: same K, same orientation, the baseline along x.
+    """
+
+    R_alpha: Float[Tensor, "3 3"]
+    R_beta: Float[Tensor, "3 3"]
+    H_alpha: Float[Tensor, "3 3"]
+    H_beta: Float[Tensor, "3 3"]
+    pair: Pair
+
+
+def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
+    """Rectifying homographies of a pinhole pair (Bouguet's: each camera is turned half way).
+
+    The new pictures have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two focal
+    lengths, and the centres of the old pictures about the middle of the new. The same R_alpha and R_beta as
+    OpenCV's `stereoRectify` for a horizontal pair; a vertical one is turned by a quarter, so that lines are rows
+    here too. Differentiable in everything. Raises ValueError for lenses, batches, and without a baseline.
+    """
+    alpha, beta = pair.cameras
+    if alpha.distortion is not None or beta.distortion is not None:
+        raise ValueError("rectification by homographies needs pinhole cameras: undistort the pictures first")
+    if alpha.K.ndim > 2 or beta.K.ndim > 2:
+        raise ValueError("rectification works on one pair at a time: take one of the batch")
+    pose = pair.beta_from_alpha
+    if not pose.t.norm() > 1e-12:
+        raise ValueError("two cameras in one place cannot be rectified: there is no baseline")
+    R_alpha, R_beta = rectifying_rotations(pose)
+    hw = hw or alpha.hw
+    K = middle_intrinsics((alpha, beta), (R_alpha, R_beta), hw) if K is None else K
+    cameras = [
+        Camera(K=K, cam_from_world=Pose(R @ c.R, matvec(R, c.t)), hw=hw, sensor=c.sensor)
+        for c, R in ((alpha, R_alpha), (beta, R_beta))
+    ]
+    H_alpha, H_beta = (K @ R @ torch.linalg.inv(c.K) for c, R in ((alpha, R_alpha), (beta, R_beta)))
+    return Rectification(R_alpha, R_beta, H_alpha, H_beta, Pair(*cameras, pair.depth))
+
+
+def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
+    """(R_alpha, R_beta): both frames turned half way to one another, then until the baseline is along x."""
+    half = rotation_from_vector(0.5 * rotation_vector(beta_from_alpha.R))
+    t = half.T @ beta_from_alpha.t
+    direction = t / t.norm()
+    x = torch.where(t[0] > 0, 1.0, -1.0) * t.new_tensor([1.0, 0, 0])
+    to_x = rotation_to(direction, x)
+    return to_x @ half, to_x @ half.T
+
+
+def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The shortest rotation that takes unit vector a to unit vector b, less than half a turn away."""
+    v = torch.linalg.cross(a, b)
+    W = torch.stack([torch.linalg.cross(v, e) for e in torch.eye(3).to(v)], -1)
+    return torch.eye(3).to(v) + W + W @ W / (1 + a @ b)
+
+
+def rotation_vector(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
+    """Axis times angle of a rotation by less than half a turn: the inverse of `rotation_from_vector`."""
+    skew = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    squared = skew.square().sum()
+    cosine = 0.5 * (R.diagonal().sum() - 1)
+    small = (squared < 1e-6) & (cosine > 0)
+    sine = torch.where(small, 1.0, squared).sqrt()
+    return skew * torch.where(small, 1 + squared / 6 + 3 * squared.square() / 40, torch.atan2(sine, cosine) / sine)
+
+
+def middle_intrinsics(
+    cameras: tuple[Camera, Camera], rotations: tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]], hw: HW
+) -> Float[Tensor, "3 3"]:
+    """K of the smaller focal length that puts what both old pictures have in the middle near the new middle."""
+    focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
+    seen = []
+    for camera, R in zip(cameras, rotations):
+        h, w = camera.hw
+        middle = camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2])
+        ray = R @ camera.rays(middle)[0]
+        seen.append(ray[:2] / ray[2])
+    centre = intrinsics(1.0, hw).to(focal)[:2, 2] - focal * torch.stack(seen).mean(0)
+    return torch.cat([torch.cat([focal * torch.eye(2).to(focal), centre[:, None]], 1), focal.new_tensor([[0, 0, 1.0]])])

@@ -1,0 +1,197 @@
+"""The command line: `pat ...`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import tyro
+from rich.console import Console
+from rich.progress import track
+from tyro.conf import UseAppendAction, arg
+
+from arraygeom import (
+    Dense,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    ReceptiveField,
+    Rectified,
+    Rig,
+)
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from .fuse import FusedFrame, Tile
+
+FIELDS: dict[str, Callable[[], ReceptiveField]] = {
+    "epipolar": Epipolar,
+    "line": EpipolarLine,
+    "homography": HomographyDisplacement,
+    "rectified": Rectified,
+    "nearest": NearestVoxels,
+    "local": Local,
+    "dense": Dense,
+}
+FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
+
+console = Console(stderr=True, highlight=False)
+
+
+@dataclass
+class Demo:
+    """Fuse the sample array of the package; write picture, depth, confidence and a figure, print the figures of merit."""
+
+    out: Path = Path("out/demo")
+    """Folder for the results."""
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .demo import ALPHA, BETA, classical, load_sample, report_figure
+        from .metrics import score
+        from .results import save_frame
+
+        sample = load_sample()
+        console.print("classical baseline: semi-global matching, warped colour, guided filter")
+        baseline = classical(sample.rig, sample.images, ALPHA, BETA)
+        console.print(f"fusion with the weights '{self.weights}'")
+        frame = fuse_frame(self.weights, sample.rig, sample.images, alpha=ALPHA)
+        written = save_frame(frame, self.out)
+        report_figure(sample, baseline, frame, self.out / "demo.png")
+        print("                 PSNR    SSIM")
+        rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
+        for name, picture in rows.items():
+            psnr, ssim = score(picture.clamp(0, 1), sample.truth)
+            print(f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}")
+        console.print(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
+
+
+@dataclass
+class Fuse:
+    """Fuse one frame: a rig file and a picture of each camera in, one picture at alpha's view out.
+
+    Example: pat fuse --rig rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
+    """
+
+    rig: Path
+    """Rig file: cameras, poses, depth range."""
+    alpha: str
+    """The camera whose view is wanted."""
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each camera."""
+    depth: tuple[float, float] | None = None
+    """Near and far bounds in metres, instead of the rig's; far may be inf."""
+    out: Path = Path("out")
+    """Folder for fused.png, confidence.png, depth.tif and depth.png."""
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+    field: FieldName = "auto"
+    """Where to look in the other cameras; auto takes what the rig allows."""
+    max_memory: str | None = None
+    """Working memory allowed, like 4GiB; larger frames are fused in tiles."""
+    match_levels: bool = False
+    """Bring every beta to alpha's brightness and contrast first (other exposures, filters)."""
+    bits: Literal[8, 16] = 8
+    """Bits a channel of fused.png."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .fuse import parse_bytes
+        from .images import read_image
+        from .results import save_frame
+
+        rig = Rig.load(self.rig)
+        files = dict(_name_and_file(text) for text in self.image)
+        if len(files) < len(self.image):
+            raise ValueError("--image: a camera is given twice; give each camera one picture")
+        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        if self.max_memory is not None:
+            parse_bytes(self.max_memory)
+        frame = fuse_frame(
+            self.weights,
+            rig,
+            images,
+            alpha=self.alpha,
+            depth=self.depth,
+            field=None if self.field == "auto" else FIELDS[self.field](),
+            max_memory=self.max_memory,
+            match_levels=self.match_levels,
+        )
+        console.print(f"written: {', '.join(map(str, save_frame(frame, self.out, bits=self.bits)))}")
+
+
+@dataclass
+class Show:
+    """Draw a rig and where some alpha pixels look in the other cameras."""
+
+    rig: Annotated[Path, arg(name="")]
+    """Rig file."""
+    alpha: str | None = None
+    """The camera to look from; by default the first."""
+    image: UseAppendAction[tuple[str, ...]] = ()
+    """NAME=FILE: pictures to draw on, if wanted."""
+    out: Path = Path("rig.png")
+    """Picture to write."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .images import read_image
+        from .show import show_rig
+
+        rig = Rig.load(self.rig)
+        files = dict(_name_and_file(text) for text in self.image)
+        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        show_rig(rig, self.alpha or rig.names[0], images, self.out)
+        console.print(f"written: {self.out}")
+
+
+Command = (
+    Annotated[Demo, tyro.conf.subcommand("demo")]
+    | Annotated[Fuse, tyro.conf.subcommand("fuse")]
+    | Annotated[Show, tyro.conf.subcommand("show")]
+)
+
+
+def fuse_frame(weights: str, rig: Rig, images: dict[str, Tensor], **options: Any) -> FusedFrame:
+    """`pat.fuse.fuse` with named weights, and a bar on the terminal."""
+    from .fuse import fuse
+    from .weights import load_weights
+
+    def bar(tiles: Iterable[Tile], total: int) -> Iterable[Tile]:
+        return track(tiles, "fusing", total=total, console=console)
+
+    return fuse(load_weights(weights), rig, images, progress=bar, **options)
+
+
+def _name_and_file(text: str) -> tuple[str, Path]:
+    name, separator, path = text.partition("=")
+    if not (name and separator and path):
+        raise ValueError(f"--image: '{text}' is not NAME=FILE, such as mono=a.png")
+    return name, Path(path)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Run `pat`. Errors in what was given are one line on standard error, and exit status 2."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    debug = "--debug" in arguments
+    command = tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="pat",
+        description="Fuse the pictures of an array of unlike cameras into one. Add --debug for a traceback of an error.",
+        args=[a for a in arguments if a != "--debug"],
+    )
+    try:
+        command.run()
+    except (ValueError, OSError) as error:
+        if debug:
+            raise
+        console.print(f"pat: {error}", style="red", markup=False, soft_wrap=True)
+        sys.exit(2)

@@ -1,0 +1,313 @@
+"""Whole frames: a rig and one picture a camera in, one fused picture out.
+
+Frames too large for the memory allowed are fused in tiles of alpha, each with just the part of every beta that
+its segments touch, and a halo as wide as the network sees. Tiled and whole results are equal to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate, pad
+
+from arraygeom import (
+    Epipolar,
+    HomographyDisplacement,
+    Pair,
+    Positions,
+    ReceptiveField,
+    Rectified,
+    Rig,
+    Segments,
+    apply_homography,
+    depth_from_track,
+    pixel_grid,
+)
+from arraygeom.fields import pinhole_track
+from arraygeom.pixels import HW
+
+from .images import luminance
+from .model import Fused, FusionNetwork, Look
+
+Progress = Callable[[Iterable["Tile"], int], Iterable["Tile"]]
+"""Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
+
+
+class FusedFrame(NamedTuple):
+    """A fused frame at alpha's view.
+
+    image: (C, H, W), in alpha's coding, not cut to 0..1.
+    depth: (H, W), metres along alpha's axis; NaN where no calibrated beta tells it.
+    confidence: (H, W), 0 to 1: that every band's beta sees the point, and that it is known where.
+    """
+
+    image: Float[Tensor, "c h w"]
+    depth: Float[Tensor, "h w"]
+    confidence: Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class Beta:
+    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look."""
+
+    picture: Tensor
+    pair: Pair
+    look: Look
+
+
+class Tile(NamedTuple):
+    """Rows and columns of the output, and of alpha's picture that they need: (top, bottom, left, right)."""
+
+    inner: tuple[int, int, int, int]
+    outer: tuple[int, int, int, int]
+
+
+def fuse(
+    network: FusionNetwork,
+    rig: Rig,
+    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    *,
+    alpha: str,
+    depth: tuple[float, float] | None = None,
+    field: ReceptiveField | None = None,
+    max_memory: float | str | None = None,
+    match_levels: bool = False,
+    progress: Progress | None = None,
+) -> FusedFrame:
+    """Fuse one frame at the view of camera `alpha`.
+
+    Args:
+        network: `load_weights("mono-colour")`, say.
+        rig: the cameras. Those without a picture in `images` are left out.
+        images: by camera name, (C, H, W) in 0..1, each of the size that the rig states.
+        alpha: the camera whose view is wanted.
+        depth: (near, far) in metres, instead of the rig's.
+        field: where to look; by default the depth-bounded epipolar segment of calibrated cameras, the run of the
+            epipolar line around H x of those known by F, and a row of beta of those known only by size.
+        max_memory: bytes, or like "4GiB"; about what the work may take on top of the pictures. Default: no limit.
+        match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
+            filters differ and which are not radiometrically calibrated.
+        progress: shows the tiles as they are done.
+
+    Raises:
+        ValueError: a camera that the rig lacks, a picture of another size, a rig whose views do not overlap.
+    """
+    rig = rig if depth is None else rig.replace(depth=depth)
+    _check(rig, images, alpha)
+    own = _grey(images[alpha])[None]
+    betas = [
+        _prepare(network, rig.pair(alpha, name), images[name][None], field, own if match_levels else None, name)
+        for name in rig.betas(alpha)
+        if name in images
+    ]
+    hw = rig[alpha].hw
+    tiles = plan(network, hw, betas, None if max_memory is None else parse_bytes(max_memory))
+    frame = [torch.empty(0)] * 3
+    for tile in progress(tiles, len(tiles)) if progress else tiles:
+        parts = _fuse_tile(network, own, betas, tile)
+        if len(tiles) == 1:
+            frame = list(parts)
+            break
+        if not frame[0].numel():
+            frame = [part.new_empty(*part.shape[:-2], *hw) for part in parts]
+        top, bottom, left, right = tile.inner
+        for whole, part in zip(frame, parts):
+            whole[..., top:bottom, left:right] = part
+    return FusedFrame(*frame)
+
+
+def default_field(pair: Pair) -> ReceptiveField:
+    """The field that what is known of a pair allows."""
+    if pair.link is not None:
+        return HomographyDisplacement(0.06 * max(pair.beta.hw))
+    if pair.calibrated:
+        return Epipolar()
+    return Rectified(alpha_is="either", max_disparity=0.12 * pair.beta.hw[1])
+
+
+def plan(network: FusionNetwork, hw: HW, betas: list[Beta], limit: float | None) -> list[Tile]:
+    """The largest tiles whose work stays under `limit` bytes; one tile if the whole frame does.
+
+    Raises ValueError if not even a tile of 64 pixels does.
+    """
+    per_pixel = network.bytes_per_pixel * (
+        1 + sum(b.picture.shape[-1] * b.picture.shape[-2] for b in betas) / math.prod(hw)
+    )
+    if limit is None or per_pixel * math.prod(hw) <= limit:
+        return [Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))]
+    side = int(math.sqrt(limit / per_pixel)) - 2 * network.halo
+    side = side // network.multiple * network.multiple
+    if side < 64:
+        least = per_pixel * (64 + 2 * network.halo) ** 2
+        raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this network needs at least {least / 2**20:.0f} MiB")
+    return list(tiles_of(hw, side, network.halo))
+
+
+def tiles_of(hw: HW, side: int, halo: int) -> Iterator[Tile]:
+    """Square tiles with a halo, cut off at the frame's borders."""
+    h, w = hw
+    for top in range(0, h, side):
+        for left in range(0, w, side):
+            bottom, right = min(top + side, h), min(left + side, w)
+            outer = (max(top - halo, 0), min(bottom + halo, h), max(left - halo, 0), min(right + halo, w))
+            yield Tile((top, bottom, left, right), outer)
+
+
+def parse_bytes(amount: float | str) -> float:
+    """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
+    if not isinstance(amount, str):
+        return float(amount)
+    units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+    number = amount.rstrip("BbKkMmGgIi ")
+    unit = amount[len(number) :].strip().upper() or "B"
+    try:
+        return float(number) * units[unit]
+    except (KeyError, ValueError):
+        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB") from None
+
+
+def _check(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
+    rig.known(alpha)
+    for name, image in images.items():
+        h, w = rig[name].hw
+        if tuple(image.shape[1:]) != (h, w):
+            got = f"{image.shape[2]}x{image.shape[1]}"
+            raise ValueError(
+                f"the picture of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right picture"
+            )
+        if not torch.isfinite(image).all():
+            raise ValueError(f"the picture of '{name}' has NaN or infinite values")
+    if alpha not in images:
+        raise ValueError(f"no picture of alpha, '{alpha}'")
+    if not set(images) - {alpha}:
+        raise ValueError(f"no picture of any other camera than alpha, '{alpha}': fusion needs at least one beta")
+
+
+def _grey(picture: Tensor) -> Tensor:
+    return luminance(picture) if picture.shape[0] == 3 else picture
+
+
+def _prepare(
+    network: FusionNetwork, pair: Pair, picture: Tensor, field: ReceptiveField | None, levels: Tensor | None, name: str
+) -> Beta:
+    """A beta at the pitch that the network wants, its field checked to reach it somewhere."""
+    if network.equal_pitch:
+        pair, picture = _at_equal_pitch(pair, picture)
+    if levels is not None:
+        picture = (picture - picture.mean()) / picture.std().clamp(min=1e-6) * levels.std() + levels.mean()
+    look = Look.along(field or default_field(pair), pair)
+    if not _reaches(look, pair):
+        bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
+        raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
+    return Beta(picture, pair, look)
+
+
+def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
+    """Beta resized so that where the views meet its pixels are about the size of alpha's."""
+    scale = pitch_ratio(pair)
+    if 0.8 < scale < 1.25:
+        return pair, picture
+    hw = (max(round(pair.beta.hw[0] / scale), 16), max(round(pair.beta.hw[1] / scale), 16))
+    picture = interpolate(picture, size=hw, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
+    return pair.resize_beta(hw), picture
+
+
+def pitch_ratio(pair: Pair) -> float:
+    """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if undefined."""
+    h, w = pair.alpha.hw
+    middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
+    steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
+    x, valid = apply_homography(pair.homography.double(), steps)
+    area = abs(float(torch.linalg.det(x[1:] - x[:1])))
+    return math.sqrt(area) if bool(valid.all()) and area > 0 else 1.0
+
+
+def _reaches(look: Look, pair: Pair) -> bool:
+    found = look.at(pixel_grid(pair.alpha.hw)[::8, ::8].reshape(-1, 2))
+    return bool((found.mask if isinstance(found, Positions) else found.valid).any())
+
+
+def _fuse_tile(network: FusionNetwork, alpha: Tensor, betas: list[Beta], tile: Tile) -> FusedFrame:
+    """The inner part of a tile."""
+    top, bottom, left, right = tile.outer
+    pieces = [_strip(b, tile.outer, network) for b in betas]
+    pictures = [_padded(p.picture, network.multiple) for p in pieces]
+    with torch.no_grad():
+        fused = network(
+            _padded(alpha[..., top:bottom, left:right], network.multiple), pictures, [p.look for p in pieces]
+        )
+    image = fused.image[0, :, : bottom - top, : right - left]
+    depth, confidence = _depth(fused, pieces, (bottom - top, right - left), (left, top))
+    rows = slice(tile.inner[0] - top, tile.inner[1] - top)
+    columns = slice(tile.inner[2] - left, tile.inner[3] - left)
+    return FusedFrame(image[:, rows, columns], depth[rows, columns], confidence[rows, columns])
+
+
+@dataclass(frozen=True)
+class Strip:
+    """The part of a beta that a tile needs. `look` maps the tile's pixels to the strip's; `offset` is its corner."""
+
+    picture: Tensor
+    look: Look
+    pair: Pair
+    offset: tuple[int, int]
+
+
+def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) -> Strip:
+    top, bottom, left, right = outer
+    corner = torch.tensor([float(left), float(top)])
+    x = pixel_grid((bottom - top, right - left)) + corner
+    y0, y1, x0, x1 = _touched(beta.look.at(x[::2, ::2].reshape(-1, 2)), beta.pair.beta.hw, network)
+    shift = torch.tensor([float(x0), float(y0)])
+
+    def at(x: Tensor) -> Segments | Positions:
+        found = beta.look.at(x + corner.to(x))
+        if isinstance(found, Positions):
+            return Positions(found.xy - shift, found.mask)
+        return Segments(found.start - shift, found.end - shift, found.valid)
+
+    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples), beta.pair, (x0, y0))
+
+
+def _touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
+    """(top, bottom, left, right) of the part of beta that is looked at, with a halo; aligned to `multiple`."""
+    if isinstance(found, Positions):
+        points = found.xy[found.mask]
+    else:
+        points = torch.cat([found.start[found.valid], found.end[found.valid]])
+    if not len(points):
+        return 0, network.multiple, 0, network.multiple
+    low, high = points.amin(0) - network.beta_halo, points.amax(0) + network.beta_halo
+    m = network.multiple
+    (x0, y0), (x1, y1) = (torch.div(v, m, rounding_mode="floor").long() * m for v in (low, high + m))
+    return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
+
+
+def _padded(picture: Tensor, multiple: int) -> Tensor:
+    """The picture continued at the bottom and the right to whole multiples."""
+    h, w = picture.shape[-2:]
+    return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
+
+
+def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -> tuple[Tensor, Tensor]:
+    """Depth by the betas that are calibrated, weighted by confidence in inverse depth; confidence, the least."""
+    h, w = hw
+    x = (pixel_grid(hw) + torch.tensor([float(v) for v in corner])).reshape(-1, 2)
+    total, weights = torch.zeros(2, h, w)
+    for piece, position, confidence in zip(pieces, fused.position, fused.confidence):
+        if piece.pair.link is not None or not piece.pair.calibrated:
+            continue
+        seen = position[0, :, :h, :w].movedim(0, -1) + torch.tensor([float(v) for v in piece.offset])
+        found = depth_from_track(pinhole_track(piece.pair, x), seen.reshape(-1, 2))
+        weight = torch.where(found.valid.reshape(h, w), confidence[0, :h, :w] + 1e-6, 0.0)
+        total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
+        weights = weights + weight
+    known = weights > 0
+    depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
+    return depth, torch.stack([c[0, :h, :w] for c in fused.confidence]).amin(0)

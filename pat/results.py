@@ -1,0 +1,39 @@
+"""What a fusion leaves on disk."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib import colormaps
+from torch import Tensor
+
+from .fuse import FusedFrame
+from .images import write_image
+
+
+def save_frame(frame: FusedFrame, out: Path, *, bits: int = 8) -> list[Path]:
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN as 0) and depth.png (near is bright).
+
+    Each file appears whole or not at all. Without any known depth there are no depth files. Returns what was written.
+    """
+    written = [out / "fused.png", out / "confidence.png"]
+    write_image(written[0], frame.image, bits=bits)
+    write_image(written[1], frame.confidence[None])
+    if frame.depth.isfinite().any():
+        written += [out / "depth.tif", out / "depth.png"]
+        write_image(written[2], frame.depth.nan_to_num(0.0)[None], bits=32)
+        write_image(written[3], colour_depth(frame.depth))
+    return written
+
+
+def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
+    """Inverse depth in colours, from its 1st to its 99th percentile; unknown depth is black."""
+    known = depth.isfinite()
+    inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
+    low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
+    scaled = ((inverse - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
+    colours = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)
+    return torch.where(known, colours, 0.0)

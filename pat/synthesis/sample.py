@@ -1,0 +1,60 @@
+"""Makes the sample array that ships in pat/sample: `python -m pat.synthesis.sample --photos DIR`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import torch
+import tyro
+
+from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, rotation_from_vector
+from pat.demo import ALPHA, BETA, SAMPLE
+from pat.images import luminance, write_image
+from pat.sensors import Clip, Noise, Quantise, record
+
+from .layered import LayeredScenes
+from .photos import PhotoBank
+from .rigs import RigBatch
+
+HW = (400, 640)
+
+
+def sample_rig() -> Rig:
+    """A mono alpha and, 12 cm to its right and a little above, a wider colour camera, turned and toed in."""
+    turned = rotation_from_vector(torch.tensor([0.6, -1.5, 2.0], dtype=torch.float64) * math.pi / 180)
+    centre = torch.tensor([0.12, -0.03, 0.01], dtype=torch.float64)
+    mono = Camera(K=intrinsics(820.0, HW), cam_from_world=Pose.identity(), hw=HW, sensor=Sensor(response="mono"))
+    colour = Camera(
+        K=intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)),
+        cam_from_world=Pose.from_centre(turned, centre),
+        hw=(360, 560),
+        sensor=Sensor(response="rgb"),
+    )
+    return Rig({ALPHA: mono, BETA: colour}, depth=(1.4, 20.0), name="sample: mono + colour")
+
+
+def main(photos: tuple[Path, ...], out: Path = SAMPLE, seed: int = 7) -> None:
+    """Render a layered scene with the sample rig, record it, and write rig, pictures and truth."""
+    rig = sample_rig()
+    generator = torch.Generator().manual_seed(seed)
+    scenes = LayeredScenes(PhotoBank.load(*photos), None, hw=HW, layers=(9, 12), seed=seed)  # type: ignore[arg-type]
+    near, far = (torch.tensor([d], dtype=torch.float64) for d in (1.6, 16.0))
+    cameras = [_batched(rig[name]) for name in rig.names]
+    views = scenes.render(RigBatch(cameras, near, far), generator, oversampling=2)
+    truth, seen = views.images
+    mono = record(luminance(truth), [Noise(8000, 3), Clip(), Quantise(8)], generator).image
+    colour = record(seen, [Noise(4000, 3), Clip(), Quantise(8)], generator).image
+    out.mkdir(parents=True, exist_ok=True)
+    rig.save(out / "rig.yaml")
+    for name, picture in {ALPHA: mono, BETA: colour, "truth": truth}.items():
+        write_image(out / f"{name}.png", picture[0])
+
+
+def _batched(camera: Camera) -> Camera:
+    pose = Pose(camera.R[None], camera.t[None])
+    return camera.replace(K=camera.K[None], cam_from_world=pose)
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,164 @@
+import dataclasses
+
+import pytest
+import torch
+
+from arraygeom import Camera, Curved, Distortion, Epipolar, Pair, Pose, Rig, intrinsics, look, rotation_from_vector
+from arraygeom.pixels import pixel_grid
+from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
+
+FISHEYE = Distortion("kannala-brandt", torch.tensor([0.1, -0.05, 0.02, -0.004], dtype=torch.float64))
+BARREL = Distortion("brown-conrady", torch.tensor([-0.28, 0.07, 1e-3, -5e-4], dtype=torch.float64))
+
+
+def with_lenses(rig: Rig, alpha: Distortion | None, beta: Distortion | None) -> Rig:
+    rig = rig.with_camera("alpha", rig["alpha"].replace(distortion=alpha))
+    return rig.with_camera("beta", rig["beta"].replace(distortion=beta))
+
+
+def fisheye_rig() -> Rig:
+    """Two fisheyes of about 150 degrees, 480 x 400 and 400 x 360 pixels, strongly curved lines."""
+
+    def camera(hw: tuple[int, int], focal: float, w: list[float], centre: list[float]) -> Camera:
+        R = rotation_from_vector(torch.tensor(w, dtype=torch.float64))
+        pose = Pose.from_centre(R, torch.tensor(centre, dtype=torch.float64))
+        return Camera(K=intrinsics(focal, hw), cam_from_world=pose, hw=hw, distortion=FISHEYE)
+
+    cameras = {
+        "alpha": camera((400, 480), 180.0, [0, 0, 0], [0, 0, 0]),
+        "beta": camera((360, 400), 150.0, [0.1, -0.15, 0.2], [0.4, 0.25, 0.1]),
+    }
+    return Rig(cameras, depth=(0.5, 8.0))
+
+
+def distance_to_polyline(points: torch.Tensor, line: torch.Tensor) -> torch.Tensor:
+    """From points (n, k, 2) to polylines (n, l, 2)."""
+    a, b = line[:, None, :-1], line[:, None, 1:]
+    step = b - a
+    s = ((points[:, :, None] - a) * step).sum(-1) / step.square().sum(-1).clamp(min=1e-12)
+    foot = a + s.clamp(0, 1)[..., None] * step
+    return (points[:, :, None] - foot).norm(dim=-1).amin(-1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_points_at_twenty_depths_lie_on_the_curve(dtype):
+    rig = fisheye_rig()
+    pair = rig.pair("alpha", "beta")
+    x = pixel_grid((400, 480), dtype=torch.float64)[10::23, 7::29].reshape(-1, 2)
+    near, far = rig.depth
+    depth = 1 / torch.linspace(1 / float(far), 1 / float(near), 20, dtype=torch.float64)
+    seen = [rig["beta"].project(rig["alpha"].unproject(x, d.expand(len(x)))) for d in depth]
+    xy = torch.stack([s.x for s in seen], 1)
+    visible = torch.stack([s.valid & rig["beta"].contains(s.x) for s in seen], 1)
+    positions = Curved()(pair, x.to(dtype))
+    wanted = visible.any(-1)
+    assert wanted.sum() > 100
+    assert positions.mask.any(-1)[visible.sum(-1) > 1].all()
+    whole = positions.mask.all(-1) & wanted
+    off = distance_to_polyline(xy[whole], positions.xy[whole].double())[visible[whole]]
+    assert off.max() < 0.05
+    # the lines are truly curved: straight segments between the ends would miss
+    chord = positions.xy[whole][:, [0, -1]].double()
+    assert distance_to_polyline(xy[whole], chord)[visible[whole]].max() > 4
+
+
+def test_spacing_is_even_in_pixels():
+    pair = fisheye_rig().pair("alpha", "beta")
+    x = pixel_grid((400, 480), dtype=torch.float64)[10::23, 7::29].reshape(-1, 2)
+    p = Curved(64)(pair, x)
+    steps = p.xy.diff(dim=-2).norm(dim=-1)[p.mask.all(-1)]
+    long = steps.sum(-1) > 10
+    assert ((steps / steps.mean(-1, keepdim=True))[long] - 1).abs().max() < 0.1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_without_lenses_it_is_the_epipolar_segment(seed):
+    pair = random_rig(seed).pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::5, ::5]
+    curved, straight = Curved(32)(pair, x), Epipolar()(pair, x)
+    assert torch.equal(curved.mask[..., 16], straight.valid)
+    expected = straight.positions(32)
+    off = (curved.xy - expected.xy).norm(dim=-1)[straight.valid]
+    assert off.max() < 0.05
+
+
+def test_brown_conrady_rigs_hold_what_is_seen():
+    rig = with_lenses(random_rig(2), BARREL, BARREL)
+    pair = rig.pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::5, ::5].reshape(-1, 2)
+    depth = torch.full((len(x),), 3.0, dtype=torch.float64)
+    seen = rig["beta"].project(rig["alpha"].unproject(x, depth))
+    positions = Curved()(pair, x)
+    both = seen.valid & rig["beta"].contains(seen.x) & positions.mask.all(-1)
+    assert both.sum() > 50
+    assert distance_to_polyline(seen.x[both][:, None], positions.xy[both]).max() < 0.05
+
+
+def test_gradients_in_every_parameter_lenses_included():
+    rig = with_lenses(random_rig(3), BARREL, FISHEYE)
+    x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
+    zero = torch.zeros(3, dtype=torch.float64)
+    cameras = [rig[n] for n in ("alpha", "beta")]
+    numbers = [v for c in cameras for v in (c.K, zero, c.t, c.distortion.coefficients)]
+    numbers = [v.detach().clone().requires_grad_() for v in (*numbers, *rig.depth)]
+
+    def positions(*numbers):
+        moved = [
+            c.replace(
+                K=K,
+                cam_from_world=Pose(rotation_from_vector(w) @ c.R, t),
+                distortion=dataclasses.replace(c.distortion, coefficients=k),
+            )
+            for c, (K, w, t, k) in zip(cameras, (numbers[:4], numbers[4:8]))
+        ]
+        p = Curved(4, nodes=8)(Pair(*moved, (numbers[8], numbers[9])), x)
+        return p.xy[p.mask]
+
+    assert positions(*numbers).numel() == 8
+    assert torch.autograd.gradcheck(positions, numbers, atol=1e-4, rtol=1e-4, fast_mode=True)
+
+
+@pytest.mark.parametrize("lens", [None, BARREL, FISHEYE], ids=["pinhole", "barrel", "fisheye"])
+@pytest.mark.parametrize("centre", [(0, 0, 0), (0, 0, 0.5), (0, 0, 5.0), (0.3, 0, 0)])
+@pytest.mark.parametrize("turned", [False, True])
+def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
+    rig = two_cameras(half_turn() if turned else None, centre=centre, depth=(1.0, float("inf")))
+    rig = with_lenses(rig, lens, lens)
+    changes = rig.parameters(free=["*.rotation", "*.translation", "*.focal", "*.centre", "depth.near"])
+    for dtype in (torch.float32, torch.float64):
+        p = look(Curved(16), rig.perturbed(changes).pair("alpha", "beta"), pixel_grid((48, 64), dtype=dtype)[::4, 1::4])
+        assert p.xy.isfinite().all()
+        slopes = torch.autograd.grad(p.xy.sum(), list(changes.values()), allow_unused=True)
+        assert all(s is None or s.isfinite().all() for s in slopes)
+
+
+def test_identical_cameras_look_at_the_same_pixel():
+    rig = with_lenses(two_cameras(), FISHEYE, FISHEYE)
+    x = pixel_grid((48, 64))
+    p = look(Curved(8), rig.pair("alpha", "beta"))
+    assert p.mask.all()
+    torch.testing.assert_close(p.xy, x[..., None, :].expand(48, 64, 8, 2), atol=1e-3, rtol=0)
+
+
+def test_batched_rigs_agree_with_single_ones():
+    rigs = [with_lenses(random_rig(i), FISHEYE, None) for i in range(2)]
+    g = torch.Generator().manual_seed(0)
+    x = uniform(g, 5, 40, 2, 6, 2)
+
+    def stacked(name: str) -> Camera:
+        cameras = [r[name] for r in rigs]
+        pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
+        return cameras[0].replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose)
+
+    batch = Rig({n: stacked(n) for n in ("alpha", "beta")}, depth=rigs[0].depth)
+    together = Curved(8)(batch.pair("alpha", "beta"), x)
+    shared = Curved(8)(batch.pair("alpha", "beta"), x[:1])
+    for i, rig in enumerate(rigs):
+        alone = Curved(8)(rig.pair("alpha", "beta"), x[i])
+        torch.testing.assert_close(together.xy[i], alone.xy)
+        torch.testing.assert_close(shared.xy[i], Curved(8)(rig.pair("alpha", "beta"), x[0]).xy)
+
+
+def test_straight_fields_refuse_lenses():
+    with pytest.raises(ValueError, match="use Curved"):
+        look(Epipolar(), fisheye_rig().pair("alpha", "beta"))
