@@ -175,7 +175,7 @@ def chessboard(path: Path) -> torch.Tensor | None:
 
 
 def test_kalibr_fisheyes(shared_data):
-    """The file states every pose twice, and the pair's frames show one scene: medians of 0.3 px are usual."""
+    """The file states every pose twice, and the pair's frames show one scene: the median is 0.34 px."""
     folder = shared_data / "rigs" / "kalibr_hilti_5cam"
     path = folder / "calibration" / "calib_3_cam0-1-camchain-imucam.yaml"
     rig = read_rig(path)
@@ -183,11 +183,8 @@ def test_kalibr_fisheyes(shared_data):
     assert relative.t.tolist() == pytest.approx([0.10817339, 0.00051284, 0.00069196], abs=1e-6)
     assert float(rig["cam0"].centre.dist(rig["cam1"].centre)) == pytest.approx(0.108, abs=1e-3)
     assert rig["cam1"].distortion.model == "kannala-brandt"
-    frames = sorted(folder.glob("rig_frames/*_0.png"))
-    if frames:
-        xa, xb = matches(frames[0], frames[0].with_name(frames[0].name.replace("_0.", "_1.")))
-        median = epipolar_errors(rig["cam0"], rig["cam1"], xa, xb).median()
-    assert median < 0.6
+    xa, xb = matches(folder / "rig_frames" / "0_0.png", folder / "rig_frames" / "0_1.png")
+    assert epipolar_errors(rig["cam0"], rig["cam1"], xa, xb).median() < 0.6
 
 
 def test_kitti(shared_data):
@@ -200,8 +197,7 @@ def test_kitti(shared_data):
     folder = shared_data / "kitti" / "object_StereoRCNN"
     rig = read_quietly(folder / "calib.txt", hw=(375, 1242))
     xa, xb = matches(folder / "left.png", folder / "right.png")
-    median = epipolar_errors(rig["cam2"], rig["cam3"], xa, xb).median()
-    assert median < 0.6
+    assert epipolar_errors(rig["cam2"], rig["cam3"], xa, xb).median() < 0.6
 
 
 def test_opencv_intrinsics(shared_data):
