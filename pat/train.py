@@ -29,7 +29,7 @@ from .sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment,
 from .synthesis.layered import ArrayBatch, LayeredScenes
 from .synthesis.photos import PhotoBank
 from .synthesis.rigs import RigDistribution
-from .weights import save_weights
+from .weights import load_weights, save_weights
 
 PAPER = 0.3
 """In this share of the batches, one of the paper's four degradations on top."""
@@ -41,7 +41,7 @@ KEPT = 48
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """A recipe. Photographs are read from the folders; nothing else is needed.
+    """A recipe. Photographs are read from the folders; `start`, if given, is a file of weights to go on from.
 
     `steps` of `batch` scenes whose alpha is `hw`, or as many as fit into `minutes`; Adam at `rate`, down to nothing
     along a half cosine. Each batch of scenes is recorded `reuse` times, at random moments, differently. The
@@ -52,6 +52,7 @@ class TrainConfig:
 
     photos: tuple[Path, ...]
     out: Path = Path("runs/mono-colour")
+    start: Path | None = None
     network: GuidedPATConfig = field(default_factory=GuidedPATConfig)
     steps: int = 4000
     minutes: float = float("inf")
@@ -84,6 +85,8 @@ def train(config: TrainConfig) -> Path:
     torch.manual_seed(config.seed)
     config.out.mkdir(parents=True, exist_ok=True)
     network = GuidedPAT(config.network)
+    if config.start is not None:
+        network.load_state_dict(load_weights(config.start).state_dict())
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
     averaged = cast(GuidedPAT, average.module)
     adam = torch.optim.Adam(network.parameters(), lr=config.rate, betas=(0.9, 0.99))
