@@ -204,7 +204,7 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
 def truth_in(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
     """Where alpha's pixels are in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w)."""
     hw = pair.alpha.hw
-    track = pinhole_track(pair, pixel_grid(hw).reshape(-1, 2))
+    track = pinhole_track(pair, pixel_grid(hw).reshape(1, -1, 2))
     z = depth.reshape(len(depth), -1)
     x = track.at(1 / z)
     expected = (track.a[..., 2] + track.b[..., 2] / z) * z

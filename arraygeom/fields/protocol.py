@@ -32,17 +32,31 @@ def look(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"] | None = No
 
 
 def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], Look]:
-    """The field as a function of alpha pixels alone, which attention calls chunk by chunk."""
-    return lambda x: field(pair, x)
+    """The field as a function of alpha pixels (n, 2) alone, which attention calls chunk by chunk.
+
+    For a batch of rigs it answers for each of them, (*b, n).
+    """
+    axes = _batch_axes(pair)
+    return lambda x: field(pair, x.reshape(*[1] * axes, *x.shape))
 
 
 def all_pixels(pair: Pair) -> Float[Tensor, "*b h w 2"]:
     """Alpha's pixel centres, float32, with the axes of a batch of rigs (of length 1) in front."""
-    known = pair.alpha.K if isinstance(pair.alpha, Camera) else pair.link.F if pair.link is not None else None
-    device = None if known is None else known.device
-    axes = 0 if known is None else known.ndim - 2
-    grid = pixel_grid(pair.alpha.hw, device=device)
-    return grid.reshape(*[1] * axes, *grid.shape)
+    known = _numbers(pair)
+    grid = pixel_grid(pair.alpha.hw, device=None if known is None else known.device)
+    return grid.reshape(*[1] * _batch_axes(pair), *grid.shape)
+
+
+def _numbers(pair: Pair) -> Tensor | None:
+    """A matrix of the pair, if it has any."""
+    if isinstance(pair.alpha, Camera):
+        return pair.alpha.K
+    return None if pair.link is None else pair.link.F
+
+
+def _batch_axes(pair: Pair) -> int:
+    known = _numbers(pair)
+    return 0 if known is None else known.ndim - 2
 
 
 CHUNK = 1 << 15
