@@ -1,0 +1,122 @@
+"""The command line: it does the main job, and what is wrong is one line and exit status 2."""
+
+import shutil
+
+import pytest
+import torch
+import yaml
+
+from pat.cli import main
+from pat.demo import SAMPLE, load_sample
+from pat.images import read_image, write_image
+from pat.metrics import score
+
+
+@pytest.fixture
+def small(tmp_path):
+    """The sample array, its rig and pictures cut small so that fusing takes a moment."""
+    sample = load_sample()
+    rig = sample.rig
+    for name in rig.names:
+        image = sample.images[name][:, :96, :128]
+        rig = rig.crop(name, 0, 0, (96, 128))
+        write_image(tmp_path / f"{name}.png", image)
+    rig.save(tmp_path / "rig.yaml")
+    return tmp_path
+
+
+def arguments(folder, **changes):
+    given = {"rig": folder / "rig.yaml", "alpha": "mono", "mono": folder / "mono.png", "colour": folder / "colour.png"}
+    given |= changes
+    images = [a for name in ("mono", "colour") for a in ("--image", f"{name}={given[name]}")]
+    extra = given.get("extra", [])
+    rig = ["--rig", str(given["rig"]), "--alpha", given["alpha"], "--out", str(folder / "out")]
+    return ["fuse", *rig, *map(str, images), *extra]
+
+
+def fails(arguments, capsys) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 2
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_fuse_writes_everything(small):
+    main(arguments(small))
+    assert sorted(p.name for p in (small / "out").iterdir()) == ["confidence.png", "depth.png", "depth.tif", "fused.png"]
+    assert read_image(small / "out" / "fused.png").shape == (3, 96, 128)
+
+
+def test_demo_beats_alpha_alone(tmp_path, capsys):
+    main(["demo", "--out", str(tmp_path)])
+    sample = load_sample()
+    alone = score(sample.images["mono"].expand(3, -1, -1), sample.truth)
+    fused = score(read_image(tmp_path / "fused.png"), sample.truth)
+    assert fused.psnr > alone.psnr + 5
+    assert fused.ssim > alone.ssim
+    assert "classical" in capsys.readouterr().out
+    assert (tmp_path / "demo.png").is_file()
+
+
+def test_help_names_the_commands(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main(["--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    assert all(command in text for command in ("demo", "fuse", "show"))
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mono": "/none.png"}, "mono: /none.png"),
+        ({"alpha": "momo"}, "no camera 'momo'; did you mean 'mono'"),
+        ({"rig": "/none.yaml"}, "/none.yaml: no such rig file"),
+        ({"extra": ["--depth", "20", "2"]}, "0 < near <= far"),
+        ({"extra": ["--depth", "-1", "2"]}, "0 < near <= far"),
+        ({"extra": ["--max-memory", "lots"]}, "max_memory is 'lots'"),
+        ({"extra": ["--image", "tele=x.png"]}, "no camera 'tele'"),
+        ({"extra": ["--weights", "mono-color"]}, "no weights 'mono-color'"),
+        ({"mono": SAMPLE / "mono.png"}, "'mono' is 640x400, the rig says 128x96"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, capsys):
+    assert message in fails(arguments(small, **changes), capsys)
+    assert not (small / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("edit", "message"),
+    [
+        (lambda rig: rig["cameras"]["mono"].update(focl=3), "cameras.mono.focl: unknown key; did you mean 'focal'"),
+        (lambda rig: rig["cameras"]["mono"].update(rotation=[[2, 0, 0], [0, 1, 0], [0, 0, 1]]), "not a rotation"),
+        (lambda rig: rig.update(depth=[20, 2]), "depth: is [20, 2] m; wanted [near, far]"),
+        (lambda rig: rig["cameras"]["mono"].pop("size"), "cameras.mono.size"),
+        (lambda rig: rig["cameras"]["colour"].update(position=[100, 0, 0], translation=[0, 0, 0]), "keep one"),
+    ],
+)
+def test_rig_mistakes_name_the_entry(edit, message, small, capsys):
+    rig = yaml.safe_load((small / "rig.yaml").read_text())
+    edit(rig)
+    (small / "rig.yaml").write_text(yaml.safe_dump(rig))
+    error = fails(arguments(small), capsys)
+    assert message in error
+    assert "rig.yaml" in error
+
+
+def test_views_that_do_not_overlap(small, capsys):
+    rig = yaml.safe_load((small / "rig.yaml").read_text())
+    rig["cameras"]["colour"] |= {"rotation": [0, 180, 0]}
+    (small / "rig.yaml").write_text(yaml.safe_dump(rig))
+    assert "'colour's views do not overlap" in fails(arguments(small), capsys)
+
+
+def test_pictures_with_an_alpha_channel_or_nan(small, capsys):
+    transparent = torch.rand(4, 96, 128)
+    import cv2
+
+    cv2.imwrite(str(small / "mono.png"), (transparent.movedim(0, -1).numpy() * 255).astype("uint8"))
+    assert "mono.png" in fails(arguments(small), capsys)
+    shutil.copy(small / "colour.png", small / "mono.tif")
+    cv2.imwrite(str(small / "mono.tif"), torch.full((96, 128), torch.nan).numpy())
+    assert "NaN" in fails(arguments(small, mono=small / "mono.tif"), capsys)
