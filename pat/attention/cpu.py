@@ -46,7 +46,9 @@ def forward(
     )
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
     pieces = _pieces(0, b * ha * wa, look.samples)
-    _share([lambda p=piece: kernels.forward(*call, *_room(look, query, value), *p, *outputs) for piece in pieces])
+    _share(
+        [lambda p=piece: kernels.forward(*call, *_room(look, query, value), *p, *outputs) for piece in pieces]
+    )
     return out.permute(0, 3, 1, 2), statistics, logsum
 
 
@@ -95,7 +97,12 @@ def backward(
         last = min(first + step, b * ha * wa)
         pieces = _pieces(first, last, look.samples)
         into = (first, stride, scratch, *outputs)
-        _share([lambda p=piece: kernels.backward(*call, *_room(look, query, value), *p, *into) for piece in pieces])
+        _share(
+            [
+                lambda p=piece: kernels.backward(*call, *_room(look, query, value), *p, *into)
+                for piece in pieces
+            ]
+        )
         _share([lambda add=add: add(first, last) for add in additions])  # noqa: B023
     pictures = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
@@ -173,7 +180,17 @@ def _channel_tasks(
 
     def task(c: int) -> Callable[[int, int], None]:
         return lambda first, last: kernels.scatter(
-            scratch.counts, scratch.rows, weights, stride, x, channels, first, last, c, min(c + width, channels), flat
+            scratch.counts,
+            scratch.rows,
+            weights,
+            stride,
+            x,
+            channels,
+            first,
+            last,
+            c,
+            min(c + width, channels),
+            flat,
         )
 
     return [task(c) for c in range(0, channels, width)]

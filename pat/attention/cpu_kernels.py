@@ -12,6 +12,7 @@ uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and
 from __future__ import annotations
 
 import math
+from inspect import unwrap
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +28,13 @@ BLOCK = 8
 LEAST_SPREAD = np.float32(1e-4)
 ONE, HALF = np.float32(1), np.float32(0.5)
 """In float32, so that they make a float64 of nothing that is not."""
+
+
+def compiled(function=None, **options):
+    """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled."""
+    return (
+        njit(unwrap(function), **options) if function else lambda function: njit(unwrap(function), **options)
+    )
 
 
 # ---- eight numbers at a time ---------------------------------------------------------------------------------
@@ -289,6 +297,7 @@ def _narrow(array, number):
     return lambda array, number: number
 
 
+@unwrap
 def _brain_float_bits(array, number):
     bits = np.float32(number).view(np.uint32)
     if math.isnan(number):
@@ -309,12 +318,15 @@ def _exponentials(x):
 def _exponentials64(typing, x):
     def code(context, builder, signature, args):
         vector = args[0].type
-        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector]), "llvm.exp.v8f64")
+        function = cgutils.get_or_insert_function(
+            builder.module, ir.FunctionType(vector, [vector]), "llvm.exp.v8f64"
+        )
         return builder.call(function, args)
 
     return x(x), code
 
 
+@unwrap
 def _exponentials32(x):
     """Cephes' expf; 1 to 2 units in the last place."""
     low = splat(np.float32(-87.0))
@@ -335,7 +347,7 @@ def _exponentials32(x):
 # ---- along the channels ---------------------------------------------------------------------------------------
 
 
-@njit
+@compiled
 def inner_products(x, rows, n, picture, channels, out):
     """out[t] = x . picture[rows[t]], for t < n; rows is padded to a multiple of TAP_BLOCK."""
     whole = channels // LANES * LANES
@@ -362,7 +374,7 @@ def inner_products(x, rows, n, picture, channels, out):
             out[t + 3] += x[c] * load_one(picture, r3 + c)
 
 
-@njit
+@compiled
 def weighted_sum(weights, rows, n, picture, channels, width, out):
     """out[c] = sum over t < n of weights[t] picture[rows[t], c], for c < width.
 
@@ -385,7 +397,7 @@ def weighted_sum(weights, rows, n, picture, channels, width, out):
         out[c] = s
 
 
-@njit
+@compiled
 def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
     a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
     for t in range(0, n, 2):
@@ -405,7 +417,7 @@ def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
     store(out, c + 24, add(a3, b3))
 
 
-@njit
+@compiled
 def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
     a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
     for t in range(0, n, TAP_BLOCK):
@@ -421,7 +433,7 @@ def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
     store(out, c + 8, add(add(b0, b1), add(b2, b3)))
 
 
-@njit
+@compiled
 def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
     a0 = a1 = a2 = a3 = splat(zero(weights))
     for t in range(0, n, TAP_BLOCK):
@@ -432,7 +444,7 @@ def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
     store(out, c, add(add(a0, a1), add(a2, a3)))
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True, cache=True)
 def scatter(counts, rows, weights, stride, x, channels, first, last, first_channel, last_channel, out):
     """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels first .. last, in their order.
 
@@ -460,7 +472,7 @@ def scatter(counts, rows, weights, stride, x, channels, first, last, first_chann
                 out[rows[t] * channels + c] += weights[t] * one
 
 
-@njit
+@compiled
 def _scatter_32(rows, weights, begin, end, x, at, channels, c, out):
     q0, q1, q2, q3 = load(x, at), load(x, at + 8), load(x, at + 16), load(x, at + 24)
     for t in range(begin, end):
@@ -518,7 +530,7 @@ class Taps(NamedTuple):
     weight: Any
 
 
-@njit
+@compiled
 def _look(look):
     return Look(
         pointer(look.points),
@@ -543,7 +555,7 @@ def room(samples, channels):
     return 6 * n + BLOCK * (m + 1), 8 * n + (BLOCK + 2) * m + channels
 
 
-@njit
+@compiled
 def _room(n, integers, numbers):
     """Scratch, cut up: for samples, taps, channels. Taps' rows and weights are there for BLOCK pixels, the
     numbers of taps behind those."""
@@ -567,33 +579,36 @@ def _room(n, integers, numbers):
     return samples, taps, from_index(t, (BLOCK + 2) * m), from_index(i, 6 * n + BLOCK * m)
 
 
-@njit
+@compiled
 def _slot(taps, slot, n):
     """The taps of a pixel of a block."""
     m = slot * (4 * n + LANES)
     return Taps(from_index(taps.row, m), taps.by_key, taps.by_value, from_index(taps.weight, m))
 
 
-@njit
+@compiled
 def _on_picture(x, y, look, slack):
     low = -HALF - slack
     return (x >= low) & (y >= low) & (x <= look.last_x - low) & (y <= look.last_y - low)
 
 
-@njit
+@compiled
 def _walk(start, along, look, out):
     """start + fraction along, rounded as torch rounds it (no fused multiply-add)."""
     for i in range(0, look.samples, LANES):
         store(out, i, add(start, mul(load(look.fractions, i), along)))
 
 
-@njit
+@compiled
 def _collect(p, look, samples):
     """Positions of the samples of pixel p that count; how many."""
     place = p % look.alpha_pixels if look.shared else p
     if look.straight:
         return _collect_segment(place, look, samples) if look.mask[place] else 0
-    points, mask = from_index(look.points, 2 * place * look.samples), from_index(look.mask, place * look.samples)
+    points, mask = (
+        from_index(look.points, 2 * place * look.samples),
+        from_index(look.mask, place * look.samples),
+    )
     n = 0
     for i in range(look.samples):
         x, y = points[2 * i], points[2 * i + 1]
@@ -602,7 +617,7 @@ def _collect(p, look, samples):
     return n
 
 
-@njit
+@compiled
 def _collect_segment(place, look, samples):
     x0, y0 = look.points[4 * place], look.points[4 * place + 1]
     dx, dy = look.points[4 * place + 2] - x0, look.points[4 * place + 3] - y0
@@ -621,7 +636,7 @@ def _collect_segment(place, look, samples):
     return n
 
 
-@njit
+@compiled
 def _tap(n, first, look, samples, taps):
     """Finds the taps of n samples; how many. `first` is the index of the first pixel of this beta."""
     if look.nearest:
@@ -633,7 +648,7 @@ def _tap(n, first, look, samples, taps):
     return m
 
 
-@njit
+@compiled
 def _tap_nearest(n, first, look, samples, taps):
     """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
     last_x, last_y, width = np.int32(look.width - 1), np.int32(look.height - 1), np.int32(look.width)
@@ -641,7 +656,11 @@ def _tap_nearest(n, first, look, samples, taps):
         x = min(np.int32(samples.x[j] + HALF), last_x)
         y = min(np.int32(samples.y[j] + HALF), last_y)
         taps.row[j] = first + y * width + x
-    if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
+    if (
+        look.straight
+        and n > 1
+        and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE
+    ):
         return n
     m = 0
     row = np.int32(-1)
@@ -654,7 +673,7 @@ def _tap_nearest(n, first, look, samples, taps):
     return m
 
 
-@njit
+@compiled
 def _tap_cells(n, first, look, samples, taps):
     """Each cell has four taps, of which those that the cell before had, too, are taken from there."""
     nothing = zero(samples.x)
@@ -694,13 +713,13 @@ def _tap_cells(n, first, look, samples, taps):
     return np.int64(m)
 
 
-@njit
+@compiled
 def _fresh(row, other, m, taps):
     taps.row[m], taps.row[m + 1] = row, other
     return m, np.int32(m + 1), np.int32(m + 2)
 
 
-@njit
+@compiled
 def _interpolate(n, m, look, samples, by_tap, out):
     """From numbers on taps to numbers on samples."""
     if look.nearest:
@@ -719,7 +738,7 @@ def _interpolate(n, m, look, samples, by_tap, out):
         out[j] = upper + v * (lower - upper)
 
 
-@njit
+@compiled
 def _distribute(n, m, look, samples, numbers, by_tap):
     """From numbers on samples to numbers on taps: the transpose of `_interpolate`."""
     if look.nearest and m == n:
@@ -742,13 +761,13 @@ def _distribute(n, m, look, samples, numbers, by_tap):
         by_tap[samples.tap[4 * j + 3]] += u * lower
 
 
-@njit
+@compiled
 def _fill(numbers, first, last, filler):
     for j in range(first, last):
         numbers[j] = filler
 
 
-@njit
+@compiled
 def _slopes(j, samples, by_tap):
     """How the interpolated number changes with x and with y, at sample j."""
     u, v = samples.right[j], samples.down[j]
@@ -760,19 +779,19 @@ def _slopes(j, samples, by_tap):
 # ---- forward and backward ----------------------------------------------------------------------------------------
 
 
-@njit
+@compiled
 def _unpack(array, at, n, out):
     for c in range(n):
         out[c] = load_one(array, at + c)
 
 
-@njit
+@compiled
 def _pack(numbers, n, array, at):
     for c in range(n):
         array[at + c] = narrow(array, numbers[c])
 
 
-@njit
+@compiled
 def _score(p, q, key, channels, look, bias, biased, samples, taps):
     """Collects pixel p's samples and scores them: how many samples, how many taps."""
     n = _collect(p, look, samples)
@@ -788,7 +807,15 @@ def _score(p, q, key, channels, look, bias, biased, samples, taps):
     return n, m
 
 
-@njit
+@compiled
+def _plain_sum(numbers, n):
+    s = zero(numbers)
+    for j in range(n):
+        s += numbers[j]
+    return s
+
+
+@compiled
 def _softmax(n, samples):
     """Weights of n scores, and the logarithm of the sum of exponentials (-inf if there is none)."""
     score, weight = samples.score, samples.weight
@@ -796,7 +823,7 @@ def _softmax(n, samples):
     for j in range(LANES, n, LANES):
         best = larger(load(score, j), best)
     top = largest(best)
-    if top == -np.inf:
+    if top == -np.inf and not math.isnan(_plain_sum(score, n)):
         return top
     mass = _exponentiate(n, samples, top)
     scale = splat(ONE / mass)
@@ -805,7 +832,7 @@ def _softmax(n, samples):
     return top + math.log(mass)
 
 
-@njit
+@compiled
 def _exponentiate(n, samples, top):
     """weight = exp(score - top), and the sum; scores are padded with -inf."""
     minus_top = splat(-top)
@@ -817,7 +844,7 @@ def _exponentiate(n, samples, top):
     return total(mass)
 
 
-@njit
+@compiled
 def _measure(n, samples, statistics):
     """Expected position, spread and largest of the weights, which are padded with 0."""
     nothing = zero(samples.x)
@@ -840,7 +867,7 @@ def _measure(n, samples, statistics):
     statistics[3] = largest(peak)
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True, cache=True)
 def forward(
     query,
     key,
@@ -880,7 +907,9 @@ def forward(
             width = min(4 * LANES, value_channels - c)
             for p in range(begin, end):
                 own = _slot(taps, p - begin, look.samples)
-                weighted_sum(own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q)
+                weighted_sum(
+                    own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q
+                )
                 _pack(q, width, out, p * value_channels + c)
 
 
@@ -893,7 +922,7 @@ class Scratch(NamedTuple):
     by_value: np.ndarray
 
 
-@njit
+@compiled
 def _blame(n, samples, statistics, upstream):
     """From gradients by the weights to gradients by the scores. Samples' slopes hold those of the values."""
     nothing = zero(upstream)
@@ -917,12 +946,12 @@ def _blame(n, samples, statistics, upstream):
         store(samples.score_slope, j, mul(load(samples.weight, j), sub(load(samples.slope, j), mean)))
 
 
-@njit
+@compiled
 def _six(statistics, upstream):
     return statistics[0], statistics[1], statistics[2], upstream[0], upstream[1], upstream[2]
 
 
-@njit
+@compiled
 def _move(n, p, look, samples, taps, statistics, upstream, out):
     """Gradients by the positions of the samples, and by the points that made them."""
     nothing = zero(upstream)
@@ -948,7 +977,7 @@ def _move(n, p, look, samples, taps, statistics, upstream, out):
         out[4 * p], out[4 * p + 1], out[4 * p + 2], out[4 * p + 3] = x0, y0, x1, y1
 
 
-@njit(nogil=True, cache=True)
+@compiled(nogil=True, cache=True)
 def backward(
     query,
     key,

@@ -1,0 +1,176 @@
+"""The compiled CPU backend: equal to the reference in values and gradients, to the bit the same for any thread count."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from torch.autograd import gradcheck, gradgradcheck
+
+from arraygeom.segments import Positions, Segments
+from pat.attention import attend, attend_with_statistics
+
+from tests.pat.attention.cases import call, gradients, random_case, relative
+
+
+def differences(seed: int, dtype: torch.dtype) -> dict[str, float]:
+    tensors, options = random_case(seed, dtype=dtype)
+    found, expected = (
+        call(attend_with_statistics, tensors, options, backend=backend) for backend in ("cpu", "reference")
+    )
+    by_output = {name: relative(getattr(found, name), getattr(expected, name)) for name in found._fields}
+    there, here = gradients(expected, tensors, seed=seed), gradients(found, tensors, seed=seed)
+    return by_output | {name: relative(here[name], there[name]) for name in tensors}
+
+
+def test_500_random_cases_in_float64():
+    for seed in range(500):
+        worst = differences(seed, torch.float64)
+        assert max(worst.values()) < 1e-10, (seed, worst)
+
+
+def test_100_random_cases_in_float32():
+    for seed in range(100):
+        worst = differences(seed, torch.float32)
+        assert max(worst.values()) < 1e-5, (seed, worst)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+def test_16_bit_inputs_are_accumulated_in_float32(dtype):
+    tensors, options = random_case(3, dtype=torch.float32)
+    stored = {
+        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t
+        for n, t in tensors.items()
+    }
+    exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
+    found = call(attend_with_statistics, stored, options, backend="cpu")
+    expected = call(attend_with_statistics, exact, options, backend="reference")
+    assert found.value.dtype == dtype
+    assert found.position.dtype == torch.float32
+    rounding = torch.finfo(dtype).eps
+    assert relative(found.value, expected.value) <= rounding / 2 * 1.01
+    assert relative(found.position, expected.position) < 1e-5
+    there, here = gradients(expected, exact, seed=0), gradients(found, stored, seed=0)
+    for name in tensors:
+        assert here[name].dtype == stored[name].dtype
+        assert relative(here[name], there[name]) < 4 * rounding, name
+
+
+def big_case(dtype=torch.float32):
+    torch.manual_seed(0)
+    q, key, value = (torch.randn(2, d, 60, 70).to(dtype).requires_grad_() for d in (40, 40, 24))
+    start = (torch.rand(2, 60, 70, 2) * 70).requires_grad_()
+    end = (torch.rand(2, 60, 70, 2) * 70).requires_grad_()
+    return q, key, value, start, end
+
+
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
+def test_any_number_of_threads_gives_the_same_bits(interpolation):
+    inputs = big_case()
+    valid = torch.rand(2, 60, 70) > 0.1
+    before = torch.get_num_threads()
+    results = []
+    try:
+        for threads in (1, 2, 5, 2):
+            torch.set_num_threads(threads)
+            out = attend(
+                *inputs[:3],
+                Segments(*inputs[3:], valid),
+                samples=50,
+                interpolation=interpolation,
+                backend="cpu",
+            )
+            results.append(
+                (
+                    out,
+                    *torch.autograd.grad(
+                        out.square().sum(), inputs[: 3 if interpolation == "nearest" else 5]
+                    ),
+                )
+            )
+    finally:
+        torch.set_num_threads(before)
+    for result in results[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(result, results[0]))
+
+
+def test_gradcheck_also_twice():
+    tensors, options = random_case(21)
+    options["interpolation"] = "bilinear"
+    small = {
+        n: t.detach()[:, :2].requires_grad_() if n in ("query", "key", "value") else t
+        for n, t in tensors.items()
+    }
+
+    def run(*values, backend="auto"):
+        return tuple(call(attend_with_statistics, dict(zip(small, values)), options, backend=backend))
+
+    assert gradcheck(run, tuple(small.values()), fast_mode=True)
+    assert gradgradcheck(run, tuple(small.values()), fast_mode=True)
+    with pytest.raises(RuntimeError, match="second-order"):
+        gradgradcheck(lambda *values: run(*values, backend="cpu"), tuple(small.values()), fast_mode=True)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
+def test_pixels_with_nowhere_to_look_give_and_pass_nothing(backend, interpolation):
+    q, key, value = (torch.randn(1, 4, 3, 3, dtype=torch.float64, requires_grad=True) for _ in range(3))
+    xy = torch.full((3, 3, 2, 2), -5.0, dtype=torch.float64)
+    xy[0, 0] = torch.nan
+    xy[1, 1] = 1.2
+    xy.requires_grad_()
+    mask = torch.ones(3, 3, 2, dtype=torch.bool)
+    mask[1, 1] = False
+    mask[2, 2] = True
+    out = attend_with_statistics(
+        q, key, value, Positions(xy, mask), interpolation=interpolation, backend=backend
+    )
+    assert all(t.abs().max() == 0 for t in out)
+    grads = torch.autograd.grad(
+        [t for t in out if t.requires_grad],
+        (q, key, value, xy),
+        [torch.ones_like(t) for t in out if t.requires_grad],
+        materialize_grads=True,
+    )
+    assert all(g.abs().max() == 0 for g in grads)
+
+
+def test_not_a_number_stays_one():
+    q, key, value = (torch.randn(1, 16, 3, 3) for _ in range(3))
+    q[0, 2, 1, 1] = torch.nan
+    xy = torch.rand(3, 3, 5, 2) * 2
+    out = attend(q, key, value, Positions(xy, torch.ones(3, 3, 5, dtype=torch.bool)), backend="cpu")
+    assert out.isnan().any(1).nonzero().tolist() == [[0, 1, 1]]
+
+
+COMPILED = """
+import torch
+from arraygeom.segments import Segments
+from pat.attention import attend
+torch.manual_seed(0)
+x = [torch.randn(1, 8, 6, 7, requires_grad=True) for _ in range(3)]
+ends = [(torch.rand(6, 7, 2) * 5).requires_grad_() for _ in range(2)]
+def run(q, k, v, s, e):
+    return attend(q, k, v, Segments(s, e, s[..., 0] > 1), samples=5)
+a, b = run(*x, *ends), torch.compile(run, backend="aot_eager", fullgraph=True)(*x, *ends)
+assert torch.equal(a, b)
+for p, q in zip(torch.autograd.grad(a.sum(), x + ends), torch.autograd.grad(b.sum(), x + ends)):
+    assert torch.allclose(p, q)
+with torch.autocast("cpu", torch.bfloat16):
+    low = torch.compile(run, backend="aot_eager", fullgraph=True)(*x, *ends)
+assert low.dtype == torch.bfloat16 and (low - a).abs().max() < 0.1
+"""
+
+
+def test_whole_graph_compilation_and_autocast():
+    """In a fresh process, because the checks of shapes while testing would break the graph."""
+    subprocess.run([sys.executable, "-c", COMPILED], check=True)
+
+
+def test_the_operator_passes_torchs_own_checks():
+    q, key, value = (torch.randn(2, 8, h, 5, requires_grad=True) for h in (3, 4, 4))
+    points = (torch.rand(2, 3, 5, 2, 2) * 4).requires_grad_()
+    mask = torch.rand(2, 3, 5, 1) > 0.3
+    torch.library.opcheck(
+        torch.ops.pat.attend.default, (q, key, value, points, mask, None, 4, True, False, "cpu", False)
+    )

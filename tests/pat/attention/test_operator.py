@@ -1,0 +1,77 @@
+"""What the public face accepts and refuses."""
+
+import pytest
+import torch
+
+from arraygeom.segments import Positions, Segments
+from pat.attention import operator
+
+Q, K, V = torch.zeros(1, 4, 2, 3), torch.zeros(1, 4, 5, 6), torch.zeros(1, 2, 5, 6)
+
+
+def segments(*lead):
+    return Segments(torch.zeros(*lead, 2), torch.ones(*lead, 2) * 3, torch.ones(lead, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "text"),
+    [
+        ({"query": Q[0]}, ValueError, "must be"),
+        ({"query": Q[:, :3]}, ValueError, "channels"),
+        ({"value": V[:, :, :4]}, ValueError, "height"),
+        ({"value": V[:, :0]}, ValueError, "empty"),
+        ({"key": K.double()}, TypeError, "float64, torch.float32|float32, torch.float64"),
+        ({"key": K.to("meta")}, ValueError, "meta"),
+        ({"interpolation": "bicubic"}, ValueError, "bicubic"),
+        ({"backend": "gpu"}, ValueError, "gpu"),
+    ],
+)
+def test_refuses_what_does_not_fit(change, error, text):
+    given = {"query": Q, "key": K, "value": V, "interpolation": "nearest", "backend": "auto"} | change
+    with pytest.raises(error, match=text):
+        operator._check(*given.values())
+
+
+@pytest.mark.parametrize(
+    ("look", "samples", "error", "text"),
+    [
+        (segments(3, 2), 4, ValueError, "leading axes"),
+        (segments(2, 2, 3), 4, ValueError, "leading axes"),
+        (segments(2, 3), 0, ValueError, "at least 1"),
+        (segments(2, 3).positions(4), 5, ValueError, "omit it"),
+        ((0, 0), 4, TypeError, "Segments"),
+    ],
+)
+def test_refuses_a_look_that_does_not_fit(look, samples, error, text):
+    with pytest.raises(error, match=text):
+        operator._form(look, Q, samples)
+
+
+def test_refuses_a_bias_that_does_not_broadcast():
+    with pytest.raises(ValueError, match="broadcast"):
+        operator._bias(torch.zeros(7), Q, 4)
+
+
+def test_refuses_a_function_that_returns_neither():
+    with pytest.raises(TypeError, match="return Segments"):
+        operator.attend_with_statistics.__wrapped__(Q, K, V, lambda x: x) if hasattr(
+            operator.attend_with_statistics, "__wrapped__"
+        ) else operator.attend_with_statistics(Q, K, V, lambda x: x)
+
+
+def test_samples_left_out_are_one_a_pixel():
+    start, end = torch.zeros(2, 2), torch.tensor([[3.2, 0.0], [40.0, 0.0]])
+    assert operator.samples_for(Segments(start, end, torch.tensor([True, False]))) == 5
+
+
+@pytest.mark.parametrize("backend", ["cpu", "triton"])
+def test_an_explicit_backend_that_cannot_serve_raises(backend, monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    device = "cuda" if backend == "cpu" else "cpu"
+    with pytest.raises(RuntimeError, match=backend):
+        operator._choose(backend, device)
+
+
+def test_positions_in_another_precision_are_cast():
+    look = Positions(torch.ones(2, 3, 4, 2, dtype=torch.float64), torch.ones(2, 3, 4, dtype=torch.bool))
+    assert operator._form(look, Q, None).points.dtype == torch.float32
