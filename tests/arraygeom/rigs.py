@@ -19,9 +19,7 @@ def random_camera(g: torch.Generator, hw: tuple[int, int], *, turn: float = 0.25
     focal = (hw[1] * float(uniform(g, 0.7, 1.1)), hw[1] * float(uniform(g, 0.7, 1.1)))
     centre = (hw[1] * float(uniform(g, 0.4, 0.6)), hw[0] * float(uniform(g, 0.4, 0.6)))
     R = rotation_from_vector(uniform(g, -turn, turn, 3))
-    return Camera(
-        K=intrinsics(focal, hw, centre), cam_from_world=Pose(R, uniform(g, -baseline, baseline, 3)), hw=hw
-    )
+    return Camera(K=intrinsics(focal, hw, centre), cam_from_world=Pose(R, uniform(g, -baseline, baseline, 3)), hw=hw)
 
 
 def random_rig(seed: int, *, near: float = 1.5, far: float = 10.0, **camera: float) -> Rig:

@@ -192,8 +192,8 @@ def test_clipped_segments_hold_all_that_is_visible_and_no_more(seed, turn):
     length = segments.length
     assert (fraction[visible] >= -1e-6).all()
     assert (fraction <= length.square() + 1e-6)[visible].all()
-    off = xy - segments.start - (fraction / length.square().clamp(min=1e-9))[..., None] * (
-        segments.end - segments.start
+    off = (
+        xy - segments.start - (fraction / length.square().clamp(min=1e-9))[..., None] * (segments.end - segments.start)
     )
     long = length.expand(visible.shape) > 1e-3
     assert off[visible & long].abs().max() < 1e-6 if (visible & long).any() else True
