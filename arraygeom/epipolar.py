@@ -126,7 +126,8 @@ def segments_between(track: Track, near: Float[Tensor, "*b"], far: Float[Tensor,
     ):
         low, high, valid = _limited(low, high, valid, g, slope)
     valid = valid & (low <= high)
-    return Segments(*(_place((X, Y, Z), (DX, DY, DZ), s, valid, beta_hw) for s in (high, low)), valid)
+    start, end = (_place((X, Y, Z), (DX, DY, DZ), s, valid, beta_hw) for s in (high, low))
+    return Segments(start, end, valid)
 
 
 def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -51,10 +51,11 @@ def infinite_homography(
 def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> MappedPoints:
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
-    `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters:
-    `plane_homography` and `infinite_homography` give it such that the scale is positive in front of both cameras;
-    a fitted H is fixed only up to sign and has to be oriented first. Where not valid, x is zero and so is its
-    gradient.
+    `valid` where the result is finite and its homogeneous scale is positive.
+
+    The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
+    positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first. Where
+    not valid, x is zero and so is its gradient.
     """
     X, Y, scale = map_homogeneous(H, x).unbind(-1)
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
@@ -97,7 +98,7 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: i
         p = u1 / w[:, None]
         zero = torch.zeros_like(p)
         slopes = [
-            torch.cat(block + [-m * p[:, :2]], -1)
+            torch.cat([*block, -m * p[:, :2]], -1)
             for block, m in (([p, zero], mapped[:, :1]), ([zero, p], mapped[:, 1:]))
         ]
         J, residual = torch.cat(slopes), (v - mapped).T.reshape(-1)

@@ -62,7 +62,9 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Float[Tensor, "*n 2"]) -> Flo
     """
     batch = M.ndim - 2
     if x.ndim - 1 < batch:
-        raise ValueError(f"a rig batched over {tuple(M.shape[:-2])} needs pixels (*batch, ..., 2), got {tuple(x.shape)}")
+        raise ValueError(
+            f"a rig batched over {tuple(M.shape[:-2])} needs pixels (*batch, ..., 2), got {tuple(x.shape)}"
+        )
     beside = (...,) + (None,) * (x.ndim - 1 - batch)
     u, v = x.unbind(-1)
     rows = [[m[beside] for m in row.unbind(-1)] for row in M.to(x.dtype).unbind(-2)]

@@ -53,7 +53,8 @@ class Pose:
     ) -> Pose:
         """exp(rotation) R and t + translation: a step on the manifold that never leaves SO(3).
 
-        The rounding of the product is taken out again, so that steps do not add up to a drift. `rotation` is a rotation vector in radians, about the axes of `to`.
+        The rounding of the product is taken out again, so that steps do not add up to a drift.
+        `rotation` is a rotation vector in radians, about the axes of `to`.
         """
         R = self.R if rotation is None else nearest_rotation(rotation_from_vector(rotation) @ self.R)
         return Pose(R, self.t if translation is None else self.t + translation)

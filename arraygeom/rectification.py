@@ -47,12 +47,12 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     R_alpha, R_beta = rectifying_rotations(pose)
     hw = hw or alpha.hw
     K = middle_intrinsics((alpha, beta), (R_alpha, R_beta), hw) if K is None else K
-    cameras = [
+    new_alpha, new_beta = (
         Camera(K=K, cam_from_world=Pose(R @ c.R, matvec(R, c.t)), hw=hw, sensor=c.sensor)
         for c, R in ((alpha, R_alpha), (beta, R_beta))
-    ]
+    )
     H_alpha, H_beta = (K @ R @ torch.linalg.inv(c.K) for c, R in ((alpha, R_alpha), (beta, R_beta)))
-    return Rectification(R_alpha, R_beta, H_alpha, H_beta, Pair(*cameras, pair.depth))
+    return Rectification(R_alpha, R_beta, H_alpha, H_beta, Pair(new_alpha, new_beta, pair.depth))
 
 
 def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:

@@ -83,7 +83,8 @@ def clip_to_picture(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw
         low = torch.maximum(low, torch.where(flat, torch.where(inside, 0.0, 2.0), torch.minimum(first, last)))
         high = torch.minimum(high, torch.where(flat, 1.0, torch.maximum(first, last)))
     valid = low <= high
-    return Segments(*(_on_picture(start, end, s, valid, hw) for s in (low, high)), valid)
+    first, last = (_on_picture(start, end, s, valid, hw) for s in (low, high))
+    return Segments(first, last, valid)
 
 
 def _on_picture(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> Tensor:

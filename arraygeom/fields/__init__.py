@@ -3,15 +3,14 @@
 A field is anything that can be called with a `Pair` and alpha pixels x (*n, 2), and answers with `Segments` or
 `Positions` over *n. The families here are frozen dataclasses; a plain function serves as well:
 
+>>> import torch
+>>> from arraygeom import Segments
 >>> def right_here(pair, x):  # the same pixel in beta, and nothing else
 ...     return Segments(x, x, torch.ones_like(x[..., 0], dtype=torch.bool))
 
 A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes of length 1 in place of *b.
 """
 
-import torch
-
-from ..segments import Segments
 from .approximation import approximated, placement_error
 from .curved import Curved
 from .explicit import Dense, Local, NearestVoxels

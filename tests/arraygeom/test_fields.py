@@ -21,7 +21,6 @@ from arraygeom import (
     Rig,
     Segments,
     View,
-    epipolar_distance,
     epipolar_lines,
     lazily,
     look,
@@ -297,14 +296,18 @@ def test_gradients_in_every_rig_parameter(field):
     x = torch.tensor([[5.0, 40.0], [30.0, 20.0], [60.0, 3.0]], dtype=torch.float64)
     numbers = geometry(rig)
     assert ends(field, rig, x, numbers).numel() >= 8
-    assert torch.autograd.gradcheck(lambda *n: ends(field, rig, x, n), numbers, atol=1e-4, rtol=1e-4, fast_mode=field == HomographyDisplacement())
+    assert torch.autograd.gradcheck(
+        lambda *n: ends(field, rig, x, n), numbers, atol=1e-4, rtol=1e-4, fast_mode=field == HomographyDisplacement()
+    )
 
 
 @pytest.mark.parametrize("field", STRAIGHT[:3], ids=ids)
 def test_second_derivatives_of_straight_fields(field):
     rig = random_rig(3)
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
-    assert torch.autograd.gradgradcheck(lambda *n: ends(field, rig, x, n), geometry(rig), atol=1e-3, rtol=1e-3, fast_mode=True)
+    assert torch.autograd.gradgradcheck(
+        lambda *n: ends(field, rig, x, n), geometry(rig), atol=1e-3, rtol=1e-3, fast_mode=True
+    )
 
 
 def test_gradients_of_an_uncalibrated_pair():

@@ -57,11 +57,15 @@ def test_vertical_pairs_get_rows_too():
     rig = two_cameras(centre=(0, 0.5, 0))
     done = rectify(rig.pair("alpha", "beta"))
     F = done.pair.fundamental
-    torch.testing.assert_close((F / F[1, 2]).abs(), torch.tensor([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]).double(), atol=1e-9, rtol=0)
+    torch.testing.assert_close(
+        (F / F[1, 2]).abs(), torch.tensor([[0.0, 0, 0], [0, 0, 1], [0, 1, 0]]).double(), atol=1e-9, rtol=0
+    )
 
 
 def test_the_rectified_field_serves_the_rectified_pair():
-    rig = two_cameras(rotation_from_vector(torch.tensor([0.02, 0.03, 0.05], dtype=torch.float64)), centre=(0.3, 0.05, 0.02))
+    rig = two_cameras(
+        rotation_from_vector(torch.tensor([0.02, 0.03, 0.05], dtype=torch.float64)), centre=(0.3, 0.05, 0.02)
+    )
     pair = rectify(rig.replace(depth=(2.0, float("inf"))).pair("alpha", "beta")).pair
     x = torch.tensor([[40.0, 20.0], [30.0, 30.0]])
     exact = Epipolar()(pair, x)
@@ -87,7 +91,9 @@ def test_rotations_there_and_back():
     for w in ([0.0, 0, 0], [1e-5, 0, -2e-5], [0.3, -0.4, 1.0], [2.0, 1.0, -1.5]):
         w = torch.tensor(w, dtype=torch.float64)
         torch.testing.assert_close(rotation_vector(rotation_from_vector(w)), w, atol=1e-12, rtol=0)
-    a, b = (torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0) for v in ([1.0, 2, 3], [-1.0, 1, 1]))
+    a, b = (
+        torch.nn.functional.normalize(torch.tensor(v, dtype=torch.float64), dim=0) for v in ([1.0, 2, 3], [-1.0, 1, 1])
+    )
     torch.testing.assert_close(rotation_to(a, b) @ a, b)
 
 

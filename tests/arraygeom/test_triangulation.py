@@ -62,7 +62,7 @@ def test_with_noise_it_is_nearly_the_least_reprojection_error():
 
 def test_the_covariance_is_the_spread():
     cameras = array_of(4)
-    X, x = seen_points(cameras, 3)
+    _, x = seen_points(cameras, 3)
     g = torch.Generator().manual_seed(2)
     noise = 0.3 * torch.randn(4, 5000, 3, 2, generator=g, dtype=torch.float64)
     found = triangulate(cameras, x[:, None] + noise)

@@ -76,7 +76,11 @@ def test_nothing_outside_the_picture_counts():
     band = Widened(Rectified(10.0), across=3.0, samples=4)(WIDE, torch.tensor([[30.0, 0.0]]))
     assert band.mask.sum() == 4 * 4
     assert not Widened(Rectified(10.0), across=1.0)(WIDE, torch.tensor([[-30.0, 0.0]])).mask.any()
-    assert Widened(NearestVoxels(8, 4), across=1.0)(random_rig(0).pair("alpha", "beta"), torch.zeros(1, 2)).xy.isfinite().all()
+    assert (
+        Widened(NearestVoxels(8, 4), across=1.0)(random_rig(0).pair("alpha", "beta"), torch.zeros(1, 2))
+        .xy.isfinite()
+        .all()
+    )
 
 
 def test_gradients_are_those_of_the_field():

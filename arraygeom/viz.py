@@ -1,0 +1,302 @@
+"""Drawings of rigs, fields and residuals. Functions give back a figure and show nothing.
+
+Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the
+figure as the last line of a notebook's cell. `interactive_rig` needs plotly.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
+
+import matplotlib
+import numpy as np
+import torch
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from .camera import Camera
+from .epipolar import epipolar_distance, epipolar_lines
+from .fields import Curved, Epipolar, HomographyDisplacement, ReceptiveField
+from .fields.widened import direction
+from .pixels import HW
+from .rig import Pair, Rig
+from .segments import Segments
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#5c5c5c")
+"""Okabe and Ito's, which colour-blind readers can tell apart."""
+
+
+# The rig in space ---------------------------------------------------------------------------------------------
+
+
+def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, title: str = "") -> Figure:
+    """The rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
+
+    `size` is the frusta's length in metres (by default a fraction of the rig's extent), `alpha` the camera whose
+    depth range is drawn (the first calibrated one; the range is left out where it would dwarf the rig, beyond 40
+    times its extent, or is infinite). Up in the figure is -y of the world.
+    """
+    cameras = calibrated(rig)
+    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
+    axes: Any = figure.add_subplot(projection="3d", proj_type="ortho")
+    size = size or frustum_size(cameras)
+    for colour, (name, camera) in zip(_colours(), cameras.items()):
+        for line in frustum(camera, size):
+            axes.plot(*_upright(line), color=colour, lw=1.1)
+        axes.text(*_upright(numpy(camera.centre)), f"{name} ", color=colour, fontsize=8, ha="right", va="top")
+    for line in depth_outline(rig, cameras, alpha):
+        axes.plot(*_upright(line), color="0.6", lw=0.8, ls="--")
+    _equal_axes(axes)
+    axes.set(xlabel="x (m)", ylabel="z (m)", zlabel="-y (m)")
+    axes.tick_params(labelsize=7, pad=-1)
+    axes.locator_params(nbins=5)
+    axes.view_init(elev=24, azim=-62)
+    figure.suptitle(title or rig.name, fontsize=10)
+    return figure
+
+
+def interactive_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None) -> go.Figure:
+    """The drawing of `draw_rig` as a plotly figure to turn about. Raises ImportError without plotly."""
+    try:
+        import plotly.graph_objects as go
+    except ImportError as error:
+        raise ImportError("the interactive figure needs plotly: `pip install plotly`, or use draw_rig") from error
+    cameras = calibrated(rig)
+    figure = go.Figure()
+    size = size or frustum_size(cameras)
+    for colour, (name, camera) in zip(_colours(), cameras.items()):
+        x, y, z = _upright(_joined(frustum(camera, size)))
+        figure.add_scatter3d(x=x, y=y, z=z, mode="lines", line={"color": colour, "width": 4}, name=name)
+        where = [[v] for v in _upright(numpy(camera.centre))]
+        figure.add_scatter3d(
+            x=where[0], y=where[1], z=where[2], mode="text", text=[name], textfont_color=colour, showlegend=False
+        )
+    outline = depth_outline(rig, cameras, alpha)
+    if outline:
+        x, y, z = _upright(_joined(outline))
+        figure.add_scatter3d(x=x, y=y, z=z, mode="lines", line={"color": "grey", "dash": "dash"}, name="near to far")
+    titles = {"xaxis_title": "x (m)", "yaxis_title": "z (m)", "zaxis_title": "-y (m)"}
+    figure.update_layout(scene={"aspectmode": "data", **titles}, title=rig.name or None)
+    return figure
+
+
+def calibrated(rig: Rig) -> dict[str, Camera]:
+    """The rig's calibrated cameras. Raises ValueError if there are none."""
+    cameras = {n: c for n, c in rig.cameras.items() if isinstance(c, Camera)}
+    if not cameras:
+        raise ValueError("no camera of this rig is calibrated: there is nothing to draw in space")
+    return cameras
+
+
+def frustum_size(cameras: Mapping[str, Camera]) -> float:
+    """A length of frusta that suits the distances between the cameras, metres."""
+    extent = extent_of(cameras)
+    return 0.45 * extent / max(1.0, len(cameras) ** 0.5) if extent > 0 else 0.1
+
+
+def extent_of(cameras: Mapping[str, Camera]) -> float:
+    """The largest distance between two cameras, metres."""
+    centres = torch.stack([c.centre.detach().double().cpu() for c in cameras.values()])
+    return float(torch.cdist(centres, centres).max())
+
+
+def frustum(camera: Camera, length: float) -> list[np.ndarray]:
+    """Lines in the world from the centre to the picture's corners, and the picture's border, `length` away."""
+    border = seen_at(camera, picture_border(camera.hw), length)
+    centre = numpy(camera.centre)
+    corners = border[:: len(border) // 4][:4]
+    return [np.stack([centre, corner]) for corner in corners] + [border]
+
+
+def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) -> list[np.ndarray]:
+    """The borders of alpha's view at near and at far, and its edges between them, as lines in the world."""
+    if rig.depth is None:
+        return []
+    camera = cameras[alpha or next(iter(cameras))]
+    limit = 40 * max(extent_of(cameras), 0.05)
+    depths = [float(d) for d in rig.depth if float(d) <= limit]
+    borders = [seen_at(camera, picture_border(camera.hw), d) for d in depths]
+    edges = zip(*(b[:: len(b) // 4][:4] for b in borders)) if len(borders) == 2 else []
+    return borders + [np.stack(edge) for edge in edges]
+
+
+def picture_border(hw: HW, points: int = 16) -> Float[Tensor, "n 2"]:
+    """Points round the picture's area from its first corner back to it, `points` a side, in pixels."""
+    h, w = hw
+    corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
+    steps = torch.arange(points, dtype=torch.float64)[:, None] / points
+    sides = [a + steps * (b - a) for a, b in pairwise(corners)]
+    return torch.cat([*sides, corners[:1]])
+
+
+def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray:
+    """World points of pixels at a depth; NaN where the lens has no ray.
+
+    Pixels that the lens model does not reach are moved towards the middle until it does, and rays more than 53
+    degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
+    """
+    camera = camera.to(torch.float64)
+    middle = x.mean(0)
+    rays, valid = camera.rays(middle + torch.linspace(1, 0.2, 33).to(x)[:, None, None] * (x - middle))
+    outermost = valid.int().argmax(0)
+    rays = rays.gather(0, outermost[None, :, None].expand(1, -1, 3))[0]
+    rays = rays / rays.norm(dim=-1, keepdim=True)
+    points = camera.cam_from_world.inverse().apply(depth * rays / rays[:, 2:].clamp(min=0.6))
+    return numpy(torch.where(valid.any(0)[:, None], points, torch.nan))
+
+
+# Where to look ------------------------------------------------------------------------------------------------
+
+
+def draw_fields(
+    rig: Rig,
+    alpha: str,
+    x: Float[Tensor, "n 2"],
+    *,
+    field: ReceptiveField | Mapping[str, ReceptiveField] | None = None,
+    images: Mapping[str, Any] | None = None,
+    betas: Sequence[str] | None = None,
+) -> Figure:
+    """Alpha's pixels x, and in every beta where a field looks for them, in the same colours.
+
+    `field` is one for all betas or one for each by name (Epipolar, Curved where there are lenses, or the
+    homography-based one without calibration). `images` holds (H, W), (H, W, 3) or (3, H, W) pictures by camera name.
+    Segments are lines with a dot at their near end, positions are dots.
+    """
+    betas = tuple(betas or rig.betas(alpha))
+    images = images or {}
+    figure = Figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
+    for index, name in enumerate((alpha, *betas)):
+        axes = figure.add_subplot(1, 1 + len(betas), 1 + index)
+        show_picture(axes, rig[name].hw, images.get(name))
+        axes.set_title(f"{name} (alpha)" if name == alpha else name, fontsize=9)
+        if name == alpha:
+            axes.scatter(*numpy(x).T, c=_colours(len(x)), s=22, edgecolors="white", linewidths=0.7)
+            continue
+        pair = rig.pair(alpha, name)
+        chosen = field.get(name) if isinstance(field, Mapping) else field
+        draw_look(axes, chosen or suitable_field(pair), pair, x)
+    return figure
+
+
+def draw_look(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
+    """Where a field looks in beta for each of a few alpha pixels, each in its own colour."""
+    found = field(pair, x)
+    for i, colour in enumerate(_colours(len(x))):
+        if isinstance(found, Segments):
+            if found.valid[i]:
+                (x0, y0), (x1, y1) = numpy(found.start[i]), numpy(found.end[i])
+                axes.plot([x0, x1], [y0, y1], color="white", lw=3.0, alpha=0.6, solid_capstyle="round")
+                axes.plot([x0, x1], [y0, y1], color=colour, lw=1.6, solid_capstyle="round")
+                axes.plot(x0, y0, "o", color=colour, ms=4, mec="white", mew=0.6)
+        else:
+            axes.scatter(*numpy(found.xy[i][found.mask[i]]).T, color=colour, s=1.5, linewidths=0)
+
+
+def suitable_field(pair: Pair) -> ReceptiveField:
+    """The field that knows most about the pair: curved, depth-bounded, or about H x."""
+    if isinstance(pair.alpha, Camera) and isinstance(pair.beta, Camera) and pair.depth is not None:
+        straight = pair.alpha.distortion is None and pair.beta.distortion is None
+        return Epipolar() if straight else Curved(256)
+    return HomographyDisplacement(0.06 * pair.beta.hw[1])
+
+
+# How well it fits ---------------------------------------------------------------------------------------------
+
+
+def draw_residuals(
+    pair: Pair,
+    x_alpha: Float[Tensor, "n 2"],
+    x_beta: Float[Tensor, "n 2"],
+    *,
+    image: Any = None,
+    magnify: float | None = None,
+) -> Figure:
+    """Measured matches against the geometry: distances from beta's points to their epipolar lines.
+
+    Left, each distance drawn across its line and `magnify` times as long (by default so that the median is 2 % of
+    the width); right, their histogram, with the median. Pixels of undistorted pictures.
+    """
+    line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
+    distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
+    size = distance.abs()
+    median = float(size.median())
+    magnify = magnify or max(1.0, float(np.round(0.02 * pair.beta.hw[1] / max(median, 1e-9), 0)))
+    ends = numpy(x_beta - magnify * distance[:, None] * direction(line[:, :2]))
+    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+    axes, histogram = figure.subplots(1, 2, width_ratios=[1.5, 1])
+    show_picture(axes, pair.beta.hw, image)
+    limit = max(float(size.quantile(0.95)), 1e-9)
+    arrows = LineCollection(
+        list(np.stack([numpy(x_beta), ends], 1)), array=numpy(size), cmap="viridis", clim=(0, limit), linewidths=1.3
+    )
+    axes.add_collection(arrows)
+    axes.set_title(f"distance to the epipolar line, {magnify:g} times as long", fontsize=9)
+    figure.colorbar(arrows, ax=axes, label="pixels", shrink=0.85)
+    histogram.hist(numpy(distance.clamp(-2 * limit, 2 * limit)), bins=41, color=COLOURS[0])
+    histogram.set_title(f"{len(distance)} matches, median {median:.2f} px", fontsize=9)
+    histogram.set(xlabel="signed distance (pixels)", ylabel="matches")
+    histogram.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+# Shared -------------------------------------------------------------------------------------------------------
+
+
+def show_picture(axes: Axes, hw: HW, image: Any = None) -> None:
+    """The picture, or an empty frame of its size, with pixel centres at whole numbers."""
+    h, w = hw
+    if image is not None:
+        picture = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
+        picture = picture.transpose(1, 2, 0) if picture.ndim == 3 and picture.shape[0] in (1, 3) else picture
+        axes.imshow(np.squeeze(picture), cmap="gray", interpolation="antialiased", aspect="equal")
+    axes.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5), aspect="equal", xticks=[], yticks=[])
+    axes.set_facecolor("0.94")
+
+
+def numpy(x: Tensor) -> np.ndarray:
+    """The tensor's values, without gradient, on the CPU."""
+    return x.detach().cpu().double().numpy()
+
+
+def _sheet(sizes: list[HW], height: float = 2.6) -> tuple[float, float]:
+    """The figure's size in inches for pictures side by side, at most 16 wide."""
+    width = sum(height * w / h for h, w in sizes)
+    shrink = min(1.0, 16 / width)
+    return width * shrink, height * shrink + 0.3
+
+
+def _colours(n: int | None = None) -> list[Any]:
+    if n is None or n <= len(COLOURS):
+        return [*COLOURS * 32][:n] if n is not None else [*COLOURS * 32]
+    return list(matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, n)))
+
+
+def _upright(X: np.ndarray) -> np.ndarray:
+    """World axes (x, y down, z ahead) to the figure's (x, z, up)."""
+    x, y, z = np.moveaxis(X, -1, 0)
+    return np.stack([x, z, -y])
+
+
+def _joined(lines: list[np.ndarray]) -> np.ndarray:
+    """Many lines as one with gaps of NaN."""
+    gap = np.full((1, 3), np.nan)
+    return np.concatenate([part for line in lines for part in (line, gap)])
+
+
+def _equal_axes(axes: Any) -> None:
+    """The same metres along each axis."""
+    limits = np.array([getattr(axes, f"get_{a}lim")() for a in "xyz"])
+    spans = np.maximum(np.diff(limits)[:, 0], 0.35 * np.diff(limits).max())
+    middles = limits.mean(1)
+    for a, middle, span in zip("xyz", middles, spans):
+        getattr(axes, f"set_{a}lim")(middle - span / 2, middle + span / 2)
+    axes.set_box_aspect(spans, zoom=0.95)

@@ -1,0 +1,98 @@
+import io
+
+import numpy as np
+import pytest
+import torch
+from matplotlib.figure import Figure
+
+from arraygeom import (
+    Distortion,
+    Epipolar,
+    HomographyDisplacement,
+    Link,
+    Local,
+    Rig,
+    Segments,
+    View,
+    Widened,
+    look,
+    viz,
+)
+from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
+
+X = torch.tensor([[20.0, 20.0], [40.0, 30.0], [30.0, 25.0]], dtype=torch.float64)
+
+
+def png(figure: Figure) -> bytes:
+    target = io.BytesIO()
+    figure.savefig(target, dpi=40)
+    return target.getvalue()
+
+
+def with_lens(rig: Rig) -> Rig:
+    lens = Distortion("kannala-brandt", torch.tensor([0.1, 0.01, 0, 0], dtype=torch.float64))
+    return rig.with_camera("beta", rig["beta"].replace(distortion=lens))
+
+
+@pytest.mark.parametrize(
+    "rig", [random_rig(0), with_lens(random_rig(0)), two_cameras(), random_rig(0).replace(depth=None)]
+)
+def test_rigs_are_drawn(rig):
+    figure = viz.draw_rig(rig)
+    assert len(png(figure)) > 1000
+    assert {t.get_text().strip() for t in figure.axes[0].texts} == {"alpha", "beta"}
+    assert {"alpha", "beta"} <= {t.name for t in viz.interactive_rig(rig).data}
+
+
+def test_frusta_are_in_front_of_their_cameras_and_project_to_the_corners():
+    camera = random_rig(1)["alpha"]
+    border = torch.from_numpy(viz.frustum(camera, 2.0)[-1])
+    projected = camera.project(border)
+    torch.testing.assert_close(projected.depth, torch.full_like(projected.depth, 2.0))
+    torch.testing.assert_close(projected.x, viz.picture_border(camera.hw))
+
+
+def test_pixels_beyond_the_lens_are_moved_inside():
+    camera = random_rig(1)["alpha"]
+    lens = Distortion("brown-conrady", torch.tensor([-0.9, 0, 0, 0], dtype=torch.float64))
+    border = viz.frustum(camera.replace(distortion=lens), 1.0)[-1]
+    assert np.isfinite(border).all()
+
+
+def test_fields_are_drawn_where_they_look():
+    rig = random_rig(1)
+    figure = viz.draw_fields(rig, "alpha", X, images={"alpha": torch.rand(3, 48, 64), "beta": np.zeros((40, 60))})
+    assert len(png(figure)) > 1000
+    segments = look(Epipolar(), rig.pair("alpha", "beta"), X)
+    drawn = [line.get_xydata() for line in figure.axes[1].lines if len(line.get_xydata()) == 1]
+    np.testing.assert_allclose(np.concatenate(drawn), segments.start[segments.valid].numpy())
+
+
+def test_any_field_can_be_drawn():
+    def here(pair, x):
+        return Segments(x, x + 3, torch.ones_like(x[..., 0], dtype=torch.bool))
+
+    for field in (here, Local(3), Widened(Epipolar(), across=2.0), {"beta": here}, None):
+        assert len(png(viz.draw_fields(random_rig(1), "alpha", X, field=field))) > 1000
+    assert len(png(viz.draw_fields(with_lens(random_rig(1)), "alpha", X))) > 1000
+
+
+def test_uncalibrated_pairs_are_drawn_about_their_homography():
+    pair = random_rig(1).pair("alpha", "beta")
+    views = {"alpha": View(hw=pair.alpha.hw), "beta": View(hw=pair.beta.hw)}
+    rig = Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
+    assert isinstance(viz.suitable_field(rig.pair("alpha", "beta")), HomographyDisplacement)
+    assert len(png(viz.draw_fields(rig, "alpha", X))) > 1000
+    with pytest.raises(ValueError, match="nothing to draw"):
+        viz.draw_rig(rig)
+
+
+def test_residuals_state_their_median():
+    rig = random_rig(1)
+    a, b = (rig[n].project(scene_points(rig)).x for n in ("alpha", "beta"))
+    lines = torch.tensor([0.0, 1.0], dtype=torch.float64)
+    figure = viz.draw_residuals(rig.pair("alpha", "beta"), a, b + 0.3 * lines)
+    assert len(png(figure)) > 1000
+    title = figure.axes[1].get_title()
+    assert "200 matches" in title
+    assert 0.1 < float(title.split()[-2]) <= 0.3

@@ -1,0 +1,121 @@
+"""Fields for all pixels of a 1280 x 800 alpha against three betas, beside the pixel-by-pixel construction.
+
+Run as `python -m tests.benchmarks.bench_fields`. Median and range of five runs, float32, two threads. The baseline
+is what the paper's own code does for each pixel and beta: the line, the distances of the pixels of a window
+about H x, and the 96 nearest, in numpy; timed on a sample of pixels and scaled to all.
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+from collections.abc import Callable
+
+import numpy as np
+import torch
+
+from arraygeom import (
+    Camera,
+    Curved,
+    Distortion,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    Pair,
+    Pose,
+    ReceptiveField,
+    Rectified,
+    Widened,
+    intrinsics,
+    look,
+    pixel_grid,
+    rotation_from_vector,
+)
+
+HW = (800, 1280)
+RUNS = 5
+SAMPLE = 500
+
+
+def pairs(lens: Distortion | None = None) -> list[Pair]:
+    """One alpha and three betas about 10 cm apart, turned by a degree or two."""
+    K = intrinsics(900.0, HW)
+    places = torch.tensor([[0, 0, 0], [0.1, 0.02, 0], [-0.1, 0.01, 0.03], [0.02, 0.12, -0.02]], dtype=torch.float64)
+    cameras = [
+        Camera(K=K, cam_from_world=Pose.from_centre(rotation_from_vector(0.3 * p), p), hw=HW, distortion=lens)
+        for p in places
+    ]
+    depth = (torch.tensor(1.0, dtype=torch.float64), torch.tensor(20.0, dtype=torch.float64))
+    return [Pair(cameras[0], beta, depth) for beta in cameras[1:]]
+
+
+def timed(work: Callable[[], object]) -> tuple[float, float, float]:
+    """(median, least, most) seconds of several runs after one to warm up."""
+    work()
+    times = []
+    for _ in range(RUNS):
+        start = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times), min(times), max(times)
+
+
+def pixel_by_pixel(pair: Pair, x: np.ndarray, *, count: int = 96, window: int = 80) -> np.ndarray:
+    """The nearest pixels of beta for each alpha pixel in turn, (n, count, 2)."""
+    F, H = pair.fundamental.numpy(), pair.homography.numpy()
+    columns, rows = np.meshgrid(np.arange(HW[1]), np.arange(HW[0]))
+    found = np.zeros((len(x), count, 2), dtype=np.int64)
+    for i, point in enumerate(x):
+        homogeneous = np.array([point[0], point[1], 1.0])
+        a, b, c = F @ homogeneous
+        cx, cy, scale = H @ homogeneous
+        cx, cy = round(cx / scale), round(cy / scale)
+        part = np.s_[max(cy - window, 0) : cy + window + 1, max(cx - window, 0) : cx + window + 1]
+        u, v = columns[part].ravel(), rows[part].ravel()
+        if len(u) < count:
+            continue
+        nearest = np.argpartition(np.abs(a * u + b * v + c), count - 1)[:count]
+        found[i] = np.stack([u[nearest], v[nearest]], -1)
+    return found
+
+
+def main() -> None:
+    """Print the table."""
+    torch.set_num_threads(2)
+    straight = pairs()
+    lens = Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 0, 0], dtype=torch.float64))
+    curved = pairs(lens)
+    g = np.random.default_rng(0)
+    sample = torch.from_numpy(g.uniform(0, [HW[1] - 1, HW[0] - 1], (SAMPLE, 2)).round()).float()
+    whole = pixel_grid(HW)
+    pixels = HW[0] * HW[1]
+    print(f"{'field':36} {'pixels':>8} {'median s':>9} {'range s':>15} {'s, all pixels':>14} {'us/pixel/beta':>14}")
+
+    def report(name: str, seconds: tuple[float, float, float], n: int) -> None:
+        median, low, high = seconds
+        all_of_them = median * pixels / n
+        each = median / (3 * n) * 1e6
+        print(f"{name:36} {n:>8} {median:9.3f} {low:7.3f}-{high:7.3f} {all_of_them:14.3f} {each:14.3f}")
+
+    def field(name: str, f: ReceptiveField, chosen: list[Pair], x: torch.Tensor) -> None:
+        with torch.no_grad():
+            report(name, timed(lambda: [look(f, pair, x) for pair in chosen]), x.numel() // 2)
+
+    field("Epipolar", Epipolar(), straight, whole)
+    field("EpipolarLine", EpipolarLine(), straight, whole)
+    field("HomographyDisplacement(40)", HomographyDisplacement(40.0), straight, whole)
+    field("HomographyDisplacement()", HomographyDisplacement(), straight, whole)
+    field("Rectified(40)", Rectified(40.0), straight, whole)
+    field("Widened(Epipolar, along=2)", Widened(Epipolar(), along=2.0), straight, whole)
+    field("Widened(Epipolar, across=1), sample", Widened(Epipolar(), across=1.0), straight, sample)
+    field("Local(5), sample", Local(5), straight, sample)
+    field("NearestVoxels(96, 80), sample", NearestVoxels(), straight, sample)
+    field("Curved(96), lenses, sample", Curved(), curved, sample)
+    points = sample.numpy()
+    report("pixel by pixel (numpy), sample", timed(lambda: [pixel_by_pixel(p, points[:200]) for p in straight]), 200)
+
+
+if __name__ == "__main__":
+    main()
