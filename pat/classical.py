@@ -142,7 +142,7 @@ def _rectifying_rotation(R: NDArray, t: NDArray) -> NDArray[np.float64]:
     baseline = R.T @ t
     if not np.linalg.norm(baseline) > 0:
         raise ValueError("the cameras are at one place (t is zero): there is no depth to match")
-    x = baseline / np.linalg.norm(baseline) * (1 if baseline[np.abs(baseline).argmax()] > 0 else -1)
+    x = baseline / np.linalg.norm(baseline)
     y = np.cross(np.array([0, 0, 1.0]) + R[2], x)
     y /= max(np.linalg.norm(y), 1e-12)
     return np.stack([x, y, np.cross(x, y)])
@@ -244,12 +244,12 @@ def _regressed(chroma: Picture, luma: Picture, residual: Picture) -> Picture:
 
 
 def _filled(values: Picture, weight: Picture, guide: NDArray[np.uint8], how: _Smoothing) -> Picture:
-    """The weighted mean of `values` over what is connected in `guide`."""
+    """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
 
     def smooth(plane: Picture) -> Picture:
         return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), how.strength, how.edge)
 
-    total = np.maximum(smooth(weight), 1e-6)
+    total = smooth(weight)
     planes = np.atleast_3d(values).transpose(2, 0, 1)
     return np.stack([smooth(plane * weight) / total for plane in planes], -1).reshape(values.shape)
 

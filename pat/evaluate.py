@@ -45,7 +45,7 @@ def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
 
 def beta_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
     """The colour picture enlarged (bicubic) and left where it is: what no matching at all scores."""
-    return interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    return interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0]
 
 
 def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:

@@ -31,6 +31,7 @@ def test_a_folder_without_pairs_is_an_error_at_once(tmp_path, reader):
         ("training/colored_0/01_10.png", "training/colored_1/01_10.png", "training/01_10"),
         ("Adirondack/im0.png", "Adirondack/im1.png", "Adirondack"),
         ("left.png", "right.png", "left"),
+        ("left/x/left/a.png", "left/x/right/a.png", "x/a"),
     ],
 )
 def test_pairs_are_found_by_their_names(tmp_path, left, right, name):
