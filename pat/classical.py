@@ -126,9 +126,7 @@ def _rectified_plane(K_alpha, K_beta, R, t, *, hw: tuple[int, int], depth: tuple
     shift = -(turn @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
-    width, height = (
-        int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1]))
-    )
+    width, height = (int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1])))
     if width * height > 8 * hw[0] * (hw[1] + max_disparity):
         raise ValueError(UNRECTIFIABLE)
     K_moved = K.copy()

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 from rich.progress import track
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Positional, UseAppendAction
 
 from arraygeom import (
     Dense,
@@ -46,7 +46,7 @@ console = Console(stderr=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Fuse the sample array of the package; write picture, depth, confidence and a figure, print the figures of merit."""
+    """Fuse the sample array of the package: picture, depth, confidence, a figure, and PSNR and SSIM beside a baseline."""
 
     out: Path = Path("out/demo")
     """Folder for the results."""
@@ -132,25 +132,34 @@ class Fuse:
 class Show:
     """Draw a rig and where some alpha pixels look in the other cameras."""
 
-    rig: Annotated[Path, arg(name="")]
+    rig: Positional[Path]
     """Rig file."""
     alpha: str | None = None
     """The camera to look from; by default the first."""
     image: UseAppendAction[tuple[str, ...]] = ()
     """NAME=FILE: pictures to draw on, if wanted."""
-    out: Path = Path("rig.png")
-    """Picture to write."""
+    out: Path = Path("out/show")
+    """Folder for rig.png (cameras in space; if calibrated) and fields.png (where some pixels look)."""
 
     def run(self) -> None:
         """Do it."""
+        from arraygeom import Camera
+        from arraygeom.viz import draw_fields, draw_rig
+
         from .images import read_image
-        from .show import show_rig
+        from .results import save_figure
 
         rig = Rig.load(self.rig)
+        alpha = rig.known(self.alpha or rig.names[0])
         files = dict(_name_and_file(text) for text in self.image)
         images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
-        show_rig(rig, self.alpha or rig.names[0], images, self.out)
-        console.print(f"written: {self.out}")
+        written = []
+        if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
+            written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
+        if len(rig.names) > 1:
+            fields = draw_fields(rig, alpha, _spread_out(rig[alpha].hw), images=images)
+            written.append(save_figure(fields, self.out / "fields.png"))
+        console.print(f"written: {', '.join(map(str, written))}")
 
 
 Command = (
@@ -169,6 +178,14 @@ def fuse_frame(weights: str, rig: Rig, images: dict[str, Tensor], **options: Any
         return track(tiles, "fusing", total=total, console=console)
 
     return fuse(load_weights(weights), rig, images, progress=bar, **options)
+
+
+def _spread_out(hw: tuple[int, int]) -> Tensor:
+    """Twelve pixels (12, 2) spread over a picture."""
+    from arraygeom import pixel_grid
+
+    spots = (pixel_grid((3, 4)) + 0.5) / pixel_grid((3, 4)).new_tensor([4, 3])
+    return (spots * spots.new_tensor([hw[1], hw[0]])).floor().reshape(-1, 2)
 
 
 def _name_and_file(text: str) -> tuple[str, Path]:

@@ -79,9 +79,7 @@ def evaluate_pairs(
             images = {name: _fused(name, fuse, pair, task, max_disparity) for name, fuse in methods.items()}
             rows += [Row(pair.name, rate, name, *score(image, task.truth)) for name, image in images.items()]
             if pictures:
-                write_image(
-                    Path(pictures) / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, images)
-                )
+                write_image(Path(pictures) / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, images))
     return rows
 
 

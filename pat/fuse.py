@@ -305,7 +305,7 @@ def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -
             continue
         seen = position[0, :, :h, :w].movedim(0, -1) + torch.tensor([float(v) for v in piece.offset])
         found = depth_from_track(pinhole_track(piece.pair, x), seen.reshape(-1, 2))
-        weight = torch.where(found.valid.reshape(h, w), confidence[0, :h, :w] + 1e-6, 0.0)
+        weight = torch.where(found.valid.reshape(h, w), confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
         weights = weights + weight
     known = weights > 0

@@ -126,7 +126,7 @@ class GuidedPAT(nn.Module):
             alpha + residual,
             [a.position for a in attended],
             [a.spread for a in attended],
-            [z[:, 0].sigmoid() for z in logits],
+            [z[:, 0].sigmoid() * (a.peak > 0) for z, a in zip(logits, attended)],
         )
         return fused, list(matches)
 
@@ -148,7 +148,7 @@ class GuidedPAT(nn.Module):
         query, key = self.coarse_key(own.quarter), self.coarse_key(other.quarter)
         attended = attend_with_statistics(query, key, self.coarse_value(other.quarter), reduced, samples=samples)
         fraction = reduced.fraction(attended.position.movedim(1, -1))
-        reach = (1 - fraction)[:, None] * length
+        reach = torch.where(valid & (attended.peak[:, None] > 0), (1 - fraction)[:, None] * length, 0.0)
         facts = [reach / 64, attended.spread[:, None] / 4, attended.peak[:, None], valid.to(reach).expand_as(reach)]
         answer = self.judge(torch.cat([own.quarter, attended.value, *facts], 1))
         reach = reach + COARSE * answer[:, :1]

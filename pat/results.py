@@ -8,10 +8,12 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from .fuse import FusedFrame
-from .images import write_image
+from .images import write_atomically, write_image
 
 
 def save_frame(frame: FusedFrame, out: Path, *, bits: int = 8) -> list[Path]:
@@ -37,3 +39,11 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     scaled = ((inverse - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
     colours = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)
     return torch.where(known, colours, 0.0)
+
+
+def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
+    """Write a figure, whole or not at all; returns where."""
+    FigureCanvasAgg(figure)
+    with write_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=dpi)
+    return path

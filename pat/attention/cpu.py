@@ -46,9 +46,7 @@ def forward(
     )
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
     pieces = _pieces(0, b * ha * wa, look.samples)
-    _share(
-        [lambda p=piece: kernels.forward(*call, *_room(look, query, value), *p, *outputs) for piece in pieces]
-    )
+    _share([lambda p=piece: kernels.forward(*call, *_room(look, query, value), *p, *outputs) for piece in pieces])
     return out.permute(0, 3, 1, 2), statistics, logsum
 
 
@@ -97,12 +95,7 @@ def backward(
         last = min(first + step, b * ha * wa)
         pieces = _pieces(first, last, look.samples)
         into = (first, stride, scratch, *outputs)
-        _share(
-            [
-                lambda p=piece: kernels.backward(*call, *_room(look, query, value), *p, *into)
-                for piece in pieces
-            ]
-        )
+        _share([lambda p=piece: kernels.backward(*call, *_room(look, query, value), *p, *into) for piece in pieces])
         _share([lambda add=add: add(first, last) for add in additions])  # noqa: B023
     pictures = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))

@@ -32,9 +32,7 @@ ONE, HALF = np.float32(1), np.float32(0.5)
 
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled."""
-    return (
-        njit(unwrap(function), **options) if function else lambda function: njit(unwrap(function), **options)
-    )
+    return njit(unwrap(function), **options) if function else lambda function: njit(unwrap(function), **options)
 
 
 # ---- eight numbers at a time ---------------------------------------------------------------------------------
@@ -67,9 +65,7 @@ def _widen(builder, stored, dtype, lanes):
 
     if dtype == types.uint16:
         sixteen = shape(ir.IntType(32))(([16] * lanes) if lanes > 1 else 16)
-        return builder.bitcast(
-            builder.shl(builder.zext(stored, shape(ir.IntType(32))), sixteen), shape(ir.FloatType())
-        )
+        return builder.bitcast(builder.shl(builder.zext(stored, shape(ir.IntType(32))), sixteen), shape(ir.FloatType()))
     if dtype == types.int16:
         return builder.fpext(builder.bitcast(stored, shape(ir.HalfType())), shape(ir.FloatType()))
     return stored
@@ -318,9 +314,7 @@ def _exponentials(x):
 def _exponentials64(typing, x):
     def code(context, builder, signature, args):
         vector = args[0].type
-        function = cgutils.get_or_insert_function(
-            builder.module, ir.FunctionType(vector, [vector]), "llvm.exp.v8f64"
-        )
+        function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(vector, [vector]), "llvm.exp.v8f64")
         return builder.call(function, args)
 
     return x(x), code
@@ -656,11 +650,7 @@ def _tap_nearest(n, first, look, samples, taps):
         x = min(np.int32(samples.x[j] + HALF), last_x)
         y = min(np.int32(samples.y[j] + HALF), last_y)
         taps.row[j] = first + y * width + x
-    if (
-        look.straight
-        and n > 1
-        and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE
-    ):
+    if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
         return n
     m = 0
     row = np.int32(-1)
@@ -907,9 +897,7 @@ def forward(
             width = min(4 * LANES, value_channels - c)
             for p in range(begin, end):
                 own = _slot(taps, p - begin, look.samples)
-                weighted_sum(
-                    own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q
-                )
+                weighted_sum(own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q)
                 _pack(q, width, out, p * value_channels + c)
 
 

@@ -49,9 +49,7 @@ def _kernels(backend: str) -> ModuleType:
     return gpu
 
 
-@torch.library.custom_op(
-    "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor)"
-)
+@torch.library.custom_op("pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor)")
 def _attend(
     query: Tensor,
     key: Tensor,
@@ -107,9 +105,7 @@ def _attend_backward(
 @_attend_backward.register_fake
 def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
     wanted = rest[-1]
-    pictures = (
-        _channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted)
-    )
+    pictures = (_channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted))
     weights = (*logsum.shape, rest[2])
     return (
         *pictures,
@@ -161,12 +157,9 @@ def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: of the reference's gradient, made anew with a graph."""
     samples, straight, nearest, backend, strict, wanted = ctx.options
     if strict:
-        raise RuntimeError(
-            f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'"
-        )
+        raise RuntimeError(f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'")
     query, key, value, points, mask, bias, _, _, *upstream = (
-        t if t is None or not t.is_floating_point() else t.detach().requires_grad_()
-        for t in ctx.saved_tensors
+        t if t is None or not t.is_floating_point() else t.detach().requires_grad_() for t in ctx.saved_tensors
     )
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
     with torch.enable_grad():

@@ -123,13 +123,9 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"query, key and value must not be empty, got {shapes}")
     if not (query.dtype == key.dtype == value.dtype and query.dtype in DTYPES):
         names = ", ".join(str(t.dtype) for t in (query, key, value))
-        raise TypeError(
-            f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}"
-        )
+        raise TypeError(f"query, key and value must be all float64, float32, bfloat16 or float16, got {names}")
     if not query.device == key.device == value.device:
-        raise ValueError(
-            f"query, key and value are on {query.device}, {key.device} and {value.device}: move them"
-        )
+        raise ValueError(f"query, key and value are on {query.device}, {key.device} and {value.device}: move them")
     if interpolation not in ("bilinear", "nearest"):
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
     if backend not in ("auto", "reference", "cpu", "triton"):
@@ -144,21 +140,15 @@ def _form(where: Where, query: Tensor, samples: int | None) -> Look:
     elif isinstance(where, Positions):
         points, mask, straight = where.xy, where.mask, False
         if samples not in (None, points.shape[-2]):
-            raise ValueError(
-                f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it"
-            )
+            raise ValueError(f"samples is {samples}, but the positions given are {points.shape[-2]} a pixel: omit it")
         samples = points.shape[-2]
     else:
-        raise TypeError(
-            f"look must be Segments, Positions or a function that returns them, got {type(where)}"
-        )
+        raise TypeError(f"look must be Segments, Positions or a function that returns them, got {type(where)}")
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
     if tuple(mask.shape[:-1]) not in ((ha, wa), (b, ha, wa), (1, ha, wa)):
-        raise ValueError(
-            f"look has the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}"
-        )
+        raise ValueError(f"look has the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}")
     if points.device != query.device:
         raise ValueError(f"look is on {points.device}, the features are on {query.device}: move one of them")
     if mask.dim() == 3:
@@ -183,9 +173,7 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
         raise ValueError(f"bias {tuple(bias.shape)} does not broadcast to {(b, ha, wa, samples)}") from None
 
 
-def _run(
-    q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend
-) -> Attended:
+def _run(q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend) -> Attended:
     chosen = _choose(backend, q.device.type)
     if chosen == "reference":
         return reference.attend(q, k, v, look, bias, nearest)

@@ -157,9 +157,7 @@ def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
     )
 
 
-def _pairs_and_files(
-    root: str | Path, *, max_disparity: float = PAPER_DISPARITY
-) -> Iterator[tuple[StereoPair, Path]]:
+def _pairs_and_files(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[tuple[StereoPair, Path]]:
     root = _folder(root)
     files = [(left, right) for left in sorted(root.rglob("*")) for right in _right_of(left, root)]
     if not files:
@@ -176,9 +174,7 @@ def _right_of(left: Path, root: Path) -> list[Path]:
     if left.suffix.lower() not in PICTURES:
         return []
     before, inside = root.as_posix(), left.as_posix()[len(root.as_posix()) :]
-    rights = (
-        Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside
-    )
+    rights = (Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside)
     return [right for right in rights if right.is_file()][:1]
 
 

@@ -39,8 +39,7 @@ def test_100_random_cases_in_float32():
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = random_case(3, dtype=torch.float32)
     stored = {
-        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t
-        for n, t in tensors.items()
+        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t for n, t in tensors.items()
     }
     exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
     found = call(attend_with_statistics, stored, options, backend="cpu")
@@ -83,9 +82,7 @@ def test_any_number_of_threads_gives_the_same_bits(interpolation):
             results.append(
                 (
                     out,
-                    *torch.autograd.grad(
-                        out.square().sum(), inputs[: 3 if interpolation == "nearest" else 5]
-                    ),
+                    *torch.autograd.grad(out.square().sum(), inputs[: 3 if interpolation == "nearest" else 5]),
                 )
             )
     finally:
@@ -97,10 +94,7 @@ def test_any_number_of_threads_gives_the_same_bits(interpolation):
 def test_gradcheck_also_twice():
     tensors, options = random_case(21)
     options["interpolation"] = "bilinear"
-    small = {
-        n: t.detach()[:, :2].requires_grad_() if n in ("query", "key", "value") else t
-        for n, t in tensors.items()
-    }
+    small = {n: t.detach()[:, :2].requires_grad_() if n in ("query", "key", "value") else t for n, t in tensors.items()}
 
     def run(*values, backend="auto"):
         return tuple(call(attend_with_statistics, dict(zip(small, values)), options, backend=backend))
@@ -122,9 +116,7 @@ def test_pixels_with_nowhere_to_look_give_and_pass_nothing(backend, interpolatio
     mask = torch.ones(3, 3, 2, dtype=torch.bool)
     mask[1, 1] = False
     mask[2, 2] = True
-    out = attend_with_statistics(
-        q, key, value, Positions(xy, mask), interpolation=interpolation, backend=backend
-    )
+    out = attend_with_statistics(q, key, value, Positions(xy, mask), interpolation=interpolation, backend=backend)
     assert all(t.abs().max() == 0 for t in out)
     grads = torch.autograd.grad(
         [t for t in out if t.requires_grad],
