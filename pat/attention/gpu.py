@@ -1,0 +1,457 @@
+"""C3 attention on GPUs, in Triton: one program for a few alpha pixels, channels along its lanes.
+
+Forward walks the samples once with a running softmax. Backward walks them twice, first for the mean of the gradients
+by the weights, then for the gradients. Beta's gradients are added to with atomics: of float32, in no fixed order; or, if
+torch is asked for deterministic algorithms, of 64-bit fixed point numbers, whose sums do not depend on the order.
+`TRITON_INTERPRET=1`, set before the first import, runs the same code on the CPU, for tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from inspect import unwrap
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+
+from arraygeom.segments import sample_fractions
+from pat.attention.reference import EDGE_SLACK, LEAST_SPREAD, Look
+
+PIXELS = 8
+"""Alpha pixels of one program."""
+LEAST = tl.constexpr(LEAST_SPREAD)
+SLACK = tl.constexpr(EDGE_SLACK)
+FIXED_BITS = 61
+"""How much of an int64 a sum of fixed point numbers may take."""
+
+
+def forward(
+    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `cpu.forward`."""
+    b, _, ha, wa = query.shape
+    counted = _accumulated(query)
+    out = query.new_empty(b, ha, wa, value.shape[1])
+    statistics = query.new_empty(b, ha, wa, 4, dtype=counted)
+    logsum = query.new_empty(b, ha, wa, dtype=counted)
+    inputs, options = _call(query, key, value, look, bias, nearest)
+    _forward[_programs(query)](*inputs, out, statistics, logsum, **options)
+    return out.permute(0, 3, 1, 2), statistics, logsum
+
+
+def backward(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    look: Look,
+    bias: Tensor | None,
+    nearest: bool,
+    saved: tuple[Tensor, Tensor],
+    cotangents: tuple[Tensor, Tensor],
+    wanted: Sequence[bool],
+) -> tuple[Tensor, ...]:
+    """As `cpu.backward`."""
+    b, _, ha, wa = query.shape
+    counted = _accumulated(query)
+    upstream, statistics_upstream = _channels_last(cotangents[0]), cotangents[1].to(counted).contiguous()
+    fixed = torch.are_deterministic_algorithms_enabled()
+    scales = (
+        _scales(query, key, value, upstream, statistics_upstream)
+        if fixed
+        else query.new_ones(2, dtype=counted)
+    )
+    sums = torch.int64 if fixed else counted
+    pictures = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
+    query_out = query.new_empty(b, ha, wa, query.shape[1])
+    points_out = query.new_zeros(b, *look.points.shape[1:], dtype=counted)
+    bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 1, dtype=counted)
+    inputs, options = _call(query, key, value, look, bias, nearest)
+    _backward[_programs(query)](
+        *inputs,
+        *(saved[0], saved[1], upstream, statistics_upstream, scales),
+        *(query_out, *pictures, points_out, bias_out),
+        **options,
+        WANTS_BIAS=wanted[4],
+        FIXED=fixed,
+    )
+    if fixed:
+        pictures = [(t.double() / s.double()).to(counted) for t, s in zip(pictures, scales)]
+    key_out, value_out = (t.to(query.dtype).permute(0, 3, 1, 2) for t in pictures)
+    found = (
+        query_out.permute(0, 3, 1, 2),
+        key_out,
+        value_out,
+        points_out.sum_to_size(look.points.shape),
+        bias_out,
+    )
+    return tuple(t if want else t.new_empty(0) for t, want in zip(found, wanted))
+
+
+def _scales(
+    query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor
+) -> Tensor:
+    """By which key's and value's gradients are multiplied so that their sums fit into fixed point.
+
+    The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the largest gradient
+    by a weight.
+    """
+    pixels = query.shape[0] * query.shape[2] * query.shape[3]
+    diagonal = float(key.shape[2] ** 2 + key.shape[3] ** 2) ** 0.5
+    pull = upstream.abs().amax().double()
+    by_weight = pull * value.abs().amax().double() * value.shape[1]
+    by_weight = by_weight + statistics_upstream.abs().amax().double() * (3 * diagonal + 1)
+    most = torch.stack([2 * by_weight * query.abs().amax().double(), pull]) * pixels
+    return torch.exp2(FIXED_BITS - most.clamp(min=1e-30).log2().ceil()).to(_accumulated(query))
+
+
+def _accumulated(tensor: Tensor) -> torch.dtype:
+    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+def _channels_last(picture: Tensor) -> Tensor:
+    return picture.permute(0, 2, 3, 1).contiguous()
+
+
+def _programs(query: Tensor) -> tuple[int]:
+    return (triton.cdiv(query.shape[0] * query.shape[2] * query.shape[3], PIXELS),)
+
+
+def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> tuple:
+    counted = _accumulated(query)
+    inputs = (
+        *(_channels_last(t) for t in (query, key, value)),
+        look.points.contiguous(),
+        look.mask.contiguous().view(torch.uint8),
+        sample_fractions(look.samples, like=look.points),
+        query.new_zeros(1, dtype=counted) if bias is None else bias.to(counted).contiguous(),
+        query.shape[0] * query.shape[2] * query.shape[3],
+        query.shape[2] * query.shape[3],
+        *key.shape[2:],
+        look.samples,
+    )
+    options = {
+        "D": query.shape[1],
+        "DV": value.shape[1],
+        "D_BLOCK": triton.next_power_of_2(query.shape[1]),
+        "DV_BLOCK": triton.next_power_of_2(value.shape[1]),
+        "PIXELS": PIXELS,
+        "SHARED": look.points.shape[0] == 1,
+        "STRAIGHT": look.straight,
+        "NEAREST": nearest,
+        "BIASED": bias is not None,
+        "NUMBER": tl.float64 if counted == torch.float64 else tl.float32,
+    }
+    return inputs, options
+
+
+def compiled(function):
+    """triton.jit, of the bare function: a checker of types that tests put around it cannot be compiled."""
+    return triton.jit(unwrap(function))
+
+
+@compiled
+def _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT):
+    """Sample i of some pixels: x, y and whether it counts."""
+    if STRAIGHT:
+        x0 = tl.load(points + 4 * place, mask=alive, other=0)
+        y0 = tl.load(points + 4 * place + 1, mask=alive, other=0)
+        u = tl.load(fractions + i)
+        x = x0 + u * (tl.load(points + 4 * place + 2, mask=alive, other=0) - x0)
+        y = y0 + u * (tl.load(points + 4 * place + 3, mask=alive, other=0) - y0)
+        counts = alive & (tl.load(mask + place, mask=alive, other=0) != 0)
+    else:
+        at = place * samples + i
+        x = tl.load(points + 2 * at, mask=alive, other=0)
+        y = tl.load(points + 2 * at + 1, mask=alive, other=0)
+        counts = alive & (tl.load(mask + at, mask=alive, other=0) != 0)
+    counts = counts & (x >= -0.5 - SLACK) & (x <= width - 0.5 + SLACK)
+    counts = counts & (y >= -0.5 - SLACK) & (y <= height - 0.5 + SLACK)
+    return tl.where(counts, x, 0), tl.where(counts, y, 0), counts
+
+
+@compiled
+def _cell(x, y, height, width, NEAREST):
+    """The four pixels around (x, y), as offsets from the first, and how far between them it lies."""
+    if NEAREST:
+        right = tl.minimum(tl.maximum(tl.floor(x + 0.5).to(tl.int64), 0), width - 1)
+        down = tl.minimum(tl.maximum(tl.floor(y + 0.5).to(tl.int64), 0), height - 1)
+        return down * width + right, 0 * right, 0 * right, 0 * x, 0 * y
+    x = tl.minimum(tl.maximum(x, 0), width - 1)
+    y = tl.minimum(tl.maximum(y, 0), height - 1)
+    right = tl.minimum(x.to(tl.int64), tl.maximum(width - 2, 0))
+    down = tl.minimum(y.to(tl.int64), tl.maximum(height - 2, 0))
+    across = tl.minimum(width - 1, 1) + 0 * right
+    below = tl.minimum(height - 1, 1) * width + 0 * right
+    return down * width + right, across, below, x - right.to(x.dtype), y - down.to(x.dtype)
+
+
+@compiled
+def _rows(picture, pixel, channel, D, live, NUMBER):
+    return tl.load(picture + pixel[:, None] * D + channel[None, :], mask=live, other=0).to(NUMBER)
+
+
+@compiled
+def _dots(x, picture, pixel, across, below, channel, D, live, NEAREST, NUMBER):
+    """Inner products with the four pixels around (with one, four times, if nearest)."""
+    a = tl.sum(x * _rows(picture, pixel, channel, D, live, NUMBER), 1)
+    if NEAREST:
+        return a, a, a, a
+    b = tl.sum(x * _rows(picture, pixel + across, channel, D, live, NUMBER), 1)
+    c = tl.sum(x * _rows(picture, pixel + below, channel, D, live, NUMBER), 1)
+    d = tl.sum(x * _rows(picture, pixel + across + below, channel, D, live, NUMBER), 1)
+    return a, b, c, d
+
+
+@compiled
+def _blend(a, b, c, d, u, v):
+    upper = a + u * (b - a)
+    lower = c + u * (d - c)
+    return upper + v * (lower - upper)
+
+
+@compiled
+def _blended(picture, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBER):
+    """The picture at the samples."""
+    a = _rows(picture, pixel, channel, D, live, NUMBER)
+    if NEAREST:
+        return a
+    b = _rows(picture, pixel + across, channel, D, live, NUMBER)
+    c = _rows(picture, pixel + below, channel, D, live, NUMBER)
+    d = _rows(picture, pixel + across + below, channel, D, live, NUMBER)
+    return _blend(a, b, c, d, u[:, None], v[:, None])
+
+
+@compiled
+def _forward(
+    query,
+    key,
+    value,
+    points,
+    mask,
+    fractions,
+    bias,
+    pixels,
+    alpha_pixels,
+    height,
+    width,
+    samples,
+    out,
+    statistics,
+    logsum,
+    D: tl.constexpr,
+    DV: tl.constexpr,
+    D_BLOCK: tl.constexpr,
+    DV_BLOCK: tl.constexpr,
+    PIXELS: tl.constexpr,
+    SHARED: tl.constexpr,
+    STRAIGHT: tl.constexpr,
+    NEAREST: tl.constexpr,
+    BIASED: tl.constexpr,
+    NUMBER: tl.constexpr,
+):
+    p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
+    alive = p < pixels
+    place = p % alpha_pixels if SHARED else p
+    first = p // alpha_pixels * height * width
+    c, cv = tl.arange(0, D_BLOCK), tl.arange(0, DV_BLOCK)
+    q = _rows(query, p, c, D, alive[:, None] & (c < D)[None, :], NUMBER)
+    top = tl.full([PIXELS], float("-inf"), NUMBER)
+    mass, mean_x, mean_y, scatter = (
+        tl.zeros([PIXELS], NUMBER),
+        tl.zeros([PIXELS], NUMBER),
+        tl.zeros([PIXELS], NUMBER),
+        tl.zeros([PIXELS], NUMBER),
+    )
+    seen = tl.zeros([PIXELS, DV_BLOCK], NUMBER)
+    for i in range(samples):
+        x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
+        pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
+        live = counts[:, None] & (c < D)[None, :]
+        s0, s1, s2, s3 = _dots(q, key, first + pixel, across, below, c, D, live, NEAREST, NUMBER)
+        score = _blend(s0, s1, s2, s3, u, v)
+        if BIASED:
+            score += tl.load(bias + p * samples + i, mask=alive, other=0)
+        score = tl.where(counts, score, float("-inf"))
+        new_top = tl.maximum(top, score)
+        base = tl.where(new_top == float("-inf"), 0.0, new_top).to(NUMBER)
+        keep, w = tl.exp(top - base), tl.exp(score - base)
+        live = counts[:, None] & (cv < DV)[None, :]
+        row = _blended(value, first + pixel, across, below, u, v, cv, DV, live, NEAREST, NUMBER)
+        seen = seen * keep[:, None] + w[:, None] * row
+        mass = mass * keep + w
+        share = tl.where(mass > 0, w / tl.where(mass > 0, mass, 1.0), 0.0).to(NUMBER)
+        dx, dy = x - mean_x, y - mean_y
+        mean_x += share * dx
+        mean_y += share * dy
+        scatter = scatter * keep + w * (dx * (x - mean_x) + dy * (y - mean_y))
+        top = new_top
+    some = mass > 0
+    whole = tl.where(some, mass, 1.0).to(NUMBER)
+    spread = tl.sqrt(tl.maximum(scatter / whole, 0.0))
+    tl.store(statistics + 4 * p, tl.where(some, mean_x, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 1, tl.where(some, mean_y, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 2, tl.where(some & (spread > LEAST), spread, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 3, tl.where(some, 1.0 / whole, 0.0), mask=alive)
+    tl.store(logsum + p, tl.where(some, top + tl.log(whole), float("-inf")), mask=alive)
+    live = alive[:, None] & (cv < DV)[None, :]
+    seen = tl.where(some[:, None], seen / whole[:, None], 0.0)
+    tl.store(out + p[:, None] * DV + cv[None, :], seen.to(out.dtype.element_ty), mask=live)
+
+
+@compiled
+def _add(out, pixel, weight, x, channel, D, live, scale, FIXED):
+    """Adds weight x to pixels of a picture."""
+    at = out + pixel[:, None] * D + channel[None, :]
+    add = weight[:, None] * x
+    if FIXED:
+        add = add.to(tl.float64) * scale
+        tl.atomic_add(at, tl.floor(add + 0.5).to(tl.int64), mask=live)
+    else:
+        tl.atomic_add(at, add, mask=live)
+
+
+@compiled
+def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, scale, NEAREST, FIXED):
+    if NEAREST:
+        _add(out, pixel, weight, x, channel, D, live, scale, FIXED)
+    else:
+        _add(out, pixel, weight * (1 - u) * (1 - v), x, channel, D, live, scale, FIXED)
+        _add(out, pixel + across, weight * u * (1 - v), x, channel, D, live, scale, FIXED)
+        _add(out, pixel + below, weight * (1 - u) * v, x, channel, D, live, scale, FIXED)
+        _add(out, pixel + across + below, weight * u * v, x, channel, D, live, scale, FIXED)
+
+
+@compiled
+def _backward(
+    query,
+    key,
+    value,
+    points,
+    mask,
+    fractions,
+    bias,
+    pixels,
+    alpha_pixels,
+    height,
+    width,
+    samples,
+    statistics,
+    logsum,
+    upstream,
+    statistics_upstream,
+    scales,
+    query_out,
+    key_out,
+    value_out,
+    points_out,
+    bias_out,
+    D: tl.constexpr,
+    DV: tl.constexpr,
+    D_BLOCK: tl.constexpr,
+    DV_BLOCK: tl.constexpr,
+    PIXELS: tl.constexpr,
+    SHARED: tl.constexpr,
+    STRAIGHT: tl.constexpr,
+    NEAREST: tl.constexpr,
+    BIASED: tl.constexpr,
+    NUMBER: tl.constexpr,
+    WANTS_BIAS: tl.constexpr,
+    FIXED: tl.constexpr,
+):
+    p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
+    alive = p < pixels
+    place = p % alpha_pixels if SHARED else p
+    first = p // alpha_pixels * height * width
+    c, cv = tl.arange(0, D_BLOCK), tl.arange(0, DV_BLOCK)
+    q = _rows(query, p, c, D, alive[:, None] & (c < D)[None, :], NUMBER)
+    g = _rows(upstream, p, cv, DV, alive[:, None] & (cv < DV)[None, :], NUMBER)
+    lse = tl.load(logsum + p, mask=alive, other=float("-inf"))
+    alive = alive & (lse > float("-inf"))
+    lse = tl.where(alive, lse, 0.0)
+    mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
+    mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
+    spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)
+    gx = tl.load(statistics_upstream + 4 * p, mask=alive, other=0)
+    gy = tl.load(statistics_upstream + 4 * p + 1, mask=alive, other=0)
+    gpeak = tl.load(statistics_upstream + 4 * p + 3, mask=alive, other=0)
+    pull = tl.load(statistics_upstream + 4 * p + 2, mask=alive, other=0)
+    pull = tl.where(spread > 0, pull / tl.where(spread > 0, spread, 1.0), 0.0).to(NUMBER)
+    best = tl.zeros([PIXELS], tl.int32)
+    most = tl.full([PIXELS], float("-inf"), NUMBER)
+    at_best = tl.zeros([PIXELS], NUMBER)
+    mean = tl.zeros([PIXELS], NUMBER)
+    key_scale, value_scale = tl.load(scales).to(tl.float64), tl.load(scales + 1).to(tl.float64)
+    for i in range(samples):
+        x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
+        pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
+        live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
+        s0, s1, s2, s3 = _dots(q, key, first + pixel, across, below, c, D, live, NEAREST, NUMBER)
+        v0, v1, v2, v3 = _dots(g, value, first + pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
+        score = _blend(s0, s1, s2, s3, u, v)
+        if BIASED:
+            score += tl.load(bias + p * samples + i, mask=alive, other=0)
+        w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
+        away = (x - mean_x) * (x - mean_x) + (y - mean_y) * (y - mean_y)
+        mean += w * (_blend(v0, v1, v2, v3, u, v) + gx * x + gy * y + 0.5 * pull * away)
+        better = counts & (score > most)
+        best = tl.where(better, i, best)
+        most = tl.where(better, score, most)
+        at_best = tl.where(better, w, at_best)
+    mean += gpeak * at_best
+    by_query = tl.zeros([PIXELS, D_BLOCK], NUMBER)
+    x_start, y_start, x_end, y_end = (
+        tl.zeros([PIXELS], NUMBER),
+        tl.zeros([PIXELS], NUMBER),
+        tl.zeros([PIXELS], NUMBER),
+        tl.zeros([PIXELS], NUMBER),
+    )
+    for i in range(samples):
+        x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
+        pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
+        live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
+        s0, s1, s2, s3 = _dots(q, key, first + pixel, across, below, c, D, live, NEAREST, NUMBER)
+        v0, v1, v2, v3 = _dots(g, value, first + pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
+        score = _blend(s0, s1, s2, s3, u, v)
+        if BIASED:
+            score += tl.load(bias + p * samples + i, mask=alive, other=0)
+        w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
+        away = (x - mean_x) * (x - mean_x) + (y - mean_y) * (y - mean_y)
+        slope = _blend(v0, v1, v2, v3, u, v) + gx * x + gy * y + 0.5 * pull * away
+        slope += tl.where(best == i, gpeak, 0.0)
+        by_score = w * (slope - mean)
+        row = _blended(key, first + pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
+        by_query += by_score[:, None] * row
+        _add_around(
+            key_out, first + pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED
+        )
+        _add_around(
+            value_out, first + pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED
+        )
+        dx, dy = w * (gx + pull * (x - mean_x)), w * (gy + pull * (y - mean_y))
+        if not NEAREST:
+            across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)
+            across_v = (1 - v) * (v1 - v0) + v * (v3 - v2)
+            below_s = (1 - u) * (s2 - s0) + u * (s3 - s1)
+            below_v = (1 - u) * (v2 - v0) + u * (v3 - v1)
+            dx += tl.where((x >= 0) & (x <= width - 1), by_score * across_s + w * across_v, 0.0)
+            dy += tl.where((y >= 0) & (y <= height - 1), by_score * below_s + w * below_v, 0.0)
+        if WANTS_BIAS:
+            tl.store(bias_out + p * samples + i, by_score, mask=counts)
+        if STRAIGHT:
+            f = tl.load(fractions + i)
+            x_start += (1 - f) * dx
+            y_start += (1 - f) * dy
+            x_end += f * dx
+            y_end += f * dy
+        else:
+            tl.store(points_out + 2 * (p * samples + i), dx, mask=counts)
+            tl.store(points_out + 2 * (p * samples + i) + 1, dy, mask=counts)
+    if STRAIGHT:
+        tl.store(points_out + 4 * p, x_start, mask=alive)
+        tl.store(points_out + 4 * p + 1, y_start, mask=alive)
+        tl.store(points_out + 4 * p + 2, x_end, mask=alive)
+        tl.store(points_out + 4 * p + 3, y_end, mask=alive)
+    live = (p < pixels)[:, None] & (c < D)[None, :]
+    tl.store(query_out + p[:, None] * D + c[None, :], by_query.to(query_out.dtype.element_ty), mask=live)
