@@ -67,9 +67,10 @@ def evaluate_pairs(
 ) -> list[Row]:
     """Each method's scores on each pair at each rate: whole frames, values cut to 0..1 and not rounded.
 
-    `max_disparity`, in alpha's pixels, is the same for all (the paper's: 120 / rate pixels of beta). With `pictures`,
-    a folder, a strip for each pair and rate goes there: beta enlarged, each method, the truth. Raises ValueError
-    naming the method and the pair if a result has another shape than the truth or is not finite.
+    `max_disparity`, in alpha's pixels, is the same for all (the paper's: 120 / rate pixels of beta). With
+    `pictures`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the truth.
+    Raises ValueError naming the method and the pair if a result has another shape than the truth or is not
+    finite.
     """
     rows = []
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):

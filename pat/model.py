@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol
+from typing import Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -61,6 +61,7 @@ class Fused(NamedTuple):
     confidence: list[Tensor]
 
 
+@runtime_checkable
 class FusionNetwork(Protocol):
     """What `fuse` asks of a network."""
 

@@ -24,7 +24,6 @@ from torch.nn.functional import conv2d, interpolate, pad
 from arraygeom.pixels import HW, resize_matrix
 from arraygeom.sensor import Band
 
-Number = float | int
 _RGB_NANOMETRES = (600.0, 540.0, 460.0)
 _RGB_SIGMA = 35.0
 _REC601 = (0.299, 0.587, 0.114)
@@ -82,7 +81,7 @@ class Coded(Step):
 class Exposure(Step):
     """Linear light times a gain: exposure time, aperture and amplification together."""
 
-    gain: Number | Tensor
+    gain: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The brighter or darker pictures, not clipped."""
@@ -150,7 +149,7 @@ class BoxBlur(Step):
 class GaussianBlur(Step):
     """Uniform Gaussian defocus; sigma in pixels."""
 
-    sigma: Number | Tensor
+    sigma: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The blurred pictures."""
@@ -165,7 +164,7 @@ class GaussianBlur(Step):
 class DiscBlur(Step):
     """Uniform defocus by a round aperture: the mean over a disc, its radius in pixels, its rim one pixel soft."""
 
-    radius: Number | Tensor
+    radius: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The blurred pictures."""
@@ -175,7 +174,7 @@ class DiscBlur(Step):
         return _convolved(image, kernel / kernel.sum())
 
 
-def _value(x: Number | Tensor) -> float:
+def _value(x: float | Tensor) -> float:
     return float(x.detach()) if isinstance(x, Tensor) else float(x)
 
 
@@ -195,7 +194,7 @@ class Resample(Step):
     the usual antialiased resize with a = -0.5.
     """
 
-    to: Number | HW
+    to: float | HW
     method: Literal["area", "bicubic"] = "area"
 
     def hw(self, hw: HW) -> HW:
@@ -233,8 +232,8 @@ class Noise(Step):
     differentiable; true Poisson counts differ visibly below about ten electrons only.
     """
 
-    full_well: Number
-    read: Number = 0.0
+    full_well: float
+    read: float = 0.0
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The noisy pictures, not clipped."""
@@ -272,9 +271,9 @@ class Jitter(Step):
     for coded values.
     """
 
-    gain: Number = 0.05
-    gamma: Number = 0.05
-    balance: Number = 0.03
+    gain: float = 0.05
+    gamma: float = 0.05
+    balance: float = 0.03
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The changed pictures."""

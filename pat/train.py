@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import torch
 from torch import Generator, Tensor
@@ -44,8 +44,10 @@ class TrainConfig:
     """A recipe. Photographs are read from the folders; nothing else is needed.
 
     `steps` of `batch` scenes whose alpha is `hw`, or as many as fit into `minutes`; Adam at `rate`, down to nothing
-    along a half cosine. Each batch of scenes is recorded `reuse` times, at random moments, differently. The average of the weights over about `average` steps is validated every `validate` steps on scenes from
-    photographs held out, and the best is kept. In `filtered` of the batches beta is three cameras, one a band.
+    along a half cosine. Each batch of scenes is recorded `reuse` times, at random moments, differently. The
+    average of the weights over about `average` steps is validated every `validate` steps on scenes from
+    photographs held out (every `held_out`-th), and the best is kept. In the share `filtered` of the batches beta
+    is three cameras, one a band; in the share `rectified`, rigs are rectified.
     """
 
     photos: tuple[Path, ...]
@@ -83,6 +85,7 @@ def train(config: TrainConfig) -> Path:
     config.out.mkdir(parents=True, exist_ok=True)
     network = GuidedPAT(config.network)
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
+    averaged = cast(GuidedPAT, average.module)
     adam = torch.optim.Adam(network.parameters(), lr=config.rate, betas=(0.9, 0.99))
     learn, examine = scenes(config)
     examination = list(examine(8))
@@ -101,13 +104,13 @@ def train(config: TrainConfig) -> Path:
         adam.step()
         average.update_parameters(network)
         if step % config.validate == 0 or done >= 1:
-            facts = validation(average.module, examination)
+            facts = validation(averaged, examination)
             facts |= {"step": step, "loss": float(loss.detach()), "minutes": (time.monotonic() - started) / 60}
             _log(config, facts)
             if facts["psnr"] > best:
                 best = facts["psnr"]
                 recipe = {"recipe": json.dumps(asdict(config), default=str), "validation": json.dumps(facts)}
-                save_weights(average.module, config.out / "best.safetensors", facts=recipe)
+                save_weights(averaged, config.out / "best.safetensors", facts=recipe)
         if done >= 1:
             break
     return config.out / "best.safetensors"

@@ -196,7 +196,11 @@ class _Text:
 
     @staticmethod
     def rigs(source: Source) -> list[list[_Sensor]]:
-        return [list(_Text._sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
+        found = [list(_Text._sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
+        if not found:
+            raise source.fail(None, "holds no rig; was it cut off?")
+        _check_count(source, "rigs", len(found))
+        return found
 
     @staticmethod
     def _sensors(source: Source, entry: str, fields: list[str]) -> Iterator[_Sensor]:

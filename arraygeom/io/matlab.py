@@ -8,17 +8,18 @@ world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose:
 
 from __future__ import annotations
 
-import contextlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import scipy.io
+import torch
 from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import Distortion
-from ..epipolar import fundamental_matrix, shift_origin
+from ..epipolar import epipolar_lines, shift_origin
+from ..pixels import pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
 from .source import Source
@@ -70,11 +71,11 @@ def _document(source: Source) -> dict[str, Any]:
 
 def _outermost(source: Source, fields: dict[str, Any]) -> dict[str, Any]:
     """The struct itself, or the first variable of the file that holds one."""
-    if "CameraParameters1" in fields or _is_camera(fields):
-        return fields
-    for value in fields.values():
+    for value in (fields, *fields.values()):
         if isinstance(value, dict) and ("CameraParameters1" in value or _is_camera(value)):
             return value
+        if value is fields and any(name.endswith("Camera2") or name == "CameraParameters2" for name in fields):
+            raise source.fail("CameraParameters1", "is missing, and the second camera's is here; is the file whole?")
     raise source.fail(
         "CameraParameters1",
         "is missing: MATLAB objects cannot be read, save the struct, s = toStruct(stereoParams); save(f, 's', '-v7')",
@@ -127,13 +128,17 @@ def _pose(source: Source, fields: dict[str, Any]) -> Pose:
 
 
 def _check_fundamental(source: Source, F: Tensor, one: Camera, two: Camera) -> None:
-    """F as stated, of pixels counted from 1, has to be that of the cameras, up to its scale."""
-    relative = two.cam_from_world @ one.cam_from_world.inverse()
-    ours, stated = fundamental_matrix(one.K, two.K, relative), shift_origin(F, 1.0)
-    with contextlib.suppress(ZeroDivisionError):
-        ours, stated = ours / ours.norm(), stated / stated.norm()
-    if min((ours - stated).norm(), (ours + stated).norm()) > 1e-2:
+    """Points that both pinholes see have to be on the lines of F as stated, which is of pixels counted from 1."""
+    h, w = one.hw
+    x = pixel_grid((4, 4), dtype=torch.float64).reshape(-1, 2) * torch.tensor([w / 4, h / 4])
+    baseline = two.centre.norm()
+    rays = to_homogeneous(x) @ torch.linalg.inv(one.K).T
+    X = two.cam_from_world.apply(torch.cat([rays * baseline * 5, rays * baseline * 50]))
+    x_two = to_homogeneous(X[:, :2] / X[:, 2:]) @ two.K.T
+    lines = epipolar_lines(shift_origin(F, 1.0), torch.cat([x, x]))
+    distance = (lines * x_two).sum(-1).abs().median()
+    if not distance < 1:
         raise source.fail(
             "FundamentalMatrix",
-            "contradicts the rotation and translation of camera 2; is the rotation transposed, or the pose inverted?",
+            f"contradicts the pose of camera 2 by {distance:.3g} px; is the rotation transposed, or the pose inverted?",
         )

@@ -68,12 +68,12 @@ def _pose(source: Source, info: dict[str, Any]) -> Pose:
 
 
 def _lens(source: Source, info: dict[str, Any]) -> Distortion | None:
-    model, entry = info.get("distortion_model"), "distortion_coefficients"
+    model, entry = source.get(info, "distortion_model", ""), "distortion_coefficients"
     if model in ("plumb_bob", "rational_polynomial"):
         return source.brown_conrady(_data(source, info, entry), entry)
     if model in ("equidistant", "fisheye"):
         return source.kannala_brandt(_data(source, info, entry), entry)
-    if model in (None, "", "none"):
+    if model in ("", "none"):
         return None
     raise source.fail("distortion_model", f"is '{model}'; supported: plumb_bob, rational_polynomial, equidistant")
 

@@ -15,6 +15,10 @@ from torch import Tensor
 from pat.attention import reference
 from pat.attention.reference import Attended, Look
 
+INPUTS = "Tensor query, Tensor key, Tensor value, Tensor points, Tensor mask, Tensor? bias"
+SAVED = "Tensor statistics, Tensor logsum, Tensor value_cotangent, Tensor statistics_cotangent"
+OPTIONS = "int samples, bool straight, bool nearest, str backend, bool strict"
+
 
 def attend(
     query: Tensor,
@@ -45,7 +49,9 @@ def _kernels(backend: str) -> ModuleType:
     return gpu
 
 
-@torch.library.custom_op("pat::attend", mutates_args=())
+@torch.library.custom_op(
+    "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor)"
+)
 def _attend(
     query: Tensor,
     key: Tensor,
@@ -70,7 +76,11 @@ def _(query, key, value, points, mask, bias, samples, straight, nearest, backend
     return out, points.new_empty(b, ha, wa, 4), points.new_empty(b, ha, wa)
 
 
-@torch.library.custom_op("pat::attend_backward", mutates_args=())
+@torch.library.custom_op(
+    "pat::attend_backward",
+    mutates_args=(),
+    schema=f"({INPUTS}, {SAVED}, {OPTIONS}, bool[] wanted) -> (Tensor, Tensor, Tensor, Tensor, Tensor)",
+)
 def _attend_backward(
     query: Tensor,
     key: Tensor,
@@ -128,7 +138,15 @@ def _differentiate(ctx, value_cotangent, statistics_cotangent, _):
         wanted,
     )
     q, k, v, p, b = (g if want else None for g, want in zip(gradients, wanted))
-    return q, k, v, p, None, None if bias is None or b is None else b.to(bias.dtype), *[None] * len(ctx.options)
+    return (
+        q,
+        k,
+        v,
+        p,
+        None,
+        None if bias is None or b is None else b.to(bias.dtype),
+        *[None] * len(ctx.options),
+    )
 
 
 _attend.register_autograd(_differentiate, setup_context=_keep)
@@ -143,9 +161,12 @@ def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: of the reference's gradient, made anew with a graph."""
     samples, straight, nearest, backend, strict, wanted = ctx.options
     if strict:
-        raise RuntimeError(f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'")
+        raise RuntimeError(
+            f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'"
+        )
     query, key, value, points, mask, bias, _, _, *upstream = (
-        t if t is None or not t.is_floating_point() else t.detach().requires_grad_() for t in ctx.saved_tensors
+        t if t is None or not t.is_floating_point() else t.detach().requires_grad_()
+        for t in ctx.saved_tensors
     )
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
     with torch.enable_grad():

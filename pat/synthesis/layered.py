@@ -183,8 +183,9 @@ class _Front:
 
 def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"]:
     """The homography H with H (x, 1) = (u, v, 1) / z: pixels to metres on the planes, and inverse depth."""
-    world = Pose(camera.R[:, None], camera.t[:, None])
-    pose = world @ layers.plane_from_world.inverse()
+    planes = layers.plane_from_world
+    camera_from_world = Pose(camera.R[:, None].expand_as(planes.R), camera.t[:, None].expand_as(planes.t))
+    pose = camera_from_world @ planes.inverse()
     eye = torch.eye(3, dtype=camera.K.dtype)
     H = plane_homography(eye, camera.K[:, None], pose.R, pose.t, normal=eye[2], d=-eye[0, 0])
     return torch.linalg.inv(H)

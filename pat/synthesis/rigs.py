@@ -14,7 +14,7 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose, rotation_from_vector
 
-Range = tuple[float | int, float | int]
+Range = tuple[float, float]
 
 
 @dataclass(frozen=True)

@@ -1,26 +1,35 @@
-"""Makes the sample array that ships in pat/sample: `python -m pat.synthesis.sample --photos DIR`."""
+"""Makes the sample array that ships in pat/sample: `python -m pat.synthesis.sample`.
+
+Its textures are pictures that scikit-image ships, free to use (astronaut: NASA; chelsea, coffee and rocket: CC0), and patterns.
+"""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
 
+import numpy as np
 import torch
 import tyro
+from skimage import io
+from skimage.data import data_dir
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics, rotation_from_vector
+from arraygeom.rig import depth_range
 from pat.demo import ALPHA, BETA, SAMPLE
 from pat.images import luminance, write_image
 from pat.sensors import Clip, Noise, Quantise, record
 
 from .layered import LayeredScenes
+from .patterns import patterns
 from .photos import PhotoBank
-from .rigs import RigBatch
+from .rigs import RigBatch, RigDistribution
 
 HW = (400, 640)
+PICTURES = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")
 
 
-def sample_rig() -> Rig:
+def sample_cameras() -> dict[str, Camera]:
     """A mono alpha and, 12 cm to its right and a little above, a wider colour camera, turned and toed in."""
     turned = rotation_from_vector(torch.tensor([0.6, -1.5, 2.0], dtype=torch.float64) * math.pi / 180)
     centre = torch.tensor([0.12, -0.03, 0.01], dtype=torch.float64)
@@ -31,17 +40,24 @@ def sample_rig() -> Rig:
         hw=(360, 560),
         sensor=Sensor(response="rgb"),
     )
-    return Rig({ALPHA: mono, BETA: colour}, depth=(1.4, 20.0), name="sample: mono + colour")
+    return {ALPHA: mono, BETA: colour}
 
 
-def main(photos: tuple[Path, ...], out: Path = SAMPLE, seed: int = 7) -> None:
+def photographs() -> list[np.ndarray]:
+    """The textures (H, W, 3), uint8."""
+    return [io.imread(Path(data_dir) / name)[..., :3] for name in PICTURES]
+
+
+def main(out: Path = SAMPLE, seed: int = 2) -> None:
     """Render a layered scene with the sample rig, record it, and write rig, pictures and truth."""
-    rig = sample_rig()
+    cameras = sample_cameras()
+    rig = Rig(cameras, depth=depth_range(1.4, 20.0), name="sample: mono + colour")
     generator = torch.Generator().manual_seed(seed)
-    scenes = LayeredScenes(PhotoBank.load(*photos), None, hw=HW, layers=(9, 12), seed=seed)  # type: ignore[arg-type]
+    pictures = photographs()
+    bank = PhotoBank(pictures + patterns(np.random.default_rng(seed), 4), photos=len(pictures))
+    scenes = LayeredScenes(bank, RigDistribution(), hw=HW, layers=(9, 12), seed=seed)
     near, far = (torch.tensor([d], dtype=torch.float64) for d in (1.6, 16.0))
-    cameras = [_batched(rig[name]) for name in rig.names]
-    views = scenes.render(RigBatch(cameras, near, far), generator, oversampling=2)
+    views = scenes.render(RigBatch([_batched(c) for c in cameras.values()], near, far), generator, oversampling=2)
     truth, seen = views.images
     mono = record(luminance(truth), [Noise(8000, 3), Clip(), Quantise(8)], generator).image
     colour = record(seen, [Noise(4000, 3), Clip(), Quantise(8)], generator).image

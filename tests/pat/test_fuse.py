@@ -1,0 +1,136 @@
+"""fuse: tiles equal the whole, sizes and pitches are followed, mistakes are named."""
+
+import math
+
+import pytest
+import torch
+
+import pat.fuse
+from arraygeom import Camera, Epipolar, Link, Pose, Rig, View, intrinsics, rotation_from_vector
+from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, tiles_of
+from pat.guided import GuidedPAT, GuidedPATConfig
+from pat.model import PAT, PATConfig
+
+
+def rig_of(hw, beta_hw, focal=300.0, beta_focal=200.0) -> Rig:
+    R = rotation_from_vector(torch.tensor([0.004, -0.01, 0.02], dtype=torch.float64))
+    t = torch.tensor([-0.1, 0.01, 0.0], dtype=torch.float64)
+    return Rig(
+        {
+            "mono": Camera(K=intrinsics(focal, hw), cam_from_world=Pose.identity(), hw=hw),
+            "colour": Camera(K=intrinsics(beta_focal, beta_hw), cam_from_world=Pose(R, t), hw=beta_hw),
+        },
+        depth=(2.0, 20.0),
+    )
+
+
+def network_of(kind: str):
+    torch.manual_seed(1)
+    if kind == "PAT":
+        return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4)).eval()
+    torch.nn.init.normal_(network.head.last.weight, std=0.2)
+    return network
+
+
+@pytest.mark.parametrize("kind", ["PAT", "GuidedPAT"])
+def test_tiled_equals_whole(kind, monkeypatch):
+    """At every pixel, the tiles' borders included. The frame is wider than a tile with its halo."""
+    hw, beta_hw = (50, 1210), (40, 830)
+    network, rig = network_of(kind), rig_of(hw, beta_hw)
+    g = torch.Generator().manual_seed(0)
+    images = {"mono": torch.rand(1, *hw, generator=g), "colour": torch.rand(3, *beta_hw, generator=g)}
+    whole = fuse(network, rig, images, alpha="mono")
+    tiles = list(tiles_of(hw, 160, network.halo))
+    assert any(t.outer[3] - t.outer[2] < hw[1] for t in tiles)
+    monkeypatch.setattr(pat.fuse, "plan", lambda *_: tiles)
+    tiled = fuse(network, rig, images, alpha="mono")
+    assert (tiled.image - whole.image).abs().max() < 1e-5
+    assert (tiled.confidence - whole.confidence).abs().max() < 1e-5
+    assert torch.allclose(1 / tiled.depth, 1 / whole.depth, atol=1e-5, equal_nan=True)
+    monkeypatch.setattr(type(network), "halo", 16)
+    monkeypatch.setattr(pat.fuse, "plan", lambda *_: list(tiles_of(hw, 160, 16)))
+    assert (fuse(network, rig, images, alpha="mono").image - whole.image).abs().max() > 1e-5
+
+
+def test_memory_decides_the_tiles():
+    network, hw = network_of("PAT"), (3000, 4000)
+    assert pat.fuse.plan(network, hw, [], None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
+    tiles = pat.fuse.plan(network, hw, [], 2.0**31)
+    area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
+    assert area * network.bytes_per_pixel <= 2**31
+    assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
+    with pytest.raises(ValueError, match="needs at least"):
+        pat.fuse.plan(network, hw, [], 2.0**20)
+
+
+def test_bytes_are_read():
+    assert parse_bytes("4GiB") == 4 * 2**30
+    assert parse_bytes("500 MB") == 5e8
+    assert parse_bytes(7) == 7.0
+    with pytest.raises(ValueError, match="'4 gigs'"):
+        parse_bytes("4 gigs")
+
+
+def test_pitch_is_the_ratio_of_pixels():
+    rig = rig_of((60, 80), (60, 80), focal=100.0, beta_focal=50.0)
+    assert abs(pitch_ratio(rig.pair("mono", "colour")) - 0.5) < 0.01
+    assert abs(pitch_ratio(rig.pair("colour", "mono")) - 2.0) < 0.04
+
+
+def test_colour_comes_from_where_the_field_says():
+    """A red half and a blue half: each alpha pixel gets the colour of its own side, from a turned beta too."""
+    hw = (64, 96)
+    rig = rig_of(hw, hw, focal=100.0, beta_focal=100.0)
+    g = torch.Generator().manual_seed(0)
+    side = (torch.arange(96) < 48).float().expand(1, *hw)
+    truth = torch.cat([side, 0 * side, 1 - side]) * (0.5 + 0.5 * torch.rand(1, *hw, generator=g))
+    network = network_of("GuidedPAT")
+    torch.nn.init.zeros_(network.head.last.weight)
+    torch.nn.init.zeros_(network.head.last.bias)
+    upright = fuse(network, rig, {"mono": truth, "colour": truth}, alpha="mono", depth=(5, 20)).image
+    turned = fuse(
+        network, rig.turn("colour", 1), {"mono": truth, "colour": truth.rot90(1, (-2, -1))}, alpha="mono", depth=(5, 20)
+    ).image
+    for image in (upright, turned):
+        assert image[0, :, 10:40].mean() > image[2, :, 10:40].mean() + 0.1
+        assert image[2, :, 56:86].mean() > image[0, :, 56:86].mean() + 0.1
+
+
+def test_uncalibrated_rigs_fuse_without_depth():
+    hw = (48, 64)
+    F = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    views = {name: View(hw=hw) for name in ("mono", "red", "green", "blue")}
+    links = {("mono", name): Link(F) for name in ("red", "green", "blue")}
+    images = {name: torch.rand(1, *hw) for name in views}
+    frame = fuse(network_of("GuidedPAT"), Rig(views, links=links), images, alpha="mono", match_levels=True)
+    assert frame.image.shape == (3, *hw)
+    assert frame.depth.isnan().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"colour": torch.rand(3, 40, 61)}, "'colour' is 61x40, the rig says 60x40"),
+        ({"color": torch.rand(3, 40, 60)}, "no camera 'color'; did you mean 'colour'"),
+        ({"mono": torch.full((1, 50, 70), torch.nan)}, "'mono' has NaN"),
+    ],
+)
+def test_mistakes_are_named(change, message):
+    rig = rig_of((50, 70), (40, 60))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)} | change
+    with pytest.raises(ValueError, match=message):
+        fuse(network_of("PAT"), rig, images, alpha="mono")
+
+
+def test_views_must_overlap():
+    rig = rig_of((50, 70), (40, 60))
+    back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
+    rig = rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(back, torch.zeros(3).double())))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
+    with pytest.raises(ValueError, match="'colour's views do not overlap between 2 and 20 m"):
+        fuse(network_of("PAT"), rig, images, alpha="mono", field=Epipolar())
+    with pytest.raises(ValueError, match="0 < near <= far"):
+        fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))
+    with pytest.raises(ValueError, match="at least one beta"):
+        fuse(network_of("PAT"), rig, {"mono": images["mono"]}, alpha="mono")
