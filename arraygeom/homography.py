@@ -51,11 +51,10 @@ def infinite_homography(
 def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> MappedPoints:
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
-    `valid` where the result is finite and its homogeneous scale is positive.
-
-    The sign of H matters: `plane_homography` and `infinite_homography` give it such that the scale is
-    positive in front of both cameras; a fitted H is fixed only up to sign and has to be oriented first. Where
-    not valid, x is zero and so is its gradient.
+    `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters:
+    `plane_homography` and `infinite_homography` give it such that the scale is positive in front of both cameras;
+    a fitted H is fixed only up to sign and has to be oriented first. Where not valid, x is zero and so is its
+    gradient.
     """
     X, Y, scale = map_homogeneous(H, x).unbind(-1)
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()

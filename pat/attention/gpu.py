@@ -57,11 +57,7 @@ def backward(
     counted = _accumulated(query)
     upstream, statistics_upstream = _channels_last(cotangents[0]), cotangents[1].to(counted).contiguous()
     fixed = torch.are_deterministic_algorithms_enabled()
-    scales = (
-        _scales(query, key, value, upstream, statistics_upstream)
-        if fixed
-        else query.new_ones(2, dtype=counted)
-    )
+    scales = _scales(query, key, value, upstream, statistics_upstream) if fixed else query.new_ones(2, dtype=counted)
     sums = torch.int64 if fixed else counted
     pictures = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
@@ -89,9 +85,7 @@ def backward(
     return tuple(t if want else t.new_empty(0) for t, want in zip(found, wanted))
 
 
-def _scales(
-    query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor
-) -> Tensor:
+def _scales(query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor) -> Tensor:
     """By which key's and value's gradients are multiplied so that their sums fit into fixed point.
 
     The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the largest gradient
@@ -423,12 +417,8 @@ def _backward(
         by_score = w * (slope - mean)
         row = _blended(key, first + pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
         by_query += by_score[:, None] * row
-        _add_around(
-            key_out, first + pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED
-        )
-        _add_around(
-            value_out, first + pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED
-        )
+        _add_around(key_out, first + pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED)
+        _add_around(value_out, first + pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)
         dx, dy = w * (gx + pull * (x - mean_x)), w * (gy + pull * (y - mean_y))
         if not NEAREST:
             across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)

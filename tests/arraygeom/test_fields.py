@@ -469,3 +469,19 @@ def test_float32_agrees_with_float64_on_a_thousand_rigs(seed, turn):
     compared = exact.valid & quick.valid & sure_of(exact, rig["beta"].hw)
     for a, b in ((exact.start, quick.start), (exact.end, quick.end)):
         assert (a - b)[compared].abs().max() < 0.02
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_epipole_itself_looks_at_one_point(dtype):
+    """The ray through beta's centre: 0/0 there, and the same pixel on the way to it."""
+    s = Epipolar()(pair_of(DEGENERATE["opposing"]), torch.tensor([[31.5 + 0.1 / 5 * 32, 23.5]], dtype=dtype))
+    assert s.valid.tolist() == [True]
+    assert s.length.max() < 0.3
+
+
+def test_gradients_are_finite_where_only_some_rigs_of_a_batch_are_degenerate():
+    rig = batch_of([DEGENERATE["identical cameras"], DEGENERATE["near is far"], DEGENERATE["opposing"]])
+    changes = rig.parameters(free=["beta.*"])
+    s = look(Epipolar(), pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=torch.float64)[None, ::8, ::8])
+    slopes = torch.autograd.grad(s.start.sum() + s.end.sum(), list(changes.values()), allow_unused=True)
+    assert all(v is None or v.isfinite().all() for v in slopes)

@@ -35,16 +35,12 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
     y, x = torch.meshgrid(torch.arange(ha).float(), torch.arange(wa).float(), indexing="ij")
     length = min(samples - 1, wa - 1)
     slope = min(0.06, (ha - 5) / length)
-    start = torch.stack(
-        [(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1
-    )
+    start = torch.stack([(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1)
     end = start + torch.tensor([length, slope * length])
     return Segments(start.to(device), end.to(device), torch.ones(ha, wa, dtype=torch.bool, device=device))
 
 
-def index_everything(
-    q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
-) -> Tensor:
+def index_everything(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
     """(a): (b, h, w, l, d) keys and values, nearest."""
     xy = (look.positions(samples).xy + 0.5).floor().long()
     x, y = xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
@@ -82,9 +78,7 @@ def measure(job: dict) -> dict:
     ha, wa, d, samples = job["ha"], job["wa"], job["d"], job["samples"]
     torch.manual_seed(0)
     q, k, v = (
-        torch.randn(1, d, ha, wa, dtype=dtype, device=device)
-        .to(memory_format=torch.channels_last)
-        .requires_grad_()
+        torch.randn(1, d, ha, wa, dtype=dtype, device=device).to(memory_format=torch.channels_last).requires_grad_()
         for _ in range(3)
     )
     look, run = field(ha, wa, samples, device), METHODS[job["method"]]
@@ -119,9 +113,7 @@ def measure(job: dict) -> dict:
 
 def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
     """Compiles what has to be, on a small picture."""
-    q, k, v = (
-        torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3)
-    )
+    q, k, v = (torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3))
     out = run(q, k, v, field(8, 8, 4, device), 4, job["interpolation"])
     if job["backward"]:
         out.sum().backward()
@@ -227,9 +219,7 @@ def row(entry: dict, result: dict, baselines: dict, rate: float, bandwidth: floa
     least = (2 if entry["backward"] else 1) * result["unit"]
     key = (shape, work)
     against = [
-        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x"
-        if base
-        else "-"
+        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x" if base else "-"
         for base in (
             baselines.get((*key, "index", "nearest")),
             baselines.get((*key, "grid_sample", entry["interpolation"])),
