@@ -46,7 +46,7 @@ console = Console(stderr=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Fuse the sample array of the package: picture, depth, confidence, a figure, and PSNR and SSIM beside a baseline."""
+    """Fuse the sample array of the package: picture, depth, confidence, a figure; PSNR and SSIM beside a baseline."""
 
     out: Path = Path("out/demo")
     """Folder for the results."""

@@ -120,7 +120,7 @@ def band_weights(band: Band) -> tuple[float, float, float]:
     """Weights of R, G and B that add up to 1 (see `Spectral`).
 
     >>> [round(w, 2) for w in band_weights(Band(600, 40))]
-    [0.8, 0.2, 0.0]
+    [0.77, 0.23, 0.0]
     """
     variance = (band.width / (8 * math.log(2)) ** 0.5) ** 2 + _RGB_SIGMA**2
     exponents = [-((band.centre - c) ** 2) / (2 * variance) for c in _RGB_NANOMETRES]

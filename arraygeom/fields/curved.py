@@ -110,7 +110,7 @@ def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW) -> Piec
     return Pieces(first, last, torch.where(seen, length, 0.0))
 
 
-def along_pieces(pieces: Pieces, u: Float[Tensor, l]) -> Float[Tensor, "*n l"]:
+def along_pieces(pieces: Pieces, u: Float[Tensor, "l"]) -> Float[Tensor, "*n l"]:
     """Where on the whole polyline (0 at the first node, 1 at the last) fractions u of the visible length are."""
     first, last, length = pieces
     ends = length.cumsum(-1)

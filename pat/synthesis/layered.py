@@ -13,11 +13,12 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import avg_pool2d
 
 from arraygeom.camera import Camera
 from arraygeom.homography import plane_homography
 from arraygeom.pixels import HW
+from arraygeom.sampling import sample
 from arraygeom.pose import Pose
 
 from .layers import Layers, draw_layers
@@ -123,9 +124,10 @@ class LayeredScenes:
         q = homogeneous[..., 2].contiguous()
         in_front = (q > 1e-6) & layers.present.to(self.device)[..., None]
         q.masked_fill_(~in_front, 1.0)
-        position = (homogeneous[..., :2] / q[..., None]).clamp_(-1, 1).view(B * L, *camera.hw, 2)
         shapes = self.outlines[layers.outline.flatten().to(self.device)]
-        distance = grid_sample(shapes, position, padding_mode="border", align_corners=False).view(B, L, -1)
+        position = (homogeneous[..., :2] / q[..., None]).clamp_(-1, 1).view(B * L, *camera.hw, 2)
+        position = position.add_(1).mul_(shapes.shape[-1] / 2).sub_(0.5)
+        distance = sample(shapes, position).values.view(B, L, -1)
         opacity = (distance / _steps(distance.view(B, L, *camera.hw)).flatten(2) + 0.5).clamp_(0, 1)
         opacity = torch.where(layers.solid.to(self.device)[..., None], 1.0, opacity)
         return q, opacity * in_front

@@ -33,7 +33,7 @@ def test_shipped_weights_load_and_are_small():
 
 
 def test_what_is_not_weights_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no weights 'mono-color'.*mono-colour"):
+    with pytest.raises(FileNotFoundError, match=r"no weights 'mono-color'.*mono-colour"):
         load_weights("mono-color")
     cut = tmp_path / "cut.safetensors"
     save_weights(NETWORKS[0], cut)
