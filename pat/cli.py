@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import tyro
 from rich.console import Console
 from rich.progress import track
-from tyro.conf import Positional, UseAppendAction
+from rich.table import Table
+from tyro.conf import OmitSubcommandPrefixes, Positional, UseAppendAction
 
 from arraygeom import (
     Dense,
@@ -162,10 +163,83 @@ class Show:
         console.print(f"written: {', '.join(map(str, written))}")
 
 
+@dataclass
+class Info:
+    """Fields of view, baselines, pixel footprints, and how long segments are for every pair."""
+
+    rig: Positional[Path]
+    """Rig file of any format known."""
+    depth: tuple[float, float] | None = None
+    """Near and far bounds in metres, instead of the rig's."""
+
+    def run(self) -> None:
+        """Do it."""
+        from arraygeom.summary import summarise_cameras, summarise_pairs
+
+        rig = Rig.load(self.rig)
+        rig = rig if self.depth is None else rig.replace(depth=self.depth)
+        table = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
+        for c in summarise_cameras(rig):
+            wh = f"{c.wh[0]}x{c.wh[1]}"
+            table.add_row(c.name, wh, _numbers(c.focal), _numbers(c.field_of_view, " x "), _numbers(c.footprint, " - "))
+        Console().print(table)
+        pairs = Table("alpha > beta", "baseline m", "turn deg", "seen", "segment px, median - most", box=None)
+        pairs.add_column("depth step m, near - far")
+        for p in summarise_pairs(rig):
+            seen = "" if p.seen is None else f"{p.seen:.0%}"
+            facts = (
+                f"{p.baseline:.4g}",
+                f"{p.rotation:.2f}",
+                seen,
+                _numbers(p.length, " - "),
+                _numbers(p.depth_step, " - "),
+            )
+            pairs.add_row(f"{p.alpha} > {p.beta}", *facts)
+        Console().print(pairs)
+
+
+@dataclass
+class Convert:
+    """Read a rig file of one format and write it in another."""
+
+    source: Positional[Path]
+    """Rig file, or the folder of a format that is one."""
+    target: Positional[Path]
+    """File or folder to write."""
+    read_as: str | None = None
+    """Format of the source; by default recognised."""
+    write_as: str = "native"
+    """Format of the target."""
+
+    def run(self) -> None:
+        """Do it."""
+        from arraygeom.io import read_rig, write_rig
+
+        rig = read_rig(self.source, format=self.read_as)
+        write_rig(rig, self.target, format=self.write_as)
+        console.print(f"written: {self.target} ({len(rig.names)} cameras)")
+
+
+@dataclass
+class RigCommand:
+    """Look at rig files and convert them."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[Info, tyro.conf.subcommand("info")]
+        | Annotated[Convert, tyro.conf.subcommand("convert")]
+        | Annotated[Show, tyro.conf.subcommand("show")]
+    ]
+
+    def run(self) -> None:
+        """Do it."""
+        self.command.run()
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fuse, tyro.conf.subcommand("fuse")]
     | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
 
 
@@ -178,6 +252,10 @@ def fuse_frame(weights: str, rig: Rig, images: dict[str, Tensor], **options: Any
         return track(tiles, "fusing", total=total, console=console)
 
     return fuse(load_weights(weights), rig, images, progress=bar, **options)
+
+
+def _numbers(values: tuple[float, float] | None, between: str = ", ") -> str:
+    return "" if values is None else between.join(f"{v:.4g}" for v in values)
 
 
 def _spread_out(hw: tuple[int, int]) -> Tensor:
@@ -202,7 +280,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="pat",
-        description="Fuse the pictures of an array of unlike cameras into one. Add --debug for a traceback of an error.",
+        description="Fuse the pictures of an array of unlike cameras into one. --debug shows tracebacks.",
         args=[a for a in arguments if a != "--debug"],
     )
     try:

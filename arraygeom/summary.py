@@ -1,0 +1,128 @@
+"""What a designer wants to know of a rig at a glance."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from .camera import Camera
+from .fields import Curved, Epipolar, look
+from .pixels import pixel_grid
+from .rig import Pair, Rig
+from .segments import Segments
+
+
+class CameraSummary(NamedTuple):
+    """One camera. `field_of_view` is (across, down) in degrees; footprints are millimetres a pixel at near and far."""
+
+    name: str
+    wh: tuple[int, int]
+    field_of_view: tuple[float, float] | None
+    focal: tuple[float, float] | None
+    footprint: tuple[float, float] | None
+
+
+class PairSummary(NamedTuple):
+    """Alpha and one beta.
+
+    baseline: metres between the optical centres; rotation: degrees between the orientations.
+    seen: share of alpha's pixels that look somewhere in beta.
+    length: (median, largest) length of their segments, pixels of beta.
+    depth_step: (near, far), the change of depth that moves the point by one pixel in beta, metres.
+    """
+
+    alpha: str
+    beta: str
+    baseline: float
+    rotation: float
+    seen: float | None
+    length: tuple[float, float] | None
+    depth_step: tuple[float, float] | None
+
+
+def summarise_cameras(rig: Rig) -> list[CameraSummary]:
+    """One summary for each camera, in the rig's order; what needs calibration is None without it."""
+    return [_camera(name, rig) for name in rig.names]
+
+
+def summarise_pairs(rig: Rig) -> list[PairSummary]:
+    """One summary for each ordered pair of calibrated cameras."""
+    names = [n for n in rig.names if isinstance(rig[n], Camera)]
+    return [_pair(a, b, rig.pair(a, b)) for a in names for b in names if a != b]
+
+
+def _camera(name: str, rig: Rig) -> CameraSummary:
+    camera = rig[name]
+    h, w = camera.hw
+    if not isinstance(camera, Camera):
+        return CameraSummary(name, (w, h), None, None, None)
+    focal = (float(camera.K[0, :2].norm()), float(camera.K[1, :2].norm()))
+    footprint = None
+    if rig.depth is not None:
+        near, far = (1000 * float(d) / math.sqrt(focal[0] * focal[1]) for d in rig.depth)
+        footprint = near, far
+    return CameraSummary(name, (w, h), field_of_view(camera), focal, footprint)
+
+
+def field_of_view(camera: Camera) -> tuple[float, float]:
+    """Angles (across, down) in degrees between the rays at the middles of opposite edges, through the lens.
+
+    An edge that the lens model does not reach gives NaN.
+    """
+    h, w = camera.hw
+    middle = ((w - 1) / 2, (h - 1) / 2)
+    ends = [(-0.5, middle[1]), (w - 0.5, middle[1]), (middle[0], -0.5), (middle[0], h - 0.5)]
+    centre_ray = camera.rays(camera.K.new_tensor([middle]))[0]
+    rays, valid = camera.rays(camera.K.new_tensor(ends))
+    halves = torch.where(valid, _angles(rays, centre_ray), torch.nan).tolist()
+    return halves[0] + halves[1], halves[2] + halves[3]
+
+
+def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, "n"]:
+    cross = torch.linalg.cross(a, b.expand_as(a)).norm(dim=-1)
+    return torch.rad2deg(torch.atan2(cross, (a * b).sum(-1)))
+
+
+def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
+    pose = pair.beta_from_alpha
+    sine, cosine = _rotation_parts(pose.R)
+    rotation = math.degrees(math.atan2(sine, cosine))
+    seen, length = _segments(pair) if pair.depth is not None else (None, None)
+    baseline = float(pose.centre.norm())
+    return PairSummary(alpha, beta, baseline, rotation, seen, length, _depth_step(pair, baseline))
+
+
+def _rotation_parts(R: Float[Tensor, "3 3"]) -> tuple[float, float]:
+    """Sine and cosine of the angle of a rotation."""
+    axis = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(axis.norm() / 2), float((R.diagonal().sum() - 1) / 2)
+
+
+def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
+    """Share of alpha's pixels that look somewhere, and (median, largest) length of where, on every fourth pixel."""
+    x = pixel_grid(pair.alpha.hw)[::4, ::4]
+    alpha, beta = pair.cameras
+    straight = alpha.distortion is None and beta.distortion is None
+    found = look(Epipolar() if straight else Curved(64), pair, x)
+    if isinstance(found, Segments):
+        valid, length = found.valid, found.length
+    else:
+        counts = found.mask[..., 1:] & found.mask[..., :-1]
+        valid = found.mask.any(-1)
+        length = (found.xy.diff(dim=-2).norm(dim=-1) * counts).sum(-1)
+    if not valid.any():
+        return 0.0, None
+    return float(valid.float().mean()), (float(length[valid].median()), float(length[valid].max()))
+
+
+def _depth_step(pair: Pair, baseline: float) -> tuple[float, float] | None:
+    """By the small-angle rule: depth^2 / (focal length of beta x baseline)."""
+    if pair.depth is None or baseline == 0:
+        return None
+    focal = float(pair.cameras[1].K[:2, :2].det().abs().sqrt())
+    near, far = (float(d) ** 2 / (focal * baseline) for d in pair.depth)
+    return near, far
