@@ -17,16 +17,17 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pixel_shuffle, pixel_unshuffle
 
-from arraygeom.pixels import pixel_grid
-from arraygeom.segments import Segments
+from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 
-from .attention import Attended, attend_with_statistics
+from .attention import Attended, attend, attend_with_statistics
 from .blocks import ResidualBlock, conv, enlarge
 from .images import luminance
 from .model import Fused, Look, Looks
 
 COARSE = 4
 """The first look is at pictures of a quarter of the size."""
+UNSURE = 1e-3
+"""The certainty that every pixel has at least."""
 NOWHERE = -10.0
 """The logit of the confidence where there is nowhere to look."""
 
@@ -36,6 +37,7 @@ class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, and of the keys.
 
     The second look reaches `window` pixels to either side of the first's answer, with `taps` samples.
+    Colour is carried within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4.
     `keep_luminance` lets the network add colour to alpha, and never luminance.
     """
 
@@ -45,6 +47,8 @@ class GuidedPATConfig:
     fine_dim: int = 8
     window: float = 4.0
     taps: int = 17
+    carry_dim: int = 8
+    carry_steps: tuple[int, ...] = (1, 3, 8)
     bands: int = 3
     keep_luminance: bool = True
 
@@ -78,8 +82,8 @@ class GuidedPAT(nn.Module):
 
     multiple = 16
     equal_pitch = True
-    halo = 464
-    """Encoder 85, judge 176, propagation 180 and head 12: the sum, rounded up."""
+    halo = 608
+    """Encoder 85, judge 176, carrying 148, propagation 180 and head 12: the sum, rounded up."""
     beta_halo = 96
     bytes_per_pixel = 700.0
 
@@ -93,6 +97,7 @@ class GuidedPAT(nn.Module):
         self.judge = UNet(w4 + c.coarse_value + 4, c.widths[1:], 2)
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], c.widths[0])
+        self.carry = nn.ModuleList(Carry(w4, c.carry_dim, step) for step in c.carry_steps)
         self.head = Head(w2, c.bands)
 
     def forward(
@@ -114,12 +119,15 @@ class GuidedPAT(nn.Module):
         own = self.encoder(alpha)
         seen = [self._see(own, beta, look) for beta, look in zip(betas, looks)]
         attended, matches = zip(*seen)
-        colour = torch.cat([a.value - alpha for a in attended], 1)
+        colours = [a.value - alpha for a in attended]
         logits = [enlarge(m.logit, COARSE) for m in matches]
-        certain = torch.cat([z.sigmoid().expand_as(b) for z, b in zip(logits, (a.value for a in attended))], 1)
+        carried = torch.cat([self._carried(own, c, z.sigmoid()) for c, z in zip(colours, logits)], 1)
+        certain = torch.cat([z.sigmoid().expand_as(c) for z, c in zip(logits, colours)], 1)
+        colour = torch.cat(colours, 1)
         rough = avg_pool2d(torch.cat([colour * certain, certain], 1), COARSE)
         context = self.propagate(torch.cat([own.quarter, rough], 1))
-        residual = colour * certain + self.head(alpha, own.half, context, colour, certain)
+        colour = torch.lerp(enlarge(carried, COARSE), colour, certain)
+        residual = colour + self.head(alpha, own.half, context, colour, certain)
         if self.config.keep_luminance:
             residual = residual - luminance(residual)
         fused = Fused(
@@ -129,6 +137,14 @@ class GuidedPAT(nn.Module):
             [z[:, 0].sigmoid() * (a.peak > 0) for z, a in zip(logits, attended)],
         )
         return fused, list(matches)
+
+    def _carried(self, own: Encoded, colour: Tensor, certain: Tensor) -> Tensor:
+        """Colour at 1/4 of the size, carried from certain pixels to others that look alike in alpha."""
+        known = avg_pool2d(certain, COARSE)
+        colour = avg_pool2d(colour * certain, COARSE) / (known + UNSURE)
+        for carry in self.carry:
+            colour, known = carry(own.quarter, colour, known)
+        return colour
 
     def _see(self, own: Encoded, beta: Tensor, look: Look) -> tuple[Attended, Match]:
         guide = luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
@@ -154,6 +170,31 @@ class GuidedPAT(nn.Module):
         reach = reach + COARSE * answer[:, :1]
         position = segments.end + reach[:, 0, :, :, None] * _along(segments)
         return Match(reach, position.movedim(-1, 1), torch.where(valid, answer[:, 1:], NOWHERE))
+
+
+class Carry(nn.Module):
+    """C3 attention of alpha to itself: each pixel takes colour from 7 x 7 around it that are certain and look alike.
+
+    The logarithm of the certainty is added to the scores as one more channel of the keys. Without training all
+    look alike, and this is a normalised convolution.
+    """
+
+    def __init__(self, width: int, dim: int, step: int) -> None:
+        super().__init__()
+        self.field = Local(7, spacing=step)
+        self.query, self.key = nn.Conv2d(width, dim, 1), nn.Conv2d(width, dim, 1)
+        nn.init.zeros_(self.query.weight)
+
+    def forward(
+        self, features: Float[Tensor, "b d h w"], colour: Float[Tensor, "b c h w"], sure: Float[Tensor, "b 1 h w"]
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+        """Colour and certainty after one round."""
+        view = View(hw=(features.shape[-2], features.shape[-1]))
+        query = torch.cat([self.query(features), torch.ones_like(sure)], 1)
+        key = torch.cat([self.key(features), (sure + UNSURE).log()], 1)
+        look = lazily(self.field, Pair(view, view))
+        found = attend(query, key, torch.cat([colour, sure], 1), look, interpolation="nearest")
+        return found[:, :-1], found[:, -1:]
 
 
 def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:

@@ -87,15 +87,16 @@ TIE = 1e-3
 
 @dataclass(frozen=True)
 class Local:
-    """A `size` x `size` window around H x; from H only (the CNN-like case)."""
+    """A `size` x `size` window around H x, `spacing` pixels between samples; from H only (the CNN-like case)."""
 
     size: int = 5
+    spacing: float = 1.0
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, size^2, 2), row by row, on a grid of whole pixels' spacing centred on H x."""
+        """Positions (*n, size^2, 2), row by row, centred on H x."""
         centre, placed = apply_homography(pair.homography, x)
         offsets = pixel_grid((self.size, self.size), dtype=x.dtype, device=x.device) - (self.size - 1) / 2
-        xy = centre[..., None, :] + offsets.reshape(-1, 2)
+        xy = centre[..., None, :] + self.spacing * offsets.reshape(-1, 2)
         return _masked(xy, pair.beta.contains(xy) & placed[..., None])
 
 
