@@ -1,8 +1,8 @@
 """C3 attention on the CPU: drives the compiled loops with as many threads as torch may use.
 
-The threads are a plain pool, for which the loops release Python's lock: idle ones sleep, so that they do not take the
-cores from torch's own. Nothing depends on how many there are: each output number is made by one thread in
-an order that the inputs alone give.
+The threads are a plain pool, for which the loops release Python's lock: idle ones sleep, so that they do not
+take the cores from torch's own. Nothing depends on how many there are: each output number is made by one
+thread in an order that the inputs alone give.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 import torch
@@ -30,7 +30,8 @@ SCRATCH_TAPS = 2**19
 def forward(
     query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4); log of the sum of exponentials (b, ha, wa)."""
+    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4); log of the sum of exponentials (b,
+    ha, wa)."""
     b, d, ha, wa = query.shape
     dv = value.shape[1]
     counted = _accumulated(query)
@@ -45,8 +46,8 @@ def forward(
         dv,
     )
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
-    pieces = _pieces(0, b * ha * wa, look.samples)
-    _share([lambda p=piece: kernels.forward(*call, *_room(look, query, value), *p, *outputs) for piece in pieces])
+    pieces = _pieces(0, b * ha * wa, look)
+    _share([partial(_in_room, kernels.forward, call, (*piece, *outputs)) for piece in pieces])
     return out.permute(0, 3, 1, 2), statistics, logsum
 
 
@@ -63,8 +64,8 @@ def backward(
 ) -> tuple[Tensor, ...]:
     """Gradients by query, key, value (channels last), points and bias; of no length where not wanted.
 
-    `saved` are statistics and logsum of forward, `cotangents` those of values and statistics. A piece of alpha at a
-    time, in two steps: its pixels are shared among the threads for all that belongs to alpha; then
+    `saved` are statistics and logsum of forward, `cotangents` those of values and statistics. A piece of
+    alpha at a time, in two steps: its pixels are shared among the threads for all that belongs to alpha; then
     the channels are, for the additions to beta's pixels.
     """
     b, d, ha, wa = query.shape
@@ -93,10 +94,10 @@ def backward(
     ]
     for first in range(0, b * ha * wa, step):
         last = min(first + step, b * ha * wa)
-        pieces = _pieces(first, last, look.samples)
-        into = (first, stride, scratch, *outputs)
-        _share([lambda p=piece: kernels.backward(*call, *_room(look, query, value), *p, *into) for piece in pieces])
-        _share([lambda add=add: add(first, last) for add in additions])  # noqa: B023
+        rest = (first, stride, scratch, *outputs)
+        pieces = _pieces(first, last, look)
+        _share([partial(_in_room, kernels.backward, call, (*piece, *rest)) for piece in pieces])
+        _share([partial(add, first, last) for add in additions])
     pictures = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
         for out, like, want in zip((query_out, key_out, value_out), (query, key, value), wanted)
@@ -149,10 +150,11 @@ def _number(like: Tensor) -> type:
     return np.float64 if _accumulated(like) == torch.float64 else np.float32
 
 
-def _room(look: Look, query: Tensor, value: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """Scratch for one task."""
-    integers, numbers = kernels.room(look.samples, max(query.shape[1], value.shape[1]))
-    return np.empty(integers, np.int32), np.empty(numbers, _number(query))
+def _in_room(kernel: Callable[..., None], call: tuple, rest: tuple) -> None:
+    """Calls a kernel with scratch of its own."""
+    look, channels = call[3], max(call[5:7])
+    integers, numbers = kernels.room(look.samples, channels)
+    kernel(*call, np.empty(integers, np.int32), np.empty(numbers, look.fractions.dtype), *rest)
 
 
 def _scratch(pixels: int, stride: int, like: Tensor) -> kernels.Scratch:
@@ -189,8 +191,8 @@ def _channel_tasks(
     return [task(c) for c in range(0, channels, width)]
 
 
-def _pieces(first: int, last: int, samples: int) -> list[tuple[int, int]]:
-    step = max(1, PIECE_SAMPLES // samples)
+def _pieces(first: int, last: int, look: Look) -> list[tuple[int, int]]:
+    step = max(1, PIECE_SAMPLES // look.samples)
     return [(p, min(p + step, last)) for p in range(first, last, step)]
 
 

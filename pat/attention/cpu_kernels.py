@@ -1,12 +1,15 @@
-"""The compiled loops of the CPU backend. All in one file: numba's cache watches only the file of the entry point.
+"""The compiled loops of the CPU backend. All in one file: numba's cache watches only the file of the entry
+point.
 
-The work on one alpha pixel is done on *taps*, the pixels of beta that its samples touch. Neighbouring samples share
-them (a bilinear look-up has four, of which the next sample usually needs two again), so all work along the
-channels is done once a tap: inner products of the query with its taps, sums of taps with weights, and in backward
-the addition of the query to the taps' gradients. Everything else is scalar work on samples.
+The work on one alpha pixel is done on *taps*, the pixels of beta that its samples touch. Neighbouring
+samples share them (a bilinear look-up has four, of which the next sample usually needs two again), so all
+work along the channels is done once a tap: inner products of the query with its taps, sums of taps with
+weights, and in backward the addition of the query to the taps' gradients. Everything else is scalar work on
+samples.
 
-Pictures come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as integers:
-uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the others.
+Pictures come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
+integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the
+others.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ def compiled(function=None, **options):
     return njit(unwrap(function), **options) if function else lambda function: njit(unwrap(function), **options)
 
 
-# ---- eight numbers at a time ---------------------------------------------------------------------------------
+# ---- eight numbers at a time ---------------------------------------------------------------------
 
 
 class Vector(types.Type):
@@ -73,8 +76,8 @@ def _widen(builder, stored, dtype, lanes):
 
 @intrinsic
 def pointer(typing, array):
-    """Where the numbers of a flat array begin. What works on pointers counts no references (a fifth of the time
-    otherwise); the caller keeps the array."""
+    """Where the numbers of a flat array begin. What works on pointers counts no references (a fifth of the
+    time otherwise); the caller keeps the array."""
 
     def code(context, builder, signature, args):
         return context.make_array(array)(context, builder, args[0]).data
@@ -338,7 +341,7 @@ def _exponentials32(x):
     return keep_above(x, low, mul(p, two_to(n)))
 
 
-# ---- along the channels ---------------------------------------------------------------------------------------
+# ---- along the channels --------------------------------------------------------------------------
 
 
 @compiled
@@ -384,11 +387,11 @@ def weighted_sum(weights, rows, n, picture, channels, width, out):
     while c + LANES <= width:
         _weighted_sum_8(weights, rows, n, picture, channels, c, out)
         c += LANES
-    for c in range(c, width):
+    for tail in range(c, width):
         s = zero(weights)
         for t in range(n):
-            s += weights[t] * load_one(picture, rows[t] * channels + c)
-        out[c] = s
+            s += weights[t] * load_one(picture, rows[t] * channels + tail)
+        out[tail] = s
 
 
 @compiled
@@ -443,8 +446,8 @@ def scatter(counts, rows, weights, stride, x, channels, first, last, first_chann
     """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels first .. last, in their order.
 
     `counts` says how many taps each of the pixels has; theirs start at multiples of `stride`. One caller owns
-    the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the same however
-    many callers share the work.
+    the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the same
+    however many callers share the work.
     """
     counts, rows, weights, x, out = pointer(counts), pointer(rows), pointer(weights), pointer(x), pointer(out)
     for p in range(first, last):
@@ -460,10 +463,10 @@ def scatter(counts, rows, weights, stride, x, channels, first, last, first_chann
                 r = rows[t] * channels + c
                 store(out, r, fma(splat(weights[t]), q, load(out, r)))
             c += LANES
-        for c in range(c, last_channel):
-            one = load_one(x, p * channels + c)
+        for tail in range(c, last_channel):
+            one = load_one(x, p * channels + tail)
             for t in range(begin, end):
-                out[rows[t] * channels + c] += weights[t] * one
+                out[rows[t] * channels + tail] += weights[t] * one
 
 
 @compiled
@@ -478,7 +481,7 @@ def _scatter_32(rows, weights, begin, end, x, at, channels, c, out):
         store(out, r + 24, fma(w, q3, load(out, r + 24)))
 
 
-# ---- where one alpha pixel looks -------------------------------------------------------------------------------
+# ---- where one alpha pixel looks -----------------------------------------------------------------
 
 
 class Look(NamedTuple):
@@ -500,7 +503,8 @@ class Look(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Room for the samples of one pixel that count: which they are, where, in which cell, with what weight."""
+    """Room for the samples of one pixel that count: which they are, where, in which cell, with what
+    weight."""
 
     index: Any
     cell: Any
@@ -766,7 +770,7 @@ def _slopes(j, samples, by_tap):
     return (ONE - v) * (b - a) + v * (d - c), (ONE - u) * (c - a) + u * (d - b)
 
 
-# ---- forward and backward ----------------------------------------------------------------------------------------
+# ---- forward and backward ------------------------------------------------------------------------
 
 
 @compiled
@@ -874,7 +878,8 @@ def forward(
     statistics,
     logsum,
 ):
-    """The alpha pixels first .. last: values out, statistics (pixel, 4) and log of the sum of exponentials."""
+    """The alpha pixels first .. last: values out, statistics (pixel, 4) and log of the sum of
+    exponentials."""
     biased = len(bias) > 0
     look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
     out, statistics = pointer(out), pointer(statistics)
@@ -989,7 +994,8 @@ def backward(
     points_out,
     bias_out,
 ):
-    """The alpha pixels first .. last: gradients by query, points and bias, and what `scatter` needs for the rest.
+    """The alpha pixels first .. last: gradients by query, points and bias, and what `scatter` needs for the
+    rest.
 
     Outputs that are not wanted have length 0; points_out and bias_out come zeroed.
     """

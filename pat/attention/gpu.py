@@ -1,9 +1,10 @@
 """C3 attention on GPUs, in Triton: one program for a few alpha pixels, channels along its lanes.
 
-Forward walks the samples once with a running softmax. Backward walks them twice, first for the mean of the gradients
-by the weights, then for the gradients. Beta's gradients are added to with atomics: of float32, in no fixed order; or, if
-torch is asked for deterministic algorithms, of 64-bit fixed point numbers, whose sums do not depend on the order.
-`TRITON_INTERPRET=1`, set before the first import, runs the same code on the CPU, for tests.
+Forward walks the samples once with a running softmax. Backward walks them twice, first for the mean of the
+gradients by the weights, then for the gradients. Beta's gradients are added to with atomics: of float32, in
+no fixed order; or, if torch is asked for deterministic algorithms, of 64-bit fixed point numbers, whose sums
+do not depend on the order. `TRITON_INTERPRET=1`, set before the first import, runs the same code on the CPU,
+for tests.
 """
 
 from __future__ import annotations
@@ -88,8 +89,8 @@ def backward(
 def _scales(query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statistics_upstream: Tensor) -> Tensor:
     """By which key's and value's gradients are multiplied so that their sums fit into fixed point.
 
-    The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the largest gradient
-    by a weight.
+    The weights of a pixel sum to 1, so that the gradients by its scores sum to no more than twice the
+    largest gradient by a weight.
     """
     pixels = query.shape[0] * query.shape[2] * query.shape[3]
     diagonal = float(key.shape[2] ** 2 + key.shape[3] ** 2) ** 0.5

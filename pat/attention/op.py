@@ -1,8 +1,8 @@
 """The compiled backends as one operator of torch, `pat::attend`, with its gradient, `pat::attend_backward`.
 
-Both are registered with shapes and derivatives, so that torch.compile and autograd see through them. Saved for
-backward are the inputs, four statistics and one log of a sum of exponentials per alpha pixel. The gradient of the
-gradient is the reference's.
+Both are registered with shapes and derivatives, so that torch.compile and autograd see through them. Saved
+for backward are the inputs, four statistics and one log of a sum of exponentials per alpha pixel. The
+gradient of the gradient is the reference's.
 """
 
 from __future__ import annotations
@@ -31,7 +31,8 @@ def attend(
     backend: str,
     strict: bool,
 ) -> Attended:
-    """As `reference.attend`, by the `cpu` or the `triton` backend. `strict`: no second order by the reference."""
+    """As `reference.attend`, by the `cpu` or the `triton` backend. `strict`: no second order by the
+    reference."""
     out, statistics, _ = _attend(
         query, key, value, look.points, look.mask, bias, look.samples, look.straight, nearest, backend, strict
     )

@@ -1,12 +1,13 @@
 """C3 attention as one operator: checks what it is given, puts where to look into one form, picks a backend.
 
 A sample counts if it is valid and lies on beta's area, [-0.5, W - 0.5] x [-0.5, H - 0.5] (to 1e-3 pixels).
-On that area the bilinear look-up takes coordinates clamped to the border's centres, and the nearest one takes the
-pixel on whose area the position lies. An alpha pixel without a sample that counts gets 0 everywhere, and
-passes no gradient.
+On that area the bilinear look-up takes coordinates clamped to the border's centres, and the nearest one
+takes the pixel on whose area the position lies. An alpha pixel without a sample that counts gets 0
+everywhere, and passes no gradient.
 
-Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak say nothing about the
-geometry (they are constant almost everywhere); position and spread do, as weighted means of the positions.
+Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak say nothing
+about the geometry (they are constant almost everywhere); position and spread do, as weighted means of the
+positions.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ def attend(
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
-    bias: Float[Tensor, "..."] | None = None,
+    bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Float[Tensor, "b dv ha wa"]:
     """What each alpha pixel sees where it looks in beta: softmax(query . key) over its samples, times value.
@@ -52,19 +53,20 @@ def attend(
     The scores are plain inner products (the paper's). The output is channels-last in memory.
 
     Args:
-        query: features of alpha; float64, float32, bfloat16 or float16, as are key and value. 16-bit numbers are
-            accumulated in float32. Under autocast all three are cast to its type (the geometry never is).
+        query: features of alpha; float64, float32, bfloat16 or float16, as are key and value. 16-bit numbers
+            are accumulated in float32. Under autocast all three are cast to its type (the geometry never is).
         key: features of beta that the query is compared with.
         value: features of beta that are returned.
-        look: where to look in beta, for each alpha pixel: Segments or Positions with the leading axes (Ha, Wa) or
-            (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to either, which is called on one piece of
-            alpha at a time and again in backward, so that not all explicit positions exist at once.
+        look: where to look in beta, for each alpha pixel: Segments or Positions with the leading axes (Ha,
+            Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to either, which is called on
+            one piece of alpha at a time and again in backward, so that not all explicit positions exist at
+            once.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
-        backend: `reference` (plain torch, twice differentiable), `cpu`, `triton`, or `auto`: the compiled one of the
-            tensors' device, with second-order gradients by the reference, or the reference if there is none. An
-            explicit compiled backend that cannot serve raises.
+        backend: `reference` (plain torch, twice differentiable), `cpu`, `triton`, or `auto`: the compiled
+            one of the tensors' device, with second-order gradients by the reference, or the reference if
+            there is none. An explicit compiled backend that cannot serve raises.
 
     Raises:
         ValueError: shapes, devices or options that do not fit together.
@@ -84,7 +86,7 @@ def attend_with_statistics(
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
-    bias: Float[Tensor, "..."] | None = None,
+    bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Attended:
     """As `attend`, with where the match is expected, how far the weights spread and how high they peak.
@@ -204,8 +206,8 @@ def _attend_chunks(
 ) -> Attended:
     """Asks `look` for a piece of alpha at a time.
 
-    Segments are small: they are gathered for the whole picture. Explicit positions are used at once, and asked
-    for again in backward.
+    Segments are small: they are gathered for the whole picture. Explicit positions are used at once, and
+    asked for again in backward.
     """
     ha, wa = query.shape[2:]
     first = look(_pixel_rows(0, 1, wa, query))

@@ -1,4 +1,5 @@
-"""C3 attention as a formula: plain torch, any device, differentiable twice. Slow, and what the fast ones obey.
+"""C3 attention as a formula: plain torch, any device, differentiable twice. Slow, and what the fast ones
+obey.
 
 For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that count,
 
@@ -28,9 +29,11 @@ LEAST_SPREAD = 1e-4
 
 
 class Look(NamedTuple):
-    """Where to look, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the batch.
+    """Where to look, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
+    batch.
 
-    `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples` samples.
+    `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`
+    samples.
     """
 
     points: Tensor
@@ -39,6 +42,7 @@ class Look(NamedTuple):
     straight: bool
 
     def rows(self, top: int, bottom: int) -> Look:
+        """A band of rows of alpha."""
         return self._replace(points=self.points[:, top:bottom], mask=self.mask[:, top:bottom])
 
     def positions(self) -> Tensor:
@@ -114,7 +118,8 @@ def _band(q: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None
 
 
 def on_picture(xy: Tensor, *, hw: tuple[int, int] | torch.Size) -> Tensor:
-    """Whether (..., 2) points lie on the picture's area, which reaches half a pixel beyond the border's centres."""
+    """Whether (..., 2) points lie on the picture's area, which reaches half a pixel beyond the border's
+    centres."""
     last = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]) + EDGE_SLACK
     return ((xy >= -0.5 - EDGE_SLACK) & (xy <= last)).all(-1)
 
@@ -137,7 +142,8 @@ def _bilinear(picture: Tensor, xy: Tensor) -> Tensor:
 
 
 def _cell(c: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The two pixels around a coordinate on an axis of n pixels, and the fraction (..., 1) of the way between."""
+    """The two pixels around a coordinate on an axis of n pixels, and the fraction (..., 1) of the way
+    between."""
     c = c.clamp(0, n - 1)
     lower = c.detach().floor().clamp(max=max(n - 2, 0))
     index = lower.long()

@@ -1,15 +1,18 @@
-"""Measures attention: `python -m tests.benchmarks.bench_attention` prints a table and writes RESULTS.md beside this file.
+"""Measures attention: `python -m tests.benchmarks.bench_attention` prints a table and writes RESULTS.md
+beside this file.
 
-Every backend that this machine has runs against two usual ways to do the same: (a) index keys and values at every
-position, matmul, softmax, matmul; (b) the same with `grid_sample`. Each measurement is a process of its own, so that
-its peak memory is its own; the machine's float32 matmul rate and copy bandwidth are measured in the same run. All
-repeat a few times; the table has medians with the spread (fastest to slowest). `--quick` leaves the large sizes out.
+Every backend that this machine has runs against two usual ways to do the same: (a) index keys and values at
+every position, matmul, softmax, matmul; (b) the same with `grid_sample`. Each measurement is a process of
+its own, so that its peak memory is its own; the machine's float32 matmul rate and copy bandwidth are
+measured in the same run. All repeat a few times; the table has medians with the spread (fastest to slowest).
+`--quick` leaves the large sizes out.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import platform
 import statistics
 import subprocess
@@ -51,7 +54,7 @@ def index_everything(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: i
 
 def grid_sampled(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
     """(b): the same with `grid_sample`, nearest or bilinear."""
-    b, d, ha, wa = q.shape
+    b, _, ha, wa = q.shape
     xy = look.positions(samples).xy.reshape(1, ha * wa, samples, 2)
     wh = xy.new_tensor([k.shape[3] - 1, k.shape[2] - 1])
     grid = (2 * xy / wh - 1).expand(b, -1, -1, -1).to(q.dtype)
@@ -225,17 +228,28 @@ def row(entry: dict, result: dict, baselines: dict, rate: float, bandwidth: floa
             baselines.get((*key, "grid_sample", entry["interpolation"])),
         )
     ]
-    return (
-        f"{start} {result['time']:.3f} ({result['low']:.3f} to {result['high']:.3f}) | {against[0]} | {against[1]} "
-        f"| {result['extra'] / result['unit']:.2f} | {flops / result['time'] / rate:.0%} "
-        f"| {least / result['time'] / bandwidth:.0%} |"
-    )
+    cells = [
+        f"{result['time']:.3f} ({result['low']:.3f} to {result['high']:.3f})",
+        *against,
+        f"{result['extra'] / result['unit']:.2f}",
+        f"{flops / result['time'] / rate:.0%}",
+        f"{least / result['time'] / bandwidth:.0%}",
+    ]
+    return f"{start} {' | '.join(cells)} |"
 
 
-HEAD = """\
-| alpha (= beta), samples, dtype | what | method | look-up | seconds (fastest to slowest) | faster, leaner than (a) | than (b) \
-| extra memory / (Q + K + V + out) | of the matmul rate | of the copy bandwidth |
-|---|---|---|---|---|---|---|---|---|---|"""
+COLUMNS = (
+    "alpha (= beta), samples, dtype",
+    "what",
+    "method",
+    "look-up",
+    "seconds (fastest to slowest)",
+    "faster, leaner than (a)",
+    "faster, leaner than (b)",
+    "extra memory / (Q + K + V + out)",
+    "of the matmul rate",
+    "of the copy bandwidth",
+)
 
 
 def main() -> None:
@@ -249,16 +263,15 @@ def main() -> None:
     lines = [
         "# Attention, measured",
         "",
-        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, {torch.get_num_threads()} threads. D = 64. "
-        "(a) is `index`, (b) is `grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory. "
+        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, {torch.get_num_threads()} threads, "
+        f"load of the machine before {os.getloadavg()[0]:.1f}. D = 64, channels last. (a) is `index`, (b) is "
+        "`grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory. "
         "Written by `python -m tests.benchmarks.bench_attention`.",
     ]
     for device in ("cpu", "cuda"):
         lines += ["", f"## {device}", ""]
         if device == "cuda" and not torch.cuda.is_available():
-            lines.append(
-                "No GPU at hand: the Triton backend was not measured. On a machine with one this command does."
-            )
+            lines.append("No GPU at hand: the Triton backend was not measured. Where there is one, this command does.")
             continue
         lines += table(device, quick=options.quick)
     RESULTS.write_text("\n".join(lines) + "\n")
@@ -271,7 +284,8 @@ def table(device: str, *, quick: bool) -> list[str]:
     lines = [
         f"float32 matmul {rate / 1e9:.0f} GFLOP/s, copy {bandwidth / 1e9:.1f} GB/s (read and written).",
         "",
-        *HEAD.splitlines(),
+        f"| {' | '.join(COLUMNS)} |",
+        "|---" * len(COLUMNS) + "|",
     ]
     print("\n".join(lines), flush=True)
     done: dict = {}

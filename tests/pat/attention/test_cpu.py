@@ -1,4 +1,5 @@
-"""The compiled CPU backend: equal to the reference in values and gradients, to the bit the same for any thread count."""
+"""The compiled CPU backend: equal to the reference in values and gradients, to the bit the same for any
+thread count."""
 
 import subprocess
 import sys
@@ -9,7 +10,6 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.segments import Positions, Segments
 from pat.attention import attend, attend_with_statistics
-
 from tests.pat.attention.cases import call, gradients, random_case, relative
 
 

@@ -5,9 +5,9 @@ import os
 import pytest
 import torch
 
-pytest.importorskip("triton", reason="the Triton backend is tested where triton is installed")
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")
+pytest.importorskip("triton", reason="the Triton backend is tested where triton is installed")
 
 from pat.attention import attend_with_statistics
 from tests.pat.attention.cases import call, gradients, random_case, relative

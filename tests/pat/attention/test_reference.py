@@ -1,4 +1,5 @@
-"""The formula against a loop written by hand, against textbook row attention, and against finite differences."""
+"""The formula against a loop written by hand, against textbook row attention, and against finite
+differences."""
 
 import math
 
@@ -8,7 +9,6 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.segments import Positions, Segments
 from pat.attention import attend, attend_with_statistics, operator, reference
-
 from tests.pat.attention.cases import call, random_case
 
 
