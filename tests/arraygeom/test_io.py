@@ -290,7 +290,7 @@ def copied(file: Path, folder: Path, text: str | bytes) -> Path:
 
 
 def refusal(path: Path, format: str | None = None) -> str:
-    """The message of the error that reading gives; it names the file and is one line."""
+    """The message of the error that reading gives, one line that names the file, without its folder."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RigFileWarning)
         with pytest.raises(RigFileError) as caught:
@@ -298,7 +298,7 @@ def refusal(path: Path, format: str | None = None) -> str:
     message = str(caught.value)
     assert "\n" not in message
     assert str(path.parent) in message
-    return message
+    return message.replace(str(path.parent), "")
 
 
 class NotRefused(Exception):
