@@ -494,3 +494,11 @@ def test_what_is_not_supported_says_so(tmp_path):
         file = FIXTURES / name
         message = refusal(copied(file, tmp_path, file.read_text().replace(old, new)), formats(file))
         assert words in message, message
+
+
+def test_colmap_models_that_lost_entries(tmp_path):
+    """COLMAP's comment says how many images there are: a file cut between two of them is not a whole one."""
+    file = FIXTURES / "colmap" / "images.txt"
+    lines = file.read_text().splitlines(keepends=True)
+    message = refusal(copied(file, tmp_path, "".join(lines[:6])), "colmap")
+    assert message.endswith("announces 2 images and holds 1; was it cut off?")
