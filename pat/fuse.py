@@ -295,6 +295,10 @@ def _padded(picture: Tensor, multiple: int) -> Tensor:
     return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
 
 
+UNSEEN = 1e-4
+"""Confidences up to this say that beta does not see the point: then it does not tell a depth either."""
+
+
 def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Depth by the betas that are calibrated, weighted by confidence in inverse depth; confidence, the least."""
     h, w = hw
@@ -305,7 +309,8 @@ def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -
             continue
         seen = position[0, :, :h, :w].movedim(0, -1) + torch.tensor([float(v) for v in piece.offset])
         found = depth_from_track(pinhole_track(piece.pair, x), seen.reshape(-1, 2))
-        weight = torch.where(found.valid.reshape(h, w), confidence[0, :h, :w] + 1e-6, 0.0)
+        told = found.valid.reshape(h, w) & (confidence[0, :h, :w] > UNSEEN)
+        weight = torch.where(told, confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
         weights = weights + weight
     known = weights > 0
