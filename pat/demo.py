@@ -6,16 +6,14 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxtyping import Float
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from arraygeom import Rig
 
 from .classical import classical_fusion_calibrated
 from .fuse import FusedFrame
-from .images import luminance, read_image, write_atomically
-from .results import colour_depth
+from .images import luminance, read_image
+from .results import colour_depth, save_panels
 
 SAMPLE = Path(__file__).parent / "sample"
 ALPHA, BETA = "mono", "colour"
@@ -64,13 +62,4 @@ def report_figure(sample: SampleArray, baseline: Tensor, frame: FusedFrame, path
         "confidence": frame.confidence[None],
         "fusion's error x 5": (frame.image.clamp(0, 1) - sample.truth).abs() * 5,
     }
-    figure = Figure(figsize=(16, 6), layout="constrained")
-    for i, (title, picture) in enumerate(panels.items()):
-        axes = figure.add_subplot(2, 4, i + 1, title=title)
-        axes.imshow(picture.expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
-        axes.set_axis_off()
-    FigureCanvasAgg(figure)
-    with write_atomically(path) as temporary:
-        figure.savefig(temporary, dpi=110)
-
-
+    save_panels(panels, path, columns=4)

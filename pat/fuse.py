@@ -122,6 +122,11 @@ def fuse(
     return FusedFrame(*frame)
 
 
+def levelled(picture: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
+    """The picture with the mean and the standard deviation of another; not cut to 0..1."""
+    return (picture - picture.mean()) / picture.std().clamp(min=1e-6) * like.std() + like.mean()
+
+
 def default_field(pair: Pair) -> ReceptiveField:
     """The field that what is known of a pair allows."""
     if pair.link is not None:
@@ -200,7 +205,7 @@ def _prepare(
     if network.equal_pitch:
         pair, picture = _at_equal_pitch(pair, picture)
     if levels is not None:
-        picture = (picture - picture.mean()) / picture.std().clamp(min=1e-6) * levels.std() + levels.mean()
+        picture = levelled(picture, levels)
     look = Look.along(field or default_field(pair), pair)
     if not _reaches(look, pair):
         bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from matplotlib import colormaps
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from .fuse import FusedFrame
-from .images import write_image
+from .images import write_atomically, write_image
 
 
 def save_frame(frame: FusedFrame, out: Path, *, bits: int = 8) -> list[Path]:
@@ -37,3 +40,17 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     scaled = ((inverse - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
     colours = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)
     return torch.where(known, colours, 0.0)
+
+
+def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, columns: int) -> None:
+    """One figure of pictures by title, row by row. It appears whole or not at all."""
+    rows = -(-len(panels) // columns)
+    h, w = next(iter(panels.values())).shape[-2:]
+    figure = Figure(figsize=(16, (16 / columns * h / w + 0.3) * rows), layout="constrained")
+    for i, (title, picture) in enumerate(panels.items()):
+        axes = figure.add_subplot(rows, columns, i + 1, title=title)
+        axes.imshow(picture.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
+        axes.set_axis_off()
+    FigureCanvasAgg(figure)
+    with write_atomically(path) as temporary:
+        figure.savefig(temporary, dpi=110)
