@@ -135,9 +135,9 @@ def _features(picture: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]
     grey = luminance(picture)[0] if picture.shape[0] == 3 else picture[0]
     even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
     points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(even, np.empty(0, np.uint8))
-    if descriptors is None:
-        descriptors = np.zeros((0, 128), np.float32)
-    return np.array([p.pt for p in points], np.float64).reshape(-1, 2), descriptors
+    if not points:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    return np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.float32)
 
 
 def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> dict[int, int]:

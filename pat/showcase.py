@@ -46,8 +46,9 @@ def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequenc
         if not (data / folder).is_dir():
             raise FileNotFoundError(f"{data / folder}: no such folder: give the folder that holds {folder}")
     network = load_weights(weights)
-    parts = (_pairs(network, data, out, rates), _syntim(network, data / "syntim", out))
-    text = "\n".join([*parts, _fast_and_slow(network, data / "hfr_lfr", out)])
+    scenes, array = [syntim_scene(data / "syntim", name) for name in SYNTIM], fast_and_slow_array(data / "hfr_lfr")
+    parts = (_pairs(network, data, out, rates), _syntim(network, scenes, out), _fast_and_slow(network, array, out))
+    text = "\n".join(parts)
     write_text(out / "showcase.md", text)
     return text
 
@@ -63,9 +64,26 @@ def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) 
     )
 
 
-def _syntim(network: FusionNetwork, folder: Path, out: Path) -> str:
-    rows = [row for scene in SYNTIM for row in _syntim_scene(network, folder, scene, out)]
-    figures = "".join(f"![{scene}](syntim_{scene}.png)\n" for scene in SYNTIM)
+class Scene(NamedTuple):
+    """A calibrated pair, left and right, with the depth range of what both see, and its pictures in colour."""
+
+    name: str
+    rig: Rig
+    left: Tensor
+    right: Tensor
+
+
+def syntim_scene(folder: Path, name: str) -> Scene:
+    """A pair of INRIA's, its depth range by matched points."""
+    left, right = (_syntim_picture(folder, name, side) for side in (0, 1))
+    rig = Rig.load(folder / f"cam_{name}_g")
+    depth = seen_depths(rig.pair("left", "right"), match_points(left, right))
+    return Scene(name, rig.replace(depth=depth, name=f"SYNTIM {name}"), left, right)
+
+
+def _syntim(network: FusionNetwork, scenes: Sequence[Scene], out: Path) -> str:
+    rows = [row for scene in scenes for row in _fused_scene(network, scene, out)]
+    figures = "".join(f"![{scene.name}](syntim_{scene.name}.png)\n" for scene in scenes)
     return (
         "### Calibrated pairs, not rectified (SYNTIM)\n\n"
         "Two cameras turned against each other, K, R and t as published; the depth range is that of matched points,\n"
@@ -74,11 +92,9 @@ def _syntim(network: FusionNetwork, folder: Path, out: Path) -> str:
     )
 
 
-def _syntim_scene(network: FusionNetwork, folder: Path, scene: str, out: Path) -> list[Row]:
-    left, right = (_syntim_picture(folder, scene, side) for side in (0, 1))
-    rig = Rig.load(folder / f"cam_{scene}_g")
-    rig = rig.replace(depth=seen_depths(rig.pair("left", "right"), match_points(left, right)), name=f"SYNTIM {scene}")
-    rig.save(_made(out) / f"syntim_{scene}.yaml")
+def _fused_scene(network: FusionNetwork, scene: Scene, out: Path) -> list[Row]:
+    """The scores of one scene; its rig file and figure go into `out`."""
+    name, rig, left, right = scene
     images = {"left": luminance_of(left), "right": right}
     frame = fuse(network, rig, images, alpha="left")
     results = {
@@ -88,8 +104,9 @@ def _syntim_scene(network: FusionNetwork, folder: Path, scene: str, out: Path) -
     }
     shown = {"alpha: left, grey": images["left"], "beta: right": right, "truth: left": left}
     shown |= {"classical": results["classical"], "fusion": results["fusion"], "depth": colour_depth(frame.depth)}
-    save_panels(shown, out / f"syntim_{scene}.png", columns=3)
-    return [Row(scene, 1, name, *score(image, left)) for name, image in results.items()]
+    save_panels(shown, out / f"syntim_{name}.png", columns=3)
+    rig.save(out / f"syntim_{name}.yaml")
+    return [Row(name, 1, method, *score(image, left)) for method, image in results.items()]
 
 
 def _syntim_picture(folder: Path, scene: str, side: int) -> Tensor:
@@ -114,15 +131,14 @@ class Array(NamedTuple):
         return 1.25 * max(fit.displacement / pitch_ratio(pairs[name]) for name, fit in self.fits.items())
 
 
-def _fast_and_slow(network: FusionNetwork, folder: Path, out: Path) -> str:
-    array = fast_and_slow_array(folder)
-    array.rig.save(_made(out) / "fast_slow.yaml")
+def _fast_and_slow(network: FusionNetwork, array: Array, out: Path) -> str:
     field = HomographyDisplacement(array.displacement)
     frame = fuse(network, array.rig, array.images, alpha=FAST, field=field, match_levels=True)
     shown = {"alpha: the fast camera": array.images[FAST]}
     shown |= {f"beta: {name}": array.images[name] for name in SLOW}
     shown |= {"betas by the rough map alone": mapped(array), "fusion": frame.image}
     save_panels(shown, out / "fast_slow.png", columns=2)
+    array.rig.save(out / "fast_slow.yaml")
     return (
         "### The paper's fast + slow array\n\n"
         "Alpha is a frame of the fast camera; the slow ones carry filters: 600 nm is shown as red, 550 nm as green,\n"
@@ -137,14 +153,13 @@ def _fast_and_slow(network: FusionNetwork, folder: Path, out: Path) -> str:
 
 
 def fast_and_slow_array(folder: Path) -> Array:
-    """The array from its pictures and `fundamental_matrices.json`, which counts pixels from 1."""
+    """The array from its pictures and `fundamental_matrices.json`."""
     images = {FAST: _coded(read_image(folder / SCENE / f"{FAST_FRAME}.png"), brightest=0.995)}
     images |= {name: _coded(read_image(folder / SCENE / f"{name}_{SLOW_FRAME}.png")) for name in SLOW}
-    published = json.loads((folder / "fundamental_matrices.json").read_text())["pillow"]
+    published = published_matrices(folder / "fundamental_matrices.json")
     fits, lines = {}, ["| beta | points | off the published lines, px | off the fitted ones, px | along, px |"]
     lines.append("| --- | ---: | ---: | ---: | ---: |")
-    for name, key in SLOW.items():
-        F = shift_origin(torch.tensor(published[key], dtype=torch.float64), 1.0)
+    for name, F in published.items():
         matches = match_points(images[FAST], images[name])
         fits[name] = fit = fit_link(matches, F)
         off = [float(line_distance(near_lines(matches, F, within=6), G).median()) for G in (F, fit.link.F)]
@@ -153,6 +168,15 @@ def fast_and_slow_array(folder: Path) -> Array:
     links = {(FAST, name): fit.link for name, fit in fits.items()}
     views = {name: View(hw=(image.shape[1], image.shape[2])) for name, image in images.items()}
     return Array(Rig(views, links=links, name="fast + slow"), images, fits, "\n".join(lines) + "\n")
+
+
+def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
+    """F of the fast camera and each slow one, in our pixels; the file counts from 1. Raises ValueError naming it."""
+    try:
+        matrices = json.loads(file.read_text())["pillow"]
+        return {name: shift_origin(torch.tensor(matrices[key], dtype=torch.float64), 1.0) for name, key in SLOW.items()}
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{file}: wanted 3x3 matrices {', '.join(SLOW.values())} under 'pillow' ({error!r})") from None
 
 
 def mapped(array: Array) -> Float[Tensor, "3 h w"]:
@@ -171,8 +195,3 @@ def _coded(picture: Float[Tensor, "_ h w"], *, brightest: float | None = None) -
     linear = luminance_of(picture)
     gain = 1.0 if brightest is None else 1 / float(linear.flatten().sort().values[int(brightest * linear.numel())])
     return record(linear[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
-
-
-def _made(folder: Path) -> Path:
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
