@@ -43,7 +43,12 @@ def fails(arguments, capsys) -> str:
 
 def test_fuse_writes_everything(small):
     main(arguments(small))
-    assert sorted(p.name for p in (small / "out").iterdir()) == ["confidence.png", "depth.png", "depth.tif", "fused.png"]
+    assert sorted(p.name for p in (small / "out").iterdir()) == [
+        "confidence.png",
+        "depth.png",
+        "depth.tif",
+        "fused.png",
+    ]
     assert read_image(small / "out" / "fused.png").shape == (3, 96, 128)
 
 

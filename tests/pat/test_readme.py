@@ -13,7 +13,9 @@ def test_only_the_block_changes_and_twice_is_once():
     assert with_block(once, "a", "new\n") == once
 
 
-@pytest.mark.parametrize("text", ["none", TEXT + TEXT, "<!-- a:end --><!-- a:begin -->"])
+@pytest.mark.parametrize(
+    "text", ["none", "<!-- a:begin -->" + TEXT, TEXT + "<!-- a:end -->", "<!-- a:end --><!-- a:begin -->"]
+)
 def test_marks_are_wanted_once_and_in_order(text):
     with pytest.raises(ValueError, match="a:begin"):
         with_block(text, "a", "new")
