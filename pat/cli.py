@@ -46,7 +46,7 @@ console = Console(stderr=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Fuse the sample array of the package; write picture, depth, confidence and a figure, print the figures of merit."""
+    """Fuse the sample array of the package; write picture, depth, confidence and a figure, print PSNR and SSIM."""
 
     out: Path = Path("out/demo")
     """Folder for the results."""
@@ -250,7 +250,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="pat",
-        description="Fuse the pictures of an array of unlike cameras into one. Add --debug for a traceback of an error.",
+        description="Fuse the pictures of an array of unlike cameras into one. --debug shows an error's traceback.",
         args=[a for a in arguments if a != "--debug"],
     )
     try:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import tyro
+from torch.nn.functional import interpolate
 from tyro.conf import UseAppendAction
 
 from .images import read_image, write_image, write_text
@@ -20,7 +21,7 @@ class Readme:
     block: UseAppendAction[tuple[str, ...]] = ()
     """NAME=FILE, once for each block."""
     picture: tuple[Path, Path] | None = None
-    """A picture to take over, and the name to give it."""
+    """A picture to take over at 3/4 of its size, and the name to give it."""
 
     def run(self) -> None:
         """Do it."""
@@ -28,7 +29,8 @@ class Readme:
         for name, _, file in (argument.partition("=") for argument in self.block):
             text = with_block(text, name, without_pictures(Path(file).read_text()))
         if self.picture:
-            write_image(self.picture[1], read_image(self.picture[0]))
+            picture = read_image(self.picture[0])[None]
+            write_image(self.picture[1], interpolate(picture, scale_factor=0.75, mode="bicubic", antialias=True)[0])
         write_text(self.document, text)
 
 

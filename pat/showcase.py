@@ -87,7 +87,8 @@ def _syntim(network: FusionNetwork, scenes: Sequence[Scene], out: Path) -> str:
     return (
         "### Calibrated pairs, not rectified (SYNTIM)\n\n"
         "Two cameras turned against each other, K, R and t as published; the depth range is that of matched points,\n"
-        "widened. Alpha is the left picture made grey. The rigs are `syntim_SCENE.yaml`.\n\n"
+        "widened. Alpha is the left picture made grey. The rigs are `syntim_SCENE.yaml`. Between the pictures of Serfaty\n"
+        "two binders were moved: colour of theirs that is out of place comes from that.\n\n"
         f"{markdown(rows)}\n{structure_kept(rows)}\n\n{figures}"
     )
 

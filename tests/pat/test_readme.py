@@ -1,7 +1,9 @@
 """Blocks of a document that commands fill."""
 
 import pytest
+import torch
 
+from pat.images import read_image, write_image
 from pat.readme import Readme, with_block, without_pictures
 
 TEXT = "before\n<!-- a:begin -->\nold\n<!-- a:end -->\nafter\n"
@@ -29,5 +31,7 @@ def test_the_document_is_brought_up_to_date(tmp_path):
     document, content = tmp_path / "d.md", tmp_path / "c.md"
     document.write_text(TEXT)
     content.write_text("new\n![p](p.png)\n")
-    Readme(document, (f"a={content}",)).run()
+    write_image(tmp_path / "p.png", torch.full((3, 40, 80), 0.5))
+    Readme(document, (f"a={content}",), (tmp_path / "p.png", tmp_path / "docs" / "p.jpg")).run()
+    assert read_image(tmp_path / "docs" / "p.jpg").shape == (3, 30, 60)
     assert document.read_text() == with_block(TEXT, "a", "new")
