@@ -6,10 +6,14 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.ready
 PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input --constraint constraints.txt
 
-.PHONY: help env demo test test-long check format bench train
+DATA ?= ../shared/data
+
+.PHONY: help env demo showcase readme test test-long check format bench train
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
+	@echo "make showcase   fuse real pictures from DATA=$(DATA) into out/showcase"
+	@echo "make readme     run both and put what they print into README.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
@@ -23,6 +27,15 @@ env: $(READY)
 demo: $(READY)
 	@echo "== fusing the sample array into out/demo"
 	@$(BIN)/pat demo --out out/demo
+
+showcase: $(READY)
+	@echo "== fusing the pictures in $(DATA) into out/showcase"
+	@$(BIN)/pat showcase --data $(DATA) --out out/showcase
+
+readme: demo showcase
+	@echo "== bringing README.md up to date"
+	@$(BIN)/python -m pat.readme --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
+		--picture out/demo/demo.png docs/demo.jpg
 
 test: $(READY)
 	@echo "== tests"

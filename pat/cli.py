@@ -47,7 +47,7 @@ console = Console(stderr=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Fuse the sample array of the package: picture, depth, confidence, a figure; PSNR and SSIM beside a baseline."""
+    """Fuse the sample array of the package; write picture, depth, confidence and a figure, print PSNR and SSIM."""
 
     out: Path = Path("out/demo")
     """Folder for the results."""
@@ -57,6 +57,7 @@ class Demo:
     def run(self) -> None:
         """Do it."""
         from .demo import ALPHA, BETA, classical, load_sample, report_figure
+        from .images import write_text
         from .metrics import score
         from .results import save_frame
 
@@ -67,11 +68,12 @@ class Demo:
         frame = fuse_frame(self.weights, sample.rig, sample.images, alpha=ALPHA)
         written = save_frame(frame, self.out)
         report_figure(sample, baseline, frame, self.out / "demo.png")
-        print("                 PSNR    SSIM")
         rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
-        for name, picture in rows.items():
-            psnr, ssim = score(picture.clamp(0, 1), sample.truth)
-            print(f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}")
+        scores = {name: score(picture.clamp(0, 1), sample.truth) for name, picture in rows.items()}
+        lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]
+        table = "\n".join(["                 PSNR    SSIM", *lines, ""])
+        print(table, end="")
+        write_text(self.out / "demo.md", f"```\n{table}```\n")
         console.print(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
 
 
@@ -127,6 +129,67 @@ class Fuse:
             match_levels=self.match_levels,
         )
         console.print(f"written: {', '.join(map(str, save_frame(frame, self.out, bits=self.bits)))}")
+
+
+@dataclass
+class Evaluate:
+    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR and SSIM, tables and pictures.
+
+    The left picture made grey is alpha, the right one, reduced, is beta, the left one in colour is the truth.
+    Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
+    """
+
+    kitti: Path | None = None
+    """Folder of KITTI pairs: image_2 / image_3, or left.png / right.png."""
+    middlebury: Path | None = None
+    """Folder of Middlebury's 2001 to 2006 collections."""
+    flickr1024: Path | None = None
+    """Folder of Flickr1024 pairs: 0001_L.png / 0001_R.png."""
+    folder: Path | None = None
+    """Folder of other pairs, with any of these ways of naming."""
+    rates: tuple[int, ...] = (2, 4)
+    """How many times beta is reduced."""
+    out: Path = Path("out/evaluate")
+    """Folder for scores.md, scores.csv and, for each data set, a strip of pictures a pair."""
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .evaluate import DATA_SETS, METHODS, evaluate_sets, rectified_fusion, sets_markdown, write_csv
+        from .images import write_text
+        from .weights import load_weights
+
+        folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
+        if not folders:
+            raise ValueError(f"no pictures: give at least one of --{', --'.join(DATA_SETS)}")
+        if not self.rates or min(self.rates) < 1:
+            raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
+        methods = {**METHODS, "fusion": rectified_fusion(load_weights(self.weights))}
+        rows = evaluate_sets(folders, methods, self.rates, out=self.out)
+        write_text(self.out / "scores.md", sets_markdown(rows))
+        write_csv(self.out / "scores.csv", [row for found in rows.values() for row in found])
+        print(sets_markdown(rows), end="")
+        console.print(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, pictures in {self.out}")
+
+
+@dataclass
+class Showcase:
+    """Fuse real pictures: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
+
+    data: Path
+    """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
+    out: Path = Path("out/showcase")
+    """Folder for showcase.md, the figures and the rig files."""
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .showcase import showcase
+
+        print(showcase(self.data, self.out, self.weights), end="")
+        console.print(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
 
 
 @dataclass
@@ -238,6 +301,8 @@ class RigCommand:
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fuse, tyro.conf.subcommand("fuse")]
+    | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
@@ -280,7 +345,7 @@ def main(arguments: list[str] | None = None) -> None:
     command = tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="pat",
-        description="Fuse the pictures of an array of unlike cameras into one. --debug shows tracebacks.",
+        description="Fuse the pictures of an array of unlike cameras into one. --debug shows an error's traceback.",
         args=[a for a in arguments if a != "--debug"],
     )
     try:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxtyping import Float
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from arraygeom import Rig
@@ -14,7 +13,7 @@ from arraygeom import Rig
 from .classical import classical_fusion_calibrated
 from .fuse import FusedFrame
 from .images import luminance, read_image
-from .results import colour_depth, save_figure
+from .results import colour_depth, save_panels
 
 SAMPLE = Path(__file__).parent / "sample"
 ALPHA, BETA = "mono", "colour"
@@ -63,9 +62,4 @@ def report_figure(sample: SampleArray, baseline: Tensor, frame: FusedFrame, path
         "confidence": frame.confidence[None],
         "fusion's error x 5": (frame.image.clamp(0, 1) - sample.truth).abs() * 5,
     }
-    figure = Figure(figsize=(16, 6), layout="constrained")
-    for i, (title, picture) in enumerate(panels.items()):
-        axes = figure.add_subplot(2, 4, i + 1, title=title)
-        axes.imshow(picture.expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
-        axes.set_axis_off()
-    save_figure(figure, path)
+    save_panels(panels, path, columns=4)

@@ -16,10 +16,22 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from arraygeom import Rectified, Rig, View
 from pat.classical import classical_fusion
-from pat.data import PAPER_DISPARITY, MonoColourTask, StereoPair, mono_colour_task
-from pat.images import write_atomically, write_image
+from pat.data import (
+    PAPER_DISPARITY,
+    MonoColourTask,
+    StereoPair,
+    flickr_pairs,
+    folder_pairs,
+    kitti_pairs,
+    middlebury_pairs,
+    mono_colour_task,
+)
+from pat.fuse import fuse
+from pat.images import write_image, write_text
 from pat.metrics import bootstrap_interval, score
+from pat.model import FusionNetwork
 
 Fusion = Callable[[Tensor, Tensor, float], Tensor]
 """(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour picture (3, H, W), 0..1."""
@@ -53,8 +65,41 @@ def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
     return classical_fusion(alpha, beta, max_disparity=max_disparity)
 
 
+def rectified_fusion(network: FusionNetwork) -> Fusion:
+    """`fuse` with a network as a method, alpha on the left: it looks along rows, up to `max_disparity` pixels."""
+
+    def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
+        rig = Rig({"alpha": View(hw=_hw(alpha)), "beta": View(hw=_hw(beta))})
+        field = Rectified(max_disparity, alpha_is="left")
+        return fuse(network, rig, {"alpha": alpha, "beta": beta}, alpha="alpha", field=field).image
+
+    return fused
+
+
 BASELINES: dict[str, Fusion] = {"alpha": alpha_alone, "beta": beta_alone, "classical": classical}
+"""What a fusion can be compared with."""
+METHODS = {name: BASELINES[name] for name in ("alpha", "classical")}
 """What every table shows beside a fusion."""
+
+
+DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
+    "kitti": kitti_pairs,
+    "middlebury": middlebury_pairs,
+    "flickr1024": flickr_pairs,
+    "folder": folder_pairs,
+}
+"""How the folder of each data set is read."""
+
+
+def evaluate_sets(
+    folders: Mapping[str, Path], methods: Mapping[str, Fusion], rates: Sequence[int], *, out: Path
+) -> dict[str, list[Row]]:
+    """`evaluate_pairs` on data sets by name (see `DATA_SETS`): rows by set, a strip of pictures a pair in out/set.
+
+    All folders are looked into before the work begins: a missing one raises FileNotFoundError or ValueError.
+    """
+    pairs = {name: DATA_SETS[name](folder) for name, folder in folders.items()}
+    return {name: evaluate_pairs(found, methods, rates, pictures=out / name) for name, found in pairs.items()}
 
 
 def evaluate_pairs(
@@ -108,18 +153,36 @@ def write_csv(path: str | Path, rows: Sequence[Row]) -> None:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(Row._fields)
     writer.writerows(rows)
-    _write_text(path, text.getvalue())
+    write_text(path, text.getvalue())
 
 
 def write_markdown(path: str | Path, rows: Sequence[Row]) -> None:
     """`markdown(rows)` in a file that appears whole or not at all."""
-    _write_text(path, markdown(rows))
+    write_text(path, markdown(rows))
 
 
 def markdown(rows: Sequence[Row]) -> str:
     """A table for each rate: pairs and mean as lines, methods as columns, PSNR / SSIM in the cells."""
     rates = _unique(row.rate for row in rows)
     return "\n".join(_table([row for row in rows if row.rate == rate]) for rate in rates)
+
+
+def _hw(image: Tensor) -> tuple[int, int]:
+    return image.shape[-2], image.shape[-1]
+
+
+def sets_markdown(rows: Mapping[str, Sequence[Row]]) -> str:
+    """`markdown` of each data set under its name, and what `structure_kept` says of each."""
+    return "\n".join(f"#### {name}\n\n{markdown(rows)}\n{structure_kept(rows)}\n" for name, rows in rows.items())
+
+
+def structure_kept(rows: Sequence[Row], *, method: str = "fusion", than: str = "alpha") -> str:
+    """One line: on which pairs, if any, the SSIM of `method` is below that of alpha alone."""
+    ssim = {(row.pair, row.rate, row.method): row.ssim for row in rows}
+    cases = [(pair, rate) for pair, rate, name in ssim if name == method]
+    lost = [f"{pair} {rate}x" for pair, rate in cases if ssim[pair, rate, method] < ssim[pair, rate, than]]
+    kept = f"SSIM of {method} is at least that of {than} in {len(cases) - len(lost)} of {len(cases)} cases"
+    return f"{kept}; **below it**: {', '.join(lost)}." if lost else f"{kept}."
 
 
 def _fused(name: str, fuse: Fusion, pair: StereoPair, task: MonoColourTask, max_disparity: float) -> Tensor:
@@ -150,7 +213,7 @@ def _table(rows: Sequence[Row]) -> str:
     pairs = _unique(row.pair for row in rows)
     lines = [[pair, *(scores.get((pair, method), "") for method in methods)] for pair in pairs]
     means = {summary.method: _mean_cell(summary) for summary in summarise(rows)}
-    header = [f"beta reduced {rows[0].rate}x", *methods]
+    header = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
     rule = ["---", *("---:" for _ in methods)]
     table = [header, rule, *lines, ["**mean**", *(means[method] for method in methods)]]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in table)
@@ -164,8 +227,3 @@ def _mean_cell(summary: Summary) -> str:
 
 def _unique(items: Iterable[T]) -> list[T]:
     return list(dict.fromkeys(items))
-
-
-def _write_text(path: str | Path, text: str) -> None:
-    with write_atomically(path) as temporary:
-        temporary.write_text(text)

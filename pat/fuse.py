@@ -122,6 +122,11 @@ def fuse(
     return FusedFrame(*frame)
 
 
+def levelled(picture: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
+    """The picture with the mean and the standard deviation of another; not cut to 0..1."""
+    return (picture - picture.mean()) / picture.std().clamp(min=1e-6) * like.std() + like.mean()
+
+
 def default_field(pair: Pair) -> ReceptiveField:
     """The field that what is known of a pair allows."""
     if pair.link is not None:
@@ -200,7 +205,7 @@ def _prepare(
     if network.equal_pitch:
         pair, picture = _at_equal_pitch(pair, picture)
     if levels is not None:
-        picture = (picture - picture.mean()) / picture.std().clamp(min=1e-6) * levels.std() + levels.mean()
+        picture = levelled(picture, levels)
     look = Look.along(field or default_field(pair), pair)
     if not _reaches(look, pair):
         bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
@@ -295,6 +300,10 @@ def _padded(picture: Tensor, multiple: int) -> Tensor:
     return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
 
 
+UNSEEN = 1e-4
+"""Confidences up to this say that beta does not see the point: then it does not tell a depth either."""
+
+
 def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Depth by the betas that are calibrated, weighted by confidence in inverse depth; confidence, the least."""
     h, w = hw
@@ -305,7 +314,8 @@ def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -
             continue
         seen = position[0, :, :h, :w].movedim(0, -1) + torch.tensor([float(v) for v in piece.offset])
         found = depth_from_track(pinhole_track(piece.pair, x), seen.reshape(-1, 2))
-        weight = torch.where(found.valid.reshape(h, w), confidence[0, :h, :w], 0.0)
+        told = found.valid.reshape(h, w) & (confidence[0, :h, :w] > UNSEEN)
+        weight = torch.where(told, confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
         weights = weights + weight
     known = weights > 0

@@ -77,6 +77,12 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file, whole or not at all. Missing folders are made."""
+    with write_atomically(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def luminance(rgb: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 1 h w"]:
     """Rec. 601 luma of coded values, 0.299 R + 0.587 G + 0.114 B: MATLAB's rgb2gray, and OpenCV's."""
     weights = rgb.new_tensor(REC601)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -47,3 +48,15 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     with write_atomically(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
     return path
+
+
+def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, columns: int) -> None:
+    """One figure of pictures by title, row by row. It appears whole or not at all."""
+    rows = -(-len(panels) // columns)
+    h, w = next(iter(panels.values())).shape[-2:]
+    figure = Figure(figsize=(16, (16 / columns * h / w + 0.3) * rows), layout="constrained")
+    for i, (title, picture) in enumerate(panels.items()):
+        axes = figure.add_subplot(rows, columns, i + 1, title=title)
+        axes.imshow(picture.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
+        axes.set_axis_off()
+    save_figure(figure, path)

@@ -18,8 +18,8 @@ from torch.nn.functional import avg_pool2d
 from arraygeom.camera import Camera
 from arraygeom.homography import plane_homography
 from arraygeom.pixels import HW
-from arraygeom.sampling import sample
 from arraygeom.pose import Pose
+from arraygeom.sampling import sample
 
 from .layers import Layers, draw_layers
 from .outlines import outlines

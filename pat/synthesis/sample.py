@@ -1,6 +1,7 @@
 """Makes the sample array that ships in pat/sample: `python -m pat.synthesis.sample`.
 
-Its textures are pictures that scikit-image ships, free to use (astronaut: NASA; chelsea, coffee and rocket: CC0), and patterns.
+Its textures are patterns and pictures that scikit-image ships, free to use (astronaut: NASA; chelsea, coffee and
+rocket: CC0).
 """
 
 from __future__ import annotations

@@ -5,9 +5,22 @@ import pytest
 import torch
 
 from pat.data import StereoPair
-from pat.evaluate import BASELINES, Row, evaluate_pairs, markdown, summarise, write_csv, write_markdown
-from pat.images import read_image
+from pat.evaluate import (
+    BASELINES,
+    Row,
+    evaluate_pairs,
+    evaluate_sets,
+    markdown,
+    rectified_fusion,
+    sets_markdown,
+    structure_kept,
+    summarise,
+    write_csv,
+    write_markdown,
+)
+from pat.images import read_image, write_image
 from pat.metrics import score
+from pat.model import Fused
 
 
 def pairs(count=2):
@@ -85,3 +98,50 @@ def test_tables_hold_every_row(tmp_path):
         "| a | 28.00 / 0.8000 |",
         "| **mean** | **28.00** / **0.8000** |",
     ]
+
+
+class Onlooker:
+    """A network that notes where it is told to look, and gives alpha back."""
+
+    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch = 0, 2, 1, 1.0, True
+
+    def __call__(self, alpha, betas, looks):
+        found = looks[0].at(torch.tensor([[20.0, 7.0]]))
+        self.start, self.end = found.start[0].tolist(), found.end[0].tolist()
+        self.beta = tuple(betas[0].shape)
+        none = alpha[:, 0] * 0
+        return Fused(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
+
+
+def test_fusion_looks_along_the_row_in_alphas_pixels():
+    network, (pair,) = Onlooker(), pairs(1)
+    rows = evaluate_pairs(
+        [pair], {"fusion": rectified_fusion(network), "alpha": BASELINES["alpha"]}, [2], max_disparity=9
+    )
+    assert (network.start, network.end, network.beta) == ([11.0, 7.0], [20.0, 7.0], (1, 3, 16, 24))
+    assert rows[0][3:] == rows[1][3:]
+
+
+def test_sets_are_read_by_their_own_rules_and_shown_apart(tmp_path):
+    (pair,) = pairs(1)
+    for name in ("left", "right"):
+        write_image(tmp_path / "k" / f"{name}.png", getattr(pair, name))
+    rows = evaluate_sets({"kitti": tmp_path / "k", "folder": tmp_path / "k"}, BASELINES, [2], out=tmp_path / "out")
+    assert list(rows) == ["kitti", "folder"]
+    assert rows["kitti"] == rows["folder"]
+    assert (tmp_path / "out" / "folder").is_dir()
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        evaluate_sets({"kitti": tmp_path / "k", "folder": tmp_path / "nowhere"}, {}, [2], out=tmp_path)
+    assert sets_markdown({"a": ROWS}).startswith(f"#### a\n\n{markdown(ROWS)}\n")
+
+
+def test_lost_structure_is_named():
+    rows = [Row("p", 2, "alpha", 20, 0.9), Row("p", 2, "fusion", 30, 0.9), Row("q", 2, "alpha", 20, 0.9)]
+    rows.append(Row("q", 2, "fusion", 30, 0.91))
+    assert structure_kept(rows) == "SSIM of fusion is at least that of alpha in 2 of 2 cases."
+    rows[1] = rows[1]._replace(ssim=0.8999)
+    assert structure_kept(rows).endswith("1 of 2 cases; **below it**: p 2x.")
+
+
+def test_beta_as_it_is_has_its_own_header():
+    assert markdown([Row("a", 1, "ours", 30.0, 0.9)]).startswith("| beta as it is | ours |")

@@ -1,0 +1,145 @@
+"""Points seen in two pictures, and what they tell of a rig that is known only in part: a rough map, a depth range."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
+from arraygeom.pixels import shift_matrix
+
+from .images import luminance
+
+RATIO = 0.75
+"""The best match must be this much nearer than the second best (Lowe 2004, section 7.1)."""
+FEATURES = 6000
+ENOUGH = 20
+"""Matches that must agree before anything is concluded from them."""
+
+
+class Matches(NamedTuple):
+    """Points (x, y) of alpha, and where beta sees them."""
+
+    alpha: Float[Tensor, "n 2"]
+    beta: Float[Tensor, "n 2"]
+
+    def only(self, kept: Bool[Tensor, " n"]) -> Matches:
+        """Some of them."""
+        return Matches(self.alpha[kept], self.beta[kept])
+
+
+def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
+    """SIFT features of both pictures' luminance, contrast evened, that choose each other and pass the ratio test."""
+    (points_a, a), (points_b, b) = _features(alpha), _features(beta)
+    if len(points_a) < 2 or len(points_b) < 2:
+        return Matches(*torch.zeros(2, 0, 2, dtype=torch.float64))
+    there, back = _nearest(a, b), _nearest(b, a)
+    chosen = [(i, j) for i, j in there.items() if back.get(j) == i]
+    first, second = ([pair[k] for pair in chosen] for k in (0, 1))
+    return Matches(torch.from_numpy(points_a[first]), torch.from_numpy(points_b[second]))
+
+
+def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> Matches:
+    """The matches within some pixels of their epipolar line in beta."""
+    return matches.only(line_distance(matches, F) <= within)
+
+
+def line_distance(matches: Matches, F: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
+    """How far each match is from its epipolar line, in beta's pixels."""
+    return epipolar_distance(F.to(matches.alpha), *matches).abs()
+
+
+class FittedLink(NamedTuple):
+    """What matches tell of a pair known by F.
+
+    link: F fitted to the matches, and a similarity H in the middle of where points are along their lines.
+    matches: those that agree.
+    displacement: pixels of beta to either side of H x that hold 98% of them.
+    """
+
+    link: Link
+    matches: Matches
+    displacement: float
+
+
+def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
+    """A better F than `F`, and a rough map, from matches that `F` puts within some pixels of their lines.
+
+    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by RANSAC, then moved along the lines' mean direction. Raises
+    ValueError for fewer than 20 matches that agree.
+    """
+    near = near_lines(matches, F, within=within)
+    fitted = _fundamental(near) if len(near.alpha) >= ENOUGH else F
+    kept = near_lines(near, fitted, within=3)
+    if len(kept.alpha) < ENOUGH:
+        raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
+    H = _similarity(kept)
+    low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
+    line = epipolar_lines(fitted, kept.alpha)
+    shift = torch.stack([-line[:, 1], line[:, 0]], -1).mean(0) * (low + high) / 2
+    H = shift_matrix(*(-shift).tolist()).to(H) @ H
+    low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
+    return FittedLink(Link(fitted, H), kept, max(-low, high))
+
+
+def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
+    """Depth bounds, metres in front of alpha, that hold what was matched: 0.9 of the nearest to 1.25 of the farthest.
+
+    Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
+    """
+    near = near_lines(matches, pair.fundamental, within=3)
+    found = triangulate([camera.to(torch.float64) for camera in pair.cameras], torch.stack(near))
+    depth = pair.cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
+    if len(depth) < ENOUGH:
+        raise ValueError(f"only {len(depth)} points seen in both pictures fit the calibration: is it theirs?")
+    low, high = _percentiles(depth, 0.02)
+    return 0.9 * low, 1.25 * high
+
+
+def _fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
+    x, y = (points.numpy() for points in matches)
+    found, _ = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 1.0, 0.999, 10_000)
+    if found is None:
+        raise ValueError("no fundamental matrix fits the points seen in both pictures")
+    return torch.from_numpy(found)
+
+
+def _similarity(matches: Matches) -> Float[Tensor, "3 3"]:
+    """The similarity that most matches follow to 30 pixels of beta."""
+    x, y = (points.numpy() for points in matches)
+    found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
+    if found is None:
+        raise ValueError("the points seen in both pictures follow no common map")
+    return torch.from_numpy(np.vstack([found, [0, 0, 1]]))
+
+
+def _along_lines(matches: Matches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
+    """How far along its line each match is from the point of the line nearest to H x, pixels of beta."""
+    line = epipolar_lines(F, matches.alpha)
+    from_map = matches.beta - apply_homography(H, matches.alpha).x
+    return (from_map * torch.stack([-line[:, 1], line[:, 0]], -1)).sum(-1)
+
+
+def _percentiles(values: Tensor, share: float) -> tuple[float, float]:
+    low, high = values.quantile(values.new_tensor([share, 1 - share])).tolist()
+    return low, high
+
+
+def _features(picture: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    grey = luminance(picture)[0] if picture.shape[0] == 3 else picture[0]
+    even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(even, np.empty(0, np.uint8))
+    if not points:
+        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
+    return np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.float32)
+
+
+def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> dict[int, int]:
+    found = cv2.BFMatcher().knnMatch(a, b, k=2)
+    return {m.queryIdx: m.trainIdx for m, second in found if m.distance < RATIO * second.distance}
