@@ -26,6 +26,8 @@ from arraygeom import (
     Rig,
 )
 
+from .train import TrainConfig, train
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -226,6 +228,18 @@ class Show:
         console.print(f"written: {', '.join(map(str, written))}")
 
 
+@dataclass(frozen=True)
+class Train(TrainConfig):
+    """Train weights on scenes made from photographs while training.
+
+    Example: pat train --photos ~/pictures --out runs/mine --minutes 60
+    """
+
+    def run(self) -> None:
+        """Do it."""
+        console.print(f"written: {train(self)}")
+
+
 @dataclass
 class Info:
     """Fields of view, baselines, pixel footprints, and how long segments are for every pair."""
@@ -304,6 +318,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
 
