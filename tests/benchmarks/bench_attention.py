@@ -48,12 +48,27 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
 def index_everything(
     q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
 ) -> Tensor:
-    """(a): (b, h, w, l, d) keys and values, nearest."""
-    xy = (look.positions(samples).xy + 0.5).floor().long()
-    x, y = xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
+    """(a): (b, d, h, w, l) keys and values, nearest, from pictures that lie channels first, as they usually
+    do."""
+    x, y = _pixels(k, look, samples)
+    keys, values = (t.contiguous()[:, :, y, x] for t in (k, v))
+    weight = torch.einsum("bdhw,bdhwl->bhwl", q, keys).softmax(-1)
+    return torch.einsum("bhwl,bdhwl->bdhw", weight, values)
+
+
+def index_channels_last(
+    q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
+) -> Tensor:
+    """(a) at its best: whole rows of channels are copied, (b, h, w, l, d)."""
+    x, y = _pixels(k, look, samples)
     keys, values = (t.permute(0, 2, 3, 1)[:, y, x] for t in (k, v))
     weight = torch.matmul(keys, q.permute(0, 2, 3, 1)[..., None]).squeeze(-1).softmax(-1)
     return torch.matmul(weight[..., None, :], values).squeeze(-2).permute(0, 3, 1, 2)
+
+
+def _pixels(k: Tensor, look: Segments, samples: int) -> tuple[Tensor, Tensor]:
+    xy = (look.positions(samples).xy + 0.5).floor().long()
+    return xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
 
 
 def grid_sampled(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
@@ -74,9 +89,11 @@ def fused(backend: str):
     return run
 
 
-METHODS = {"index": index_everything, "grid_sample": grid_sampled} | {
-    name: fused(name) for name in ("reference", "cpu", "triton")
-}
+METHODS = {
+    "index": index_everything,
+    "index, channels last": index_channels_last,
+    "grid_sample": grid_sampled,
+} | {name: fused(name) for name in ("reference", "cpu", "triton")}
 
 
 def measure(job: dict) -> dict:
@@ -191,9 +208,9 @@ def jobs(device: str, quick: bool) -> list[dict]:
     for ha, wa, samples in sizes:
         for backward in (False, True):
             gathered = ha * wa * samples * 64 * 4 * (2 + 3 * backward)
-            for method in ("index", "grid_sample", "reference", fast):
+            for method in ("index", "index, channels last", "grid_sample", "reference", fast):
                 for interpolation in ("nearest", "bilinear"):
-                    skip = method == "index" and interpolation == "bilinear"
+                    skip = method.startswith("index") and interpolation == "bilinear"
                     skip |= method != fast and gathered > 16 * 2**30
                     skip |= method == "reference" and ha * wa * samples * (1 + backward) > 2 * 10**7
                     if not skip:
@@ -273,7 +290,8 @@ def main() -> None:
     lines = [
         "# Attention, measured",
         "",
-        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, {torch.get_num_threads()} threads, "
+        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, "
+        f"{torch.get_num_threads()} threads; "
         f"load of the machine before {os.getloadavg()[0]:.1f}. D = 64, channels last. (a) is `index`, (b) is "
         "`grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory. "
         "Written by `python -m tests.benchmarks.bench_attention`.",
