@@ -218,6 +218,8 @@ def _attend_chunks(
 
     def chunk(q: Tensor, k: Tensor, v: Tensor, part: Tensor | None, top: int) -> Attended:
         where = look(_pixel_rows(top, top + q.shape[2], wa, q))
+        if not isinstance(where, Positions):
+            raise TypeError(f"look returned Positions for some pixels and {type(where)} for others")
         where = Positions(where.xy.unflatten(0, (-1, wa)), where.mask.unflatten(0, (-1, wa)))
         return run(q, k, v, where, part)
 

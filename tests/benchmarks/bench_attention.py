@@ -38,18 +38,37 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
     y, x = torch.meshgrid(torch.arange(ha).float(), torch.arange(wa).float(), indexing="ij")
     length = min(samples - 1, wa - 1)
     slope = min(0.06, (ha - 5) / length)
-    start = torch.stack([(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1)
+    start = torch.stack(
+        [(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1
+    )
     end = start + torch.tensor([length, slope * length])
     return Segments(start.to(device), end.to(device), torch.ones(ha, wa, dtype=torch.bool, device=device))
 
 
-def index_everything(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
-    """(a): (b, h, w, l, d) keys and values, nearest."""
-    xy = (look.positions(samples).xy + 0.5).floor().long()
-    x, y = xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
+def index_everything(
+    q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
+) -> Tensor:
+    """(a): (b, d, h, w, l) keys and values, nearest, from pictures that lie channels first, as they usually
+    do."""
+    x, y = _pixels(k, look, samples)
+    keys, values = (t.contiguous()[:, :, y, x] for t in (k, v))
+    weight = torch.einsum("bdhw,bdhwl->bhwl", q, keys).softmax(-1)
+    return torch.einsum("bhwl,bdhwl->bdhw", weight, values)
+
+
+def index_channels_last(
+    q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
+) -> Tensor:
+    """(a) at its best: whole rows of channels are copied, (b, h, w, l, d)."""
+    x, y = _pixels(k, look, samples)
     keys, values = (t.permute(0, 2, 3, 1)[:, y, x] for t in (k, v))
     weight = torch.matmul(keys, q.permute(0, 2, 3, 1)[..., None]).squeeze(-1).softmax(-1)
     return torch.matmul(weight[..., None, :], values).squeeze(-2).permute(0, 3, 1, 2)
+
+
+def _pixels(k: Tensor, look: Segments, samples: int) -> tuple[Tensor, Tensor]:
+    xy = (look.positions(samples).xy + 0.5).floor().long()
+    return xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
 
 
 def grid_sampled(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
@@ -70,9 +89,11 @@ def fused(backend: str):
     return run
 
 
-METHODS = {"index": index_everything, "grid_sample": grid_sampled} | {
-    name: fused(name) for name in ("reference", "cpu", "triton")
-}
+METHODS = {
+    "index": index_everything,
+    "index, channels last": index_channels_last,
+    "grid_sample": grid_sampled,
+} | {name: fused(name) for name in ("reference", "cpu", "triton")}
 
 
 def measure(job: dict) -> dict:
@@ -81,7 +102,9 @@ def measure(job: dict) -> dict:
     ha, wa, d, samples = job["ha"], job["wa"], job["d"], job["samples"]
     torch.manual_seed(0)
     q, k, v = (
-        torch.randn(1, d, ha, wa, dtype=dtype, device=device).to(memory_format=torch.channels_last).requires_grad_()
+        torch.randn(1, d, ha, wa, dtype=dtype, device=device)
+        .to(memory_format=torch.channels_last)
+        .requires_grad_()
         for _ in range(3)
     )
     look, run = field(ha, wa, samples, device), METHODS[job["method"]]
@@ -116,7 +139,9 @@ def measure(job: dict) -> dict:
 
 def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
     """Compiles what has to be, on a small picture."""
-    q, k, v = (torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3))
+    q, k, v = (
+        torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3)
+    )
     out = run(q, k, v, field(8, 8, 4, device), 4, job["interpolation"])
     if job["backward"]:
         out.sum().backward()
@@ -183,9 +208,9 @@ def jobs(device: str, quick: bool) -> list[dict]:
     for ha, wa, samples in sizes:
         for backward in (False, True):
             gathered = ha * wa * samples * 64 * 4 * (2 + 3 * backward)
-            for method in ("index", "grid_sample", "reference", fast):
+            for method in ("index", "index, channels last", "grid_sample", "reference", fast):
                 for interpolation in ("nearest", "bilinear"):
-                    skip = method == "index" and interpolation == "bilinear"
+                    skip = method.startswith("index") and interpolation == "bilinear"
                     skip |= method != fast and gathered > 16 * 2**30
                     skip |= method == "reference" and ha * wa * samples * (1 + backward) > 2 * 10**7
                     if not skip:
@@ -222,7 +247,9 @@ def row(entry: dict, result: dict, baselines: dict, rate: float, bandwidth: floa
     least = (2 if entry["backward"] else 1) * result["unit"]
     key = (shape, work)
     against = [
-        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x" if base else "-"
+        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x"
+        if base
+        else "-"
         for base in (
             baselines.get((*key, "index", "nearest")),
             baselines.get((*key, "grid_sample", entry["interpolation"])),
@@ -263,7 +290,8 @@ def main() -> None:
     lines = [
         "# Attention, measured",
         "",
-        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, {torch.get_num_threads()} threads, "
+        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, "
+        f"{torch.get_num_threads()} threads; "
         f"load of the machine before {os.getloadavg()[0]:.1f}. D = 64, channels last. (a) is `index`, (b) is "
         "`grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory. "
         "Written by `python -m tests.benchmarks.bench_attention`.",
@@ -271,7 +299,9 @@ def main() -> None:
     for device in ("cpu", "cuda"):
         lines += ["", f"## {device}", ""]
         if device == "cuda" and not torch.cuda.is_available():
-            lines.append("No GPU at hand: the Triton backend was not measured. Where there is one, this command does.")
+            lines.append(
+                "No GPU at hand: the Triton backend was not measured. Where there is one, this command does."
+            )
             continue
         lines += table(device, quick=options.quick)
     RESULTS.write_text("\n".join(lines) + "\n")
