@@ -11,8 +11,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
+
+from pat.images import write_image
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("arraygeom", "pat", "calib")
@@ -157,11 +160,15 @@ def test_what_is_asked_for_is_pinned_exactly_and_in_range():
 
 
 def test_the_readme_example_runs(tmp_path, monkeypatch, capsys):
-    (rig,), (program,) = blocks("README.md", "yaml"), blocks("README.md", "python")
+    (rig,), (where, fused) = blocks("README.md", "yaml"), blocks("README.md", "python")
     (tmp_path / "rig.yaml").write_text(rig)
+    for name, channels in (("a", 1), ("b", 3)):
+        write_image(tmp_path / f"{name}.png", torch.rand(channels, 400, 640))
     monkeypatch.chdir(tmp_path)
-    exec(program, {})
+    exec(where, {})
     assert "tensor" in capsys.readouterr().out
+    exec(fused, {})
+    assert "[3, 400, 640]" in capsys.readouterr().out
 
 
 def test_documents_name_targets_and_files_that_exist():

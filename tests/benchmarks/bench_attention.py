@@ -38,16 +38,12 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
     y, x = torch.meshgrid(torch.arange(ha).float(), torch.arange(wa).float(), indexing="ij")
     length = min(samples - 1, wa - 1)
     slope = min(0.06, (ha - 5) / length)
-    start = torch.stack(
-        [(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1
-    )
+    start = torch.stack([(x - length).clamp(0, wa - 1 - length), (y + 0.3).clamp(0, ha - 2 - slope * length)], -1)
     end = start + torch.tensor([length, slope * length])
     return Segments(start.to(device), end.to(device), torch.ones(ha, wa, dtype=torch.bool, device=device))
 
 
-def index_everything(
-    q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
-) -> Tensor:
+def index_everything(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
     """(a): (b, d, h, w, l) keys and values, nearest, from pictures that lie channels first, as they usually
     do."""
     x, y = _pixels(k, look, samples)
@@ -56,9 +52,7 @@ def index_everything(
     return torch.einsum("bhwl,bdhwl->bdhw", weight, values)
 
 
-def index_channels_last(
-    q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str
-) -> Tensor:
+def index_channels_last(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
     """(a) at its best: whole rows of channels are copied, (b, h, w, l, d)."""
     x, y = _pixels(k, look, samples)
     keys, values = (t.permute(0, 2, 3, 1)[:, y, x] for t in (k, v))
@@ -102,9 +96,7 @@ def measure(job: dict) -> dict:
     ha, wa, d, samples = job["ha"], job["wa"], job["d"], job["samples"]
     torch.manual_seed(0)
     q, k, v = (
-        torch.randn(1, d, ha, wa, dtype=dtype, device=device)
-        .to(memory_format=torch.channels_last)
-        .requires_grad_()
+        torch.randn(1, d, ha, wa, dtype=dtype, device=device).to(memory_format=torch.channels_last).requires_grad_()
         for _ in range(3)
     )
     look, run = field(ha, wa, samples, device), METHODS[job["method"]]
@@ -139,9 +131,7 @@ def measure(job: dict) -> dict:
 
 def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
     """Compiles what has to be, on a small picture."""
-    q, k, v = (
-        torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3)
-    )
+    q, k, v = (torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3))
     out = run(q, k, v, field(8, 8, 4, device), 4, job["interpolation"])
     if job["backward"]:
         out.sum().backward()
@@ -247,9 +237,7 @@ def row(entry: dict, result: dict, baselines: dict, rate: float, bandwidth: floa
     least = (2 if entry["backward"] else 1) * result["unit"]
     key = (shape, work)
     against = [
-        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x"
-        if base
-        else "-"
+        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x" if base else "-"
         for base in (
             baselines.get((*key, "index", "nearest")),
             baselines.get((*key, "grid_sample", entry["interpolation"])),
@@ -299,9 +287,7 @@ def main() -> None:
     for device in ("cpu", "cuda"):
         lines += ["", f"## {device}", ""]
         if device == "cuda" and not torch.cuda.is_available():
-            lines.append(
-                "No GPU at hand: the Triton backend was not measured. Where there is one, this command does."
-            )
+            lines.append("No GPU at hand: the Triton backend was not measured. Where there is one, this command does.")
             continue
         lines += table(device, quick=options.quick)
     RESULTS.write_text("\n".join(lines) + "\n")
