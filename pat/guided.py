@@ -151,12 +151,12 @@ class GuidedPAT(nn.Module):
         other = self.encoder(guide)
         hw = own.half.shape[-2] * 2, own.half.shape[-1] * 2
         match = self._first_look(own, other, look, hw)
-        window = window_around(match.reach, _segments(look, hw, 1), self.config.window)
+        window = window_around(match.reach, _segments(look, hw, 1, own.half), self.config.window)
         query, key = (pixel_shuffle(self.fine_key(f.half), 2) for f in (own, other))
         return attend_with_statistics(query, key, beta, window, samples=self.config.taps), match
 
     def _first_look(self, own: Encoded, other: Encoded, look: Look, hw: tuple[int, int]) -> Match:
-        segments = _segments(look, hw, COARSE)
+        segments = _segments(look, hw, COARSE, own.half)
         length = segments.length[:, None]
         valid = segments.valid[:, None]
         reduced = Segments(_reduced(segments.start), _reduced(segments.end), segments.valid)
@@ -206,10 +206,10 @@ def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: f
     return Segments(middle + window * along, middle - window * along, segments.valid.expand(reach.shape))
 
 
-def _segments(look: Look, hw: tuple[int, int], step: int) -> Segments:
+def _segments(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:
     """The segments of every `step`-th block of alpha pixels, at its centre: (B or 1, h / step, w / step)."""
     grid = (hw[0] // step, hw[1] // step)
-    x = (pixel_grid(grid) + 0.5) * step - 0.5
+    x = (pixel_grid(grid, dtype=like.dtype, device=like.device) + 0.5) * step - 0.5
     found = look.at(x.reshape(-1, 2))
     if not isinstance(found, Segments):
         raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the pictures")

@@ -125,6 +125,8 @@ def _flat(tensor: Tensor) -> np.ndarray:
 def _new(*shape: int, dtype: torch.dtype) -> Tensor:
     """An uninitialised tensor. Of numpy's memory, which asks for huge pages: first touching torch's pages of
     4 KiB took an eighth of forward's time."""
+    if not math.prod(shape):
+        return torch.empty(shape, dtype=dtype)
     return torch.from_numpy(np.empty(math.prod(shape) * dtype.itemsize, np.uint8)).view(dtype).view(shape)
 
 
