@@ -39,7 +39,7 @@ class Look:
         found = at(sparse)
         if isinstance(found, Positions):
             return cls(at, found.xy.shape[-2])
-        longest = torch.where(found.valid, found.length, 0.0).max()
+        longest = torch.where(found.valid, found.length.detach(), 0.0).max()
         return cls(at, math.ceil(float(longest)) + 1)
 
 
