@@ -1,8 +1,7 @@
 """Whole frames: a rig and one picture a camera in, one fused picture out.
 
 Frames too large for the memory allowed are fused in tiles of alpha, each with just the part of every beta that
-its segments touch, and a halo as wide as the network sees. Tiled and whole results are equal to rounding, which in
-float32 is that of positions in beta: at 1000 pixels 6e-5 of a pixel.
+its segments touch, and a halo as wide as the network sees. Tiled and whole results are equal to rounding.
 """
 
 from __future__ import annotations
@@ -308,7 +307,7 @@ UNSEEN = 1e-4
 def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -> tuple[Tensor, Tensor]:
     """Depth by the betas that are calibrated, weighted by confidence in inverse depth; confidence, the least."""
     h, w = hw
-    like = fused.confidence[0]
+    like = fused.position[0]
     x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
     total, weights = like.new_zeros(2, h, w)
     for piece, position, confidence in zip(pieces, fused.position, fused.confidence):
@@ -322,4 +321,4 @@ def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -
         weights = weights + weight
     known = weights > 0
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
-    return depth, torch.stack([c[0, :h, :w] for c in fused.confidence]).amin(0)
+    return depth.to(fused.image), torch.stack([c[0, :h, :w] for c in fused.confidence]).amin(0)

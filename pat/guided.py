@@ -119,7 +119,7 @@ class GuidedPAT(nn.Module):
         own = self.encoder(alpha)
         seen = [self._see(own, beta, look) for beta, look in zip(betas, looks)]
         attended, matches = zip(*seen)
-        colours = [a.value - alpha for a in attended]
+        colours = [a.value.to(alpha) - alpha for a in attended]
         logits = [enlarge(m.logit, COARSE) for m in matches]
         carried = torch.cat([self._carried(own, c, z.sigmoid()) for c, z in zip(colours, logits)], 1)
         certain = torch.cat([z.sigmoid().expand_as(c) for z, c in zip(logits, colours)], 1)
@@ -151,22 +151,27 @@ class GuidedPAT(nn.Module):
         other = self.encoder(guide)
         hw = own.half.shape[-2] * 2, own.half.shape[-1] * 2
         match = self._first_look(own, other, look, hw)
-        window = window_around(match.reach, _segments(look, hw, 1, own.half), self.config.window)
-        query, key = (pixel_shuffle(self.fine_key(f.half), 2) for f in (own, other))
-        return attend_with_statistics(query, key, beta, window, samples=self.config.taps), match
+        window = window_around(match.reach, _segments(look, hw, 1, self._exact(own.half)), self.config.window)
+        query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
+        return attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps), match
+
+    def _exact(self, x: Tensor) -> Tensor:
+        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
+        return x if self.training else x.double()
 
     def _first_look(self, own: Encoded, other: Encoded, look: Look, hw: tuple[int, int]) -> Match:
-        segments = _segments(look, hw, COARSE, own.half)
+        query, key = (self._exact(self.coarse_key(f.quarter)) for f in (own, other))
+        value = self._exact(self.coarse_value(other.quarter))
+        segments = _segments(look, hw, COARSE, query)
         length = segments.length[:, None]
         valid = segments.valid[:, None]
         reduced = Segments(_reduced(segments.start), _reduced(segments.end), segments.valid)
         samples = -(-(look.samples - 1) // COARSE) + 1
-        query, key = self.coarse_key(own.quarter), self.coarse_key(other.quarter)
-        attended = attend_with_statistics(query, key, self.coarse_value(other.quarter), reduced, samples=samples)
+        attended = attend_with_statistics(query, key, value, reduced, samples=samples)
         fraction = reduced.fraction(attended.position.movedim(1, -1))
         reach = torch.where(valid & (attended.peak[:, None] > 0), (1 - fraction)[:, None] * length, 0.0)
         facts = [reach / 64, attended.spread[:, None] / 4, attended.peak[:, None], valid.to(reach).expand_as(reach)]
-        answer = self.judge(torch.cat([own.quarter, attended.value, *facts], 1))
+        answer = self.judge(torch.cat([own.quarter, *(f.to(own.quarter) for f in (attended.value, *facts))], 1))
         reach = reach + COARSE * answer[:, :1]
         position = segments.end + reach[:, 0, :, :, None] * _along(segments)
         return Match(reach, position.movedim(-1, 1), torch.where(valid, answer[:, 1:], NOWHERE))
