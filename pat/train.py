@@ -19,7 +19,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, interpolate, smooth_l1_loss
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
-from arraygeom import Epipolar, Pair, pixel_grid, sample
+from arraygeom import Epipolar, Pair, ReceptiveField, pixel_grid, sample
 from arraygeom.fields import pinhole_track
 
 from .guided import COARSE, GuidedPAT, GuidedPATConfig, Match
@@ -80,8 +80,11 @@ class Sample(NamedTuple):
     visible: list[Tensor]
 
 
-def train(config: TrainConfig) -> Path:
-    """Train from nothing; returns the file of the best weights (and writes log.jsonl beside it)."""
+def train(config: TrainConfig, *, field: ReceptiveField = Epipolar()) -> Path:  # noqa: B008
+    """Train, looking where `field` says; returns the file of the best weights (and writes log.jsonl beside it).
+
+    Raises FloatingPointError if a gradient is not finite; the best weights so far stay.
+    """
     torch.manual_seed(config.seed)
     config.out.mkdir(parents=True, exist_ok=True)
     network = GuidedPAT(config.network)
@@ -90,7 +93,7 @@ def train(config: TrainConfig) -> Path:
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
     averaged = cast(GuidedPAT, average.module)
     adam = torch.optim.Adam(network.parameters(), lr=config.rate, betas=(0.9, 0.99))
-    learn, examine = scenes(config)
+    learn, examine = scenes(config, field=field)
     examination = list(examine(8))
     best, started = -torch.inf, time.monotonic()
     for step, given in enumerate(learn(config.steps), 1):
@@ -119,7 +122,11 @@ def train(config: TrainConfig) -> Path:
     return config.out / "best.safetensors"
 
 
-def scenes(config: TrainConfig) -> tuple[Callable[[int], Iterator[Sample]], Callable[[int], Iterator[Sample]]]:
+def scenes(
+    config: TrainConfig,
+    *,
+    field: ReceptiveField = Epipolar(),  # noqa: B008
+) -> tuple[Callable[[int], Iterator[Sample]], Callable[[int], Iterator[Sample]]]:
     """Sources of samples to learn from and to validate on, from different photographs."""
     bank, unseen = photographs(config)
     kinds = {
@@ -142,9 +149,9 @@ def scenes(config: TrainConfig) -> tuple[Callable[[int], Iterator[Sample]], Call
                     kind = "rectified" if _chance(config.rectified, g) else "general"
                     betas = 3 if _chance(config.filtered, g) else 1
                     kept = [makers[kind, betas].sample(config.batch, g), *kept[:KEPT]]
-                    yield degraded(kept[0], g)
+                    yield degraded(kept[0], g, field=field)
                 else:
-                    yield degraded(kept[int(torch.randint(len(kept), (), generator=g))], g)
+                    yield degraded(kept[int(torch.randint(len(kept), (), generator=g))], g, field=field)
 
         return samples
 
@@ -161,7 +168,7 @@ def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
     return bank(lambda i: i % n != 0), bank(lambda i: i % n == 0)
 
 
-def degraded(scene: ArrayBatch, g: Generator) -> Sample:
+def degraded(scene: ArrayBatch, g: Generator, *, field: ReceptiveField = Epipolar()) -> Sample:  # noqa: B008
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
     ideal = scene.images[0]
     alpha = record(luminance(ideal), recording(g), g).image
@@ -172,7 +179,7 @@ def degraded(scene: ArrayBatch, g: Generator) -> Sample:
         if len(scene.images) == 2 and _chance(PAPER, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
-        looks.append(Look.along(Epipolar(), pair))
+        looks.append(Look.along(field, pair))
         where, seen = truth_in(pair, scene.depth[0], scene.depth[i])
         position.append(where)
         visible.append(seen)

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Generator
 
-from arraygeom import sample
+from arraygeom import Epipolar, Segments, sample
 from pat.guided import GuidedPATConfig
 from pat.images import luminance, write_image
 from pat.train import TrainConfig, degraded, picture_loss, scenes, train
@@ -50,6 +50,20 @@ def test_positions_lie_on_the_segments(config):
             nearest = segments.at(segments.fraction(position.reshape(len(position), -1, 2)).clamp(0, 1))
             off = (nearest - position.reshape(len(position), -1, 2)).norm(dim=-1)
             assert off[segments.valid & visible.reshape(len(visible), -1)].max() < 0.1
+
+
+def test_a_field_of_ones_own_trains(config):
+    """A field in a few lines, given to training, is where the samples look."""
+
+    def upper_half(pair, x):
+        found = Epipolar()(pair, x)
+        return Segments(found.start, found.at(torch.full_like(found.start[..., 0], 0.5)), found.valid)
+
+    learn, _ = scenes(config, field=upper_half)
+    whole, _ = scenes(config)
+    x = torch.tensor([[20.0, 15.0]])
+    (mine, all_of_it) = (next(source(1)).looks[0].at(x) for source in (learn, whole))
+    assert torch.allclose(2 * mine.length, all_of_it.length, rtol=1e-4)
 
 
 def test_the_same_seed_makes_the_same_samples(config):
