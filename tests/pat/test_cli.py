@@ -6,6 +6,7 @@ import pytest
 import torch
 import yaml
 
+from arraygeom import Rig
 from pat.cli import main
 from pat.demo import SAMPLE, load_sample
 from pat.images import read_image, write_image
@@ -125,3 +126,29 @@ def test_pictures_with_an_alpha_channel_or_nan(small, capsys):
     shutil.copy(small / "colour.png", small / "mono.tif")
     cv2.imwrite(str(small / "mono.tif"), torch.full((96, 128), torch.nan).numpy())
     assert "NaN" in fails(arguments(small, mono=small / "mono.tif"), capsys)
+
+
+def test_show_draws_the_rig_and_its_fields(small):
+    main(["show", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--out", str(small / "out")])
+    assert sorted(p.name for p in (small / "out").iterdir()) == ["fields.png", "rig.png"]
+    main(["rig", "show", str(small / "rig.yaml"), "--alpha", "colour", "--out", str(small / "again")])
+    assert (small / "again" / "fields.png").is_file()
+
+
+def test_rig_info_tells_the_numbers(small, capsys):
+    main(["rig", "info", str(small / "rig.yaml"), "--depth", "2", "8"])
+    text = " ".join(capsys.readouterr().out.split())
+    assert "128x96" in text
+    assert "820, 820" in text
+    assert "2.439 - 9.756" in text
+    assert "0.1241" in text
+
+
+def test_rig_convert_and_back(small, capsys):
+    main(["rig", "convert", str(small / "rig.yaml"), str(small / "chain.yaml"), "--write-as", "kalibr"])
+    main(["rig", "convert", str(small / "chain.yaml"), str(small / "back.yaml")])
+    first, again = Rig.load(small / "rig.yaml"), Rig.load(small / "back.yaml")
+    for a, b in zip(first.cameras.values(), again.cameras.values()):
+        assert torch.allclose(a.K, b.K)
+        assert torch.allclose(a.cam_from_world.t, b.cam_from_world.t, atol=1e-9)
+    assert "known" in fails(["rig", "convert", str(small / "rig.yaml"), "x", "--write-as", "word"], capsys)
