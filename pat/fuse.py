@@ -108,14 +108,10 @@ def fuse(
     ]
     hw = rig[alpha].hw
     tiles = plan(network, hw, betas, None if max_memory is None else parse_bytes(max_memory))
-    frame = [torch.empty(0)] * 3
+    frame: list[Tensor] = []
     for tile in progress(tiles, len(tiles)) if progress else tiles:
         parts = _fuse_tile(network, own, betas, tile)
-        if len(tiles) == 1:
-            frame = list(parts)
-            break
-        if not frame[0].numel():
-            frame = [part.new_empty(*part.shape[:-2], *hw) for part in parts]
+        frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in parts]
         top, bottom, left, right = tile.inner
         for whole, part in zip(frame, parts):
             whole[..., top:bottom, left:right] = part

@@ -85,7 +85,7 @@ class GuidedPAT(nn.Module):
     halo = 608
     """Encoder 85, judge 176, carrying 148, propagation 180 and head 12: the sum, rounded up."""
     beta_halo = 96
-    bytes_per_pixel = 700.0
+    bytes_per_pixel = 320.0
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()

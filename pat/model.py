@@ -111,7 +111,7 @@ class PAT(nn.Module):
     beta_halo = 64
     multiple = 1
     equal_pitch = False
-    bytes_per_pixel = 3000.0
+    bytes_per_pixel = 1600.0
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()

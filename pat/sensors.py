@@ -12,6 +12,7 @@ Steps that change the pixel grid say how through `pixel_matrix`; K' = A K with t
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -29,12 +30,12 @@ _RGB_SIGMA = 35.0
 _REC601 = (0.299, 0.587, 0.114)
 
 
-class Step:
+class Step(ABC):
     """One thing that happens to a picture. Subclasses say what in `apply`."""
 
+    @abstractmethod
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
         """The pictures afterwards."""
-        raise NotImplementedError
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
         """A with x_after ~ A x_before for a picture of height and width `hw`."""
