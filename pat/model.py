@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_grid
 
 from .attention import Attended, attend_with_statistics
+from .consensus import Consensus
 from .blocks import ResidualASPP, ResidualBlock
 
 
@@ -26,10 +27,12 @@ class Look:
     """Where to look in one beta: `at` maps alpha pixels (n, 2) to segments or positions in beta's pixels.
 
     `at` may answer for one rig (n) or for a batch of rigs (B, n). Segments are looked at in `samples` places.
+    `known` is what a survey of the whole pictures has found, for networks that make one.
     """
 
     at: Callable[[Tensor], Segments | Positions]
     samples: int
+    known: Consensus | None = None
 
     @classmethod
     def along(cls, field: ReceptiveField, pair: Pair) -> Look:

@@ -15,21 +15,22 @@ from pathlib import Path
 from typing import NamedTuple, cast
 
 import torch
+from safetensors.torch import load_file
 from torch import Generator, Tensor
-from torch.nn.functional import binary_cross_entropy_with_logits, interpolate, smooth_l1_loss
+from torch.nn.functional import binary_cross_entropy_with_logits, interpolate
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from arraygeom import Epipolar, Pair, ReceptiveField, pixel_grid, sample
 from arraygeom.fields import pinhole_track
 
-from .guided import COARSE, GuidedPAT, GuidedPATConfig, Match
+from .guided import GuidedPAT, GuidedPATConfig, Seen
 from .images import luminance
 from .model import Fused, Look
 from .sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from .synthesis.layered import ArrayBatch, LayeredScenes
 from .synthesis.photos import PhotoBank
 from .synthesis.rigs import RigDistribution
-from .weights import load_weights, save_weights
+from .weights import save_weights
 
 PAPER = 0.3
 """In this share of the batches, one of the paper's four degradations on top."""
@@ -89,7 +90,8 @@ def train(config: TrainConfig, *, field: ReceptiveField = Epipolar()) -> Path:  
     config.out.mkdir(parents=True, exist_ok=True)
     network = GuidedPAT(config.network)
     if config.start is not None:
-        network.load_state_dict(load_weights(config.start).state_dict())
+        own, old = network.state_dict(), load_file(config.start)
+        network.load_state_dict(own | {k: v for k, v in old.items() if k in own and own[k].shape == v.shape})
     average = AveragedModel(network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
     averaged = cast(GuidedPAT, average.module)
     adam = torch.optim.Adam(network.parameters(), lr=config.rate, betas=(0.9, 0.99))
@@ -100,8 +102,8 @@ def train(config: TrainConfig, *, field: ReceptiveField = Epipolar()) -> Path:  
         done = max(step / config.steps, (time.monotonic() - started) / 60 / config.minutes)
         for group in adam.param_groups:
             group["lr"] = config.rate * min(step / 100, 0.5 + 0.5 * math.cos(math.pi * min(done, 1)))
-        fused, matches = network.explain(given.alpha, given.betas, given.looks)
-        loss = picture_loss(fused.image, given.truth) + match_loss(fused, matches, given)
+        fused, seen = network.explain(given.alpha, given.betas, given.looks)
+        loss = picture_loss(fused.image, given.truth) + match_loss(fused, seen, given)
         adam.zero_grad()
         loss.backward()
         norm = torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -227,22 +229,15 @@ def picture_loss(image: Tensor, truth: Tensor) -> Tensor:
     return ((image - truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
 
-def match_loss(fused: Fused, matches: list[Match], given: Sample) -> Tensor:
+def match_loss(fused: Fused, seen: list[Seen], given: Sample) -> Tensor:
     """How far off the looks were where beta sees the point, pixels, and how wrong the confidence."""
     total = fused.image.new_zeros(())
-    for i, match in enumerate(matches):
-        near = given.position[i].movedim(-1, 1)
-        seen = given.visible[i][:, None]
-        coarse = _coarse(near)
-        all_seen = torch.nn.functional.avg_pool2d(seen.float(), COARSE)
-        error = smooth_l1_loss(match.position, coarse, reduction="none", beta=2.0).sum(1, keepdim=True)
-        weight = 0.1 + 0.9 * all_seen
-        total = total + 0.02 * (error.clamp(max=40) * weight).sum() / weight.sum()
-        fine = (fused.position[i] - near).abs().sum(1, keepdim=True).clamp(max=6.0)
-        total = total + 0.02 * (fine * seen).sum() / seen.sum().clamp(min=1)
-        good = all_seen * ((match.position - coarse).square().sum(1, keepdim=True) < 9).float()
-        total = total + 0.1 * binary_cross_entropy_with_logits(match.logit, good.detach())
-    return total / len(matches)
+    for told, truth, visible in zip(seen, given.position, given.visible):
+        off = (told.attended.position - truth.movedim(-1, 1)).abs().sum(1)
+        total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
+        good = (visible & (off.detach() < 1.5)).to(off)
+        total = total + 0.05 * binary_cross_entropy_with_logits(told.logit[:, 0], good)
+    return total / len(seen)
 
 
 @torch.no_grad()
@@ -256,10 +251,6 @@ def validation(network: GuidedPAT, samples: list[Sample]) -> dict[str, float]:
         off = (fused.position[0] - given.position[0].movedim(-1, 1)).norm(dim=1)
         near.append((off[given.visible[0]] < 1.5).float().mean())
     return {"psnr": float(torch.stack(psnr).mean()), "matched": float(torch.stack(near).mean())}
-
-
-def _coarse(x: Tensor) -> Tensor:
-    return torch.nn.functional.avg_pool2d(x, COARSE)
 
 
 def _enlarged(picture: Tensor, hw: tuple[int, int]) -> Tensor:

@@ -48,7 +48,7 @@ def forward(
     )
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
     pieces = _pieces(0, b * ha * wa, look)
-    _share([partial(_in_room, kernels.forward, call, (*piece, *outputs)) for piece in pieces])
+    share([partial(_in_room, kernels.forward, call, (*piece, *outputs)) for piece in pieces])
     return out.permute(0, 3, 1, 2), statistics, logsum
 
 
@@ -97,8 +97,8 @@ def backward(
         last = min(first + step, b * ha * wa)
         rest = (first, stride, scratch, *outputs)
         pieces = _pieces(first, last, look)
-        _share([partial(_in_room, kernels.backward, call, (*piece, *rest)) for piece in pieces])
-        _share([partial(add, first, last) for add in additions])
+        share([partial(_in_room, kernels.backward, call, (*piece, *rest)) for piece in pieces])
+        share([partial(add, first, last) for add in additions])
     pictures = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
         for out, like, want in zip((query_out, key_out, value_out), (query, key, value), wanted)
@@ -207,7 +207,7 @@ def _pieces(first: int, last: int, look: Look) -> list[tuple[int, int]]:
     return [(p, min(p + step, last)) for p in range(first, last, step)]
 
 
-def _share(tasks: list[Callable[[], None]]) -> None:
+def share(tasks: list[Callable[[], None]]) -> None:
     """Runs tasks on the threads that torch may use, this one included; raises what any of them raises."""
     left = iter(tasks)
 
