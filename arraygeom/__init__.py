@@ -42,6 +42,7 @@ from .sampling import sample, to_grid
 from .segments import Positions, Segments
 from .sensor import Band, Curve, Sensor
 from .triangulation import Triangulated, depth_of, triangulate
+from .undistortion import pinhole_view, retaken
 
 __all__ = [
     "Band",
@@ -86,10 +87,12 @@ __all__ = [
     "intrinsics",
     "lazily",
     "look",
+    "pinhole_view",
     "pixel_grid",
     "plane_homography",
     "rectify",
     "resize_matrix",
+    "retaken",
     "rotation_from_vector",
     "sample",
     "segments_between",

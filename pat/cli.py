@@ -95,7 +95,7 @@ class Fuse:
     depth: tuple[float, float] | None = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Path = Path("out")
-    """Folder for fused.png, confidence.png, depth.tif and depth.png."""
+    """Folder for fused.png, confidence.png, depth.tif, depth.png and view.yaml (the rig of the fused view)."""
     weights: str = "mono-colour"
     """Name of weights in the package, or a file."""
     field: FieldName = "auto"
@@ -104,20 +104,24 @@ class Fuse:
     """Working memory allowed, like 4GiB; larger frames are fused in tiles."""
     match_levels: bool = False
     """Bring every beta to alpha's brightness and contrast first (other exposures, filters)."""
-    bits: Literal[8, 16] = 8
-    """Bits a channel of fused.png."""
+    bits: Literal[8, 16, 32] = 8
+    """Bits a channel of the fused picture: 8 or 16 coded as sRGB, or 32 for linear light as floats (tif, exr)."""
+    kind: Literal["png", "tif", "exr"] = "png"
+    """Format of the fused picture."""
 
     def run(self) -> None:
         """Do it."""
+        from .develop import read_views
         from .fuse import parse_bytes
-        from .images import read_image
-        from .results import save_frame
+        from .results import save_frame, view_of
 
         rig = Rig.load(self.rig)
         files = dict(_name_and_file(text) for text in self.image)
         if len(files) < len(self.image):
             raise ValueError("--image: a camera is given twice; give each camera one picture")
-        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
+            raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
+        rig, images = read_views(rig, {rig.known(name): path for name, path in files.items()}, alpha=self.alpha)
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
         frame = fuse_frame(
@@ -130,7 +134,9 @@ class Fuse:
             max_memory=self.max_memory,
             match_levels=self.match_levels,
         )
-        console.print(f"written: {', '.join(map(str, save_frame(frame, self.out, bits=self.bits)))}")
+        view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
+        written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
+        console.print(f"written: {', '.join(map(str, written))}")
 
 
 @dataclass

@@ -17,6 +17,8 @@ from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
 from arraygeom import (
+    Camera,
+    Curved,
     Epipolar,
     HomographyDisplacement,
     Pair,
@@ -25,9 +27,13 @@ from arraygeom import (
     Rectified,
     Rig,
     Segments,
+    View,
+    Widened,
     apply_homography,
     depth_from_track,
+    pinhole_view,
     pixel_grid,
+    retaken,
 )
 from arraygeom.fields import pinhole_track
 from arraygeom.pixels import HW
@@ -82,6 +88,11 @@ def fuse(
 ) -> FusedFrame:
     """Fuse one frame at the view of camera `alpha`.
 
+    Lenses: unless `field` is `Curved`, pictures that a lens bends are taken across to pinhole views first (up to 62
+    degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha is bent back,
+    alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta turned by about
+    a quarter or half a turn against alpha is turned upright.
+
     Args:
         network: `load_weights("mono-colour")`, say.
         rig: the cameras. Those without a picture in `images` are left out.
@@ -100,6 +111,19 @@ def fuse(
     """
     rig = rig if depth is None else rig.replace(depth=depth)
     _check(rig, images, alpha)
+    if any(_has_lens(rig[name]) for name in images) and not _follows_lenses(field):
+        straight_rig, straight = without_lenses(rig, images)
+        seen = fuse(
+            network,
+            straight_rig,
+            straight,
+            alpha=alpha,
+            field=field,
+            max_memory=max_memory,
+            match_levels=match_levels,
+            progress=progress,
+        )
+        return _bent(seen, straight[alpha], images[alpha], straight_rig[alpha], rig[alpha])
     own = _grey(images[alpha])[None]
     betas = [
         _prepare(network, rig.pair(alpha, name), images[name][None], field, own if match_levels else None, name)
@@ -116,6 +140,36 @@ def fuse(
         for whole, part in zip(frame, parts):
             whole[..., top:bottom, left:right] = part
     return FusedFrame(*frame)
+
+
+def without_lenses(rig: Rig, images: Mapping[str, Tensor]) -> tuple[Rig, dict[str, Tensor]]:
+    """The rig and its pictures with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
+    straight = dict(images)
+    for name, image in images.items():
+        camera = rig[name]
+        if isinstance(camera, Camera) and camera.distortion is not None:
+            rig = rig.with_camera(name, pinhole_view(camera))
+            straight[name] = retaken(image, camera, rig[name]).values[0].clamp(min=0)  # type: ignore[arg-type]
+    return rig, straight
+
+
+def _has_lens(view: View) -> bool:
+    return isinstance(view, Camera) and view.distortion is not None
+
+
+def _follows_lenses(field: ReceptiveField | None) -> bool:
+    return isinstance(field.field if isinstance(field, Widened) else field, Curved)
+
+
+def _bent(frame: FusedFrame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> FusedFrame:
+    """The frame at the pixels of alpha's own picture."""
+    if not (isinstance(pinhole, Camera) and isinstance(lens, Camera) and lens.distortion is not None):
+        return frame
+    added = frame.image - _grey(straight)
+    inverse = (1 / frame.depth).nan_to_num(0.0)
+    back = retaken(torch.cat([added, frame.confidence[None]]), pinhole, lens, interpolation="bilinear").values[0]
+    depth = 1 / retaken(inverse[None], pinhole, lens, interpolation="nearest").values[0, 0]
+    return FusedFrame(_grey(own) + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
 
 
 def levelled(picture: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
@@ -197,7 +251,10 @@ def _grey(picture: Tensor) -> Tensor:
 def _prepare(
     network: FusionNetwork, pair: Pair, picture: Tensor, field: ReceptiveField | None, levels: Tensor | None, name: str
 ) -> Beta:
-    """A beta at the pitch that the network wants, its field checked to reach it somewhere."""
+    """A beta upright and at the pitch that the network wants, its field checked to reach it somewhere."""
+    turns = quarter_turns(pair)
+    if turns:
+        pair, picture = pair.turn_beta(turns), picture.rot90(turns, (-2, -1))
     if network.equal_pitch:
         pair, picture = _at_equal_pitch(pair, picture)
     if levels is not None:
@@ -221,12 +278,27 @@ def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
 
 def pitch_ratio(pair: Pair) -> float:
     """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if undefined."""
+    steps = _steps_in_beta(pair)
+    area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
+    return math.sqrt(area) if area > 0 else 1.0
+
+
+def quarter_turns(pair: Pair) -> int:
+    """How often beta's picture must be turned (see `Camera.turn`) to be upright as alpha's is, 0 to 3."""
+    steps = _steps_in_beta(pair)
+    if steps is None:
+        return 0
+    (a, c), (b, d) = steps.tolist()
+    return round(math.atan2(c - b, a + d) / (math.pi / 2)) % 4
+
+
+def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
+    """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
     x, valid = apply_homography(pair.homography.double(), steps)
-    area = abs(float(torch.linalg.det(x[1:] - x[:1])))
-    return math.sqrt(area) if bool(valid.all()) and area > 0 else 1.0
+    return x[1:] - x[:1] if bool(valid.all()) else None
 
 
 def _reaches(look: Look, pair: Pair) -> bool:

@@ -6,10 +6,15 @@ import pytest
 import torch
 
 import pat.fuse
-from arraygeom import Camera, Epipolar, Link, Pose, Rig, View, intrinsics, rotation_from_vector
-from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, tiles_of
+from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
+from pat.demo import load_sample
+from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, quarter_turns, tiles_of, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
+from pat.images import luminance, read_image
+from pat.matches import match_points, seen_depths
+from pat.metrics import score
 from pat.model import PAT, PATConfig
+from pat.weights import load_weights
 
 
 def rig_of(hw, beta_hw, focal=300.0, beta_focal=200.0) -> Rig:
@@ -144,3 +149,73 @@ def test_views_must_overlap():
         fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))
     with pytest.raises(ValueError, match="at least one beta"):
         fuse(network_of("PAT"), rig, {"mono": images["mono"]}, alpha="mono")
+
+
+def bent(lens_of, rig, images):
+    """The rig with lenses, and the pictures those would have taken."""
+    for name, coefficients in lens_of.items():
+        lens = Distortion("brown-conrady", torch.tensor(coefficients, dtype=torch.float64))
+        camera = rig[name].replace(distortion=lens)
+        images = images | {name: retaken(images[name], rig[name], camera).values[0]}
+        rig = rig.with_camera(name, camera)
+    return rig, images
+
+
+LENSES = {"mono": [0.9, 0.0, 0.0, 0.0], "colour": [-0.6, 0.2, 0.005, 0.0]}
+
+
+@pytest.mark.parametrize("with_lens", [("colour",), ("mono", "colour")])
+def test_lenses_are_seen_through(with_lens):
+    """The sample array behind lenses: the same colours at alpha's own, bent pixels, and alpha's detail untouched."""
+    sample = load_sample()
+    rig, images, network = (
+        sample.rig.crop("mono", 80, 160, (240, 320)),
+        dict(sample.images),
+        load_weights("mono-colour"),
+    )
+    images["mono"], truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.truth))
+    lensed, taken = bent({name: LENSES[name] for name in with_lens}, rig, images)
+    clean = (fuse(network, rig, images, alpha="mono").image - truth).square().mean()
+    frame = fuse(network, lensed, taken, alpha="mono")
+    if "mono" in with_lens:
+        truth = retaken(truth, rig["mono"], lensed["mono"]).values[0]
+    seen = truth.sum(0) > 0
+    error = (frame.image - truth)[:, seen].square().mean()
+    assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
+    blind = fuse(network, rig, taken, alpha="mono")
+    assert error < 1.1 * clean
+    assert error < 0.85 * (blind.image - truth)[:, seen].square().mean()
+    assert torch.isfinite(frame.image).all()
+    assert 0.7 < float((frame.depth.isfinite() & seen).float().sum() / seen.float().sum()) <= 1
+
+
+def test_a_turned_beta_is_turned_upright():
+    rig = rig_of((60, 80), (60, 80))
+    for turns in range(4):
+        assert quarter_turns(rig.turn("colour", turns).pair("mono", "colour")) == -turns % 4
+    images = {"mono": texture(1, (60, 80)), "colour": texture(3, (60, 80))}
+    network = network_of("GuidedPAT")
+    upright = fuse(network, rig, images, alpha="mono")
+    turned = fuse(network, rig.turn("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono")
+    assert (upright.image - turned.image).abs().max() < 1e-4
+
+
+@pytest.mark.slow
+def test_real_lenses(shared_data):
+    """A real pair with barrel distortion of some 30 pixels: colour lands at alpha's own pixels."""
+    folder, network = shared_data / "bumblebee2_scenes", load_weights("mono-colour")
+    rig = Rig.load(folder / "stereo.yaml")
+    left, right = (read_image(folder / f"chair01_{side}.jpg") for side in ("left", "right"))
+    straight_rig, straight = without_lenses(rig, {"left": left, "right": right})
+    depth = seen_depths(straight_rig.pair("left", "right"), match_points(*straight.values()))
+    images = {"left": luminance(left), "right": right}
+    frame = fuse(network, rig, images, alpha="left", depth=depth)
+    no_lens = rig
+    for name in rig.names:
+        no_lens = no_lens.with_camera(name, rig[name].replace(distortion=None))
+    ignored = fuse(network, no_lens, images, alpha="left", depth=depth)
+    grey, seen, blind = (
+        score(p.clamp(0, 1), left).psnr for p in (luminance(left).expand(3, -1, -1), frame.image, ignored.image)
+    )
+    assert seen > grey + 4
+    assert seen > blind + 1
