@@ -80,8 +80,9 @@ def consensus(
 ) -> Consensus:
     """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
 
-    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres of
-    its 2x2 pixels, in beta's pixels. All sides are even. On the CPU, with as many threads as torch may use; the same whatever their number.
+    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
+    of its 2x2 pixels, in beta's pixels. All sides are even. On the CPU, with as many threads as torch may use; the
+    same whatever their number.
     """
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     other = levelled(other, own)
@@ -136,7 +137,10 @@ def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, sli
     for top in range(0, hw[0], BLOCK):
         for left in range(0, hw[1], BLOCK):
             inner = slice(top, min(top + BLOCK, hw[0])), slice(left, min(left + BLOCK, hw[1]))
-            outer = slice(max(top - margin, 0), top + BLOCK + margin), slice(max(left - margin, 0), left + BLOCK + margin)
+            outer = (
+                slice(max(top - margin, 0), top + BLOCK + margin),
+                slice(max(left - margin, 0), left + BLOCK + margin),
+            )
             yield inner, outer
 
 

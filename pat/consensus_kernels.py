@@ -16,6 +16,8 @@ SMALL, LARGE = np.float32(12.0), np.float32(100.0)
 """Penalties of neighbours whose labels differ by one, and by more (the latter where alpha shows no edge)."""
 EDGE = np.float32(8 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
+FARTHEST = np.float32(8)
+"""A look back that lands farther off than this, in labels, counts as this far."""
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 
@@ -45,6 +47,13 @@ def _count(bits):
     return (bits * np.uint64(0x0101010101010101)) >> np.uint64(56)
 
 
+@compiled(inline="always")
+def _pixel(end, along, label):
+    """Column and row of beta's pixel at a label: so many pixels from `end`."""
+    reach = np.float32(label)
+    return int(np.floor(end[0] + reach * along[0] + HALF)), int(np.floor(end[1] + reach * along[1] + HALF))
+
+
 @compiled(nogil=True, cache=True)
 def costs(own, own_bits, other, other_bits, end, along, length, out):
     """How unlike alpha's pixel (own) and beta's (other) at each label are: out (h, w, labels).
@@ -56,28 +65,27 @@ def costs(own, own_bits, other, other_bits, end, along, length, out):
     for y in range(height):
         for x in range(width):
             reach = length[y, x] + HALF
-            for l in range(labels):
-                column = int(np.floor(end[y, x, 0] + np.float32(l) * along[y, x, 0] + HALF))
-                row = int(np.floor(end[y, x, 1] + np.float32(l) * along[y, x, 1] + HALF))
-                if l > reach or column < 0 or row < 0 or column >= columns or row >= rows:
-                    out[y, x, l] = NOWHERE
+            for label in range(labels):
+                column, row = _pixel(end[y, x], along[y, x], label)
+                if label > reach or column < 0 or row < 0 or column >= columns or row >= rows:
+                    out[y, x, label] = NOWHERE
                 else:
                     unlike = min(abs(own[y, x] - other[row, column]) * LEVELS, TRUNCATED)
-                    out[y, x, l] = np.uint8(_count(own_bits[y, x] ^ other_bits[row, column])) + np.uint8(unlike)
+                    different = _count(own_bits[y, x] ^ other_bits[row, column])
+                    out[y, x, label] = np.uint8(different) + np.uint8(unlike)
 
 
 @compiled(inline="always")
 def _advance(before, least, cost, total, now, jump):
     """One step of a path: its costs `now` (from index 1; a wall at both ends), added to `total`; the least."""
-    labels = len(cost)
-    for l in range(labels):
-        step = min(before[l], before[l + 2]) + SMALL
-        stay = min(before[l + 1], least + jump)
-        now[l + 1] = np.float32(cost[l]) + min(step, stay) - least
+    for i in range(len(cost)):
+        step = min(before[i], before[i + 2]) + SMALL
+        stay = min(before[i + 1], least + jump)
+        now[i + 1] = np.float32(cost[i]) + min(step, stay) - least
     fewest = MOST
-    for l in range(labels):
-        total[l] += now[l + 1]
-        fewest = min(fewest, now[l + 1])
+    for i in range(len(cost)):
+        total[i] += now[i + 1]
+        fewest = min(fewest, now[i + 1])
     return fewest
 
 
@@ -89,76 +97,105 @@ def _jump(a, b):
 @compiled(nogil=True, cache=True, fastmath=True)
 def aggregate(cost, guide, total):
     """The sum over eight paths of semi-global matching (Hirschmüller 2008), added to total (h, w, labels)."""
+    for dx in range(-1, 2):
+        for way in range(2):
+            _sweep(cost, guide, total, dx, way)
+    for way in range(2):
+        _sweep_rows(cost, guide, total, way)
+
+
+@compiled(inline="always")
+def _sweep_rows(cost, guide, total, way):
+    """Paths along rows."""
+    height, width, labels = cost.shape
+    before, now = np.full((2, labels + 2), MOST, np.float32)
+    first, step = (0, 1) if way == 0 else (width - 1, -1)
+    for y in range(height):
+        before[1:-1] = 0
+        least = np.float32(0)
+        for i in range(width):
+            x = first + i * step
+            jump = _jump(guide[y, x], guide[y, x - step]) if i > 0 else LARGE
+            least = _advance(before, least, cost[y, x], total[y, x], now, jump)
+            before, now = now, before
+
+
+@compiled(inline="always")
+def _sweep(cost, guide, total, dx, way):
+    """Paths from row to row, that move by `dx` columns on the way."""
     height, width, labels = cost.shape
     before, now = np.full((2, width, labels + 2), MOST, np.float32)
     fewest, fewer = np.zeros((2, width), np.float32)
-    for y in range(height):
-        for way in range(2):
-            first, step = (0, 1) if way == 0 else (width - 1, -1)
-            before[0, 1:-1] = 0
-            least = np.float32(0)
-            for i in range(width):
-                x = first + i * step
-                jump = _jump(guide[y, x], guide[y, x - step]) if i > 0 else LARGE
-                least = _advance(before[0], least, cost[y, x], total[y, x], now[0], jump)
-                before[0], now[0] = now[0], before[0].copy()
-    for dx in range(-1, 2):
-        for way in range(2):
-            first, step = (0, 1) if way == 0 else (height - 1, -1)
-            before[:, 1:-1] = 0
-            fewest[:] = 0
-            for i in range(height):
-                y = first + i * step
-                for x in range(width):
-                    origin = x - dx
-                    if i == 0 or origin < 0 or origin >= width:
-                        now[x, 1:-1] = cost[y, x]
-                        total[y, x] += cost[y, x]
-                        fewer[x] = cost[y, x].min()
-                    else:
-                        jump = _jump(guide[y, x], guide[y - step, origin])
-                        fewer[x] = _advance(before[origin], fewest[origin], cost[y, x], total[y, x], now[x], jump)
-                before, now = now, before
-                fewest, fewer = fewer, fewest
+    first, step = (0, 1) if way == 0 else (height - 1, -1)
+    for i in range(height):
+        y = first + i * step
+        for x in range(width):
+            origin = x - dx
+            if i == 0 or origin < 0 or origin >= width:
+                now[x, 1:-1] = cost[y, x]
+                total[y, x] += cost[y, x]
+                fewer[x] = cost[y, x].min()
+            else:
+                jump = _jump(guide[y, x], guide[y - step, origin])
+                fewer[x] = _advance(before[origin], fewest[origin], cost[y, x], total[y, x], now[x], jump)
+        before, now = now, before
+        fewest, fewer = fewer, fewest
 
 
 @compiled(nogil=True, cache=True)
 def winners(total, end, along, length, rows, columns, reach, facts):
     """Each pixel's best label, to a fraction (reach); and facts (h, w, 3): how far the best label of those that
     look at the same pixel of beta is from it, by how much it is better than the second, and how good it is."""
+    claims = _claims(total, end, along, length, rows, columns)
     height, width, labels = total.shape
-    lowest = np.full((rows, columns), MOST, np.float32)
-    label = np.full((rows, columns), -labels, np.int32)
-    for y in range(height):
-        for x in range(width):
-            for l in range(min(labels - 1, int(length[y, x] + HALF)) + 1):
-                column = int(np.floor(end[y, x, 0] + np.float32(l) * along[y, x, 0] + HALF))
-                row = int(np.floor(end[y, x, 1] + np.float32(l) * along[y, x, 1] + HALF))
-                if 0 <= row < rows and 0 <= column < columns and total[y, x, l] < lowest[row, column]:
-                    lowest[row, column], label[row, column] = total[y, x, l], l
     for y in range(height):
         for x in range(width):
             last = min(labels - 1, int(length[y, x] + HALF))
-            best = 0
-            for l in range(1, last + 1):
-                if total[y, x, l] < total[y, x, best]:
-                    best = l
-            second = MOST
-            for l in range(last + 1):
-                if abs(l - best) > 1:
-                    second = min(second, total[y, x, l])
-            offset = np.float32(0)
-            if 0 < best < last:
-                a, b, c = total[y, x, best - 1], total[y, x, best], total[y, x, best + 1]
-                deepest = max(a, c) - b
-                if deepest > 0:
-                    offset = HALF * (a - c) / deepest
-            reach[y, x] = np.float32(best) + offset
-            column = int(np.floor(end[y, x, 0] + np.float32(best) * along[y, x, 0] + HALF))
-            row = int(np.floor(end[y, x, 1] + np.float32(best) * along[y, x, 1] + HALF))
+            best, second = _two_best(total[y, x], last)
+            lowest = total[y, x, best]
+            reach[y, x] = np.float32(best) + _between(total[y, x], best, last)
+            column, row = _pixel(end[y, x], along[y, x], best)
+            facts[y, x, 0] = ONE
             if 0 <= row < rows and 0 <= column < columns:
-                facts[y, x, 0] = min(np.float32(abs(label[row, column] - best)), np.float32(8)) / np.float32(8)
-            else:
-                facts[y, x, 0] = ONE
-            facts[y, x, 1] = min((second - total[y, x, best]) / (8 * LARGE), ONE)
-            facts[y, x, 2] = total[y, x, best] / (8 * LARGE)
+                facts[y, x, 0] = min(np.float32(abs(claims[row, column] - best)) / FARTHEST, ONE)
+            facts[y, x, 1] = min((second - lowest) / (8 * LARGE), ONE)
+            facts[y, x, 2] = lowest / (8 * LARGE)
+
+
+@compiled(inline="always")
+def _claims(total, end, along, length, rows, columns):
+    """For each pixel of beta the label of whichever of alpha's pixels has the best claim to it."""
+    height, width, labels = total.shape
+    lowest = np.full((rows, columns), MOST, np.float32)
+    claims = np.full((rows, columns), -labels, np.int32)
+    for y in range(height):
+        for x in range(width):
+            for label in range(min(labels - 1, int(length[y, x] + HALF)) + 1):
+                column, row = _pixel(end[y, x], along[y, x], label)
+                if 0 <= row < rows and 0 <= column < columns and total[y, x, label] < lowest[row, column]:
+                    lowest[row, column], claims[row, column] = total[y, x, label], label
+    return claims
+
+
+@compiled(inline="always")
+def _two_best(total, last):
+    """The best of the labels to `last`, and what the best does that is not beside it."""
+    best = 0
+    for label in range(1, last + 1):
+        if total[label] < total[best]:
+            best = label
+    second = MOST
+    for label in range(last + 1):
+        if abs(label - best) > 1:
+            second = min(second, total[label])
+    return best, second
+
+
+@compiled(inline="always")
+def _between(total, best, last):
+    """How far the best is from the label, by the two lines of equal slope through it and its neighbours."""
+    if not 0 < best < last:
+        return np.float32(0)
+    before, after = total[best - 1], total[best + 1]
+    deepest = max(before, after) - total[best]
+    return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -126,7 +126,11 @@ def fuse(
         return _bent(seen, straight[alpha], images[alpha], straight_rig[alpha], rig[alpha])
     own = _grey(images[alpha])[None]
     betas = [
-        _prepare(network, rig.pair(alpha, name), images[name][None], field, own if match_levels else None, name)
+        _surveyed(
+            network,
+            own,
+            _prepare(network, rig.pair(alpha, name), images[name][None], field, own if match_levels else None, name),
+        )
         for name in rig.betas(alpha)
         if name in images
     ]
@@ -266,6 +270,13 @@ def _prepare(
     return Beta(picture, pair, look)
 
 
+def _surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta) -> Beta:
+    """The beta with what the network wants to know of whole pictures."""
+    with torch.no_grad():
+        known = network.survey(_padded(alpha, network.multiple), _padded(beta.picture, network.multiple), beta.look)
+    return replace(beta, look=replace(beta.look, known=known))
+
+
 def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
     """Beta resized so that where the views meet its pixels are about the size of alpha's."""
     scale = pitch_ratio(pair)
@@ -345,7 +356,11 @@ def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork)
             return Positions(found.xy - shift.to(x), found.mask)
         return Segments(found.start - shift.to(x), found.end - shift.to(x), found.valid)
 
-    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples), beta.pair, (x0, y0))
+    m = network.multiple
+    known = beta.look.known
+    if known is not None:
+        known = known.cut((top, top - (top - bottom) // m * m, left, left - (left - right) // m * m))
+    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples, known), beta.pair, (x0, y0))
 
 
 def _touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:

@@ -104,9 +104,7 @@ class GuidedPAT(nn.Module):
         self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
         self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
-    def survey(
-        self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look
-    ) -> Consensus:
+    def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
         """What can be known before attention looks, of whole pictures; for pieces of them it is cut, not redone."""
         return self._agreed(alpha, beta, look, _segments(look, hw_of(alpha), 1, alpha.double()))
 
@@ -303,7 +301,6 @@ class Head(nn.Module):
         self.start = nn.Sequential(conv(inputs, width), *(ResidualBlock(width) for _ in range(3)))
         self.last = nn.Conv2d(width, 4 * bands, 3, padding=1)
         nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
 
     def forward(self, fine: Tensor, half: Tensor, context: Tensor) -> Tensor:
         """(B, bands, H, W), from pictures at full size, features at 1/2 and the context at 1/4."""

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_grid
 
 from .attention import Attended, attend_with_statistics
-from .consensus import Consensus
 from .blocks import ResidualASPP, ResidualBlock
+from .consensus import Consensus
 
 
 @dataclass(frozen=True)
@@ -78,6 +78,10 @@ class FusionNetwork(Protocol):
     """Pictures are padded to multiples of this, and cut at them."""
     equal_pitch: bool
     """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
+
+    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> Consensus | None:
+        """What is to be known of whole pictures (of whole multiples) before pieces of them are fused, if anything."""
+        ...
 
     def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> Fused:
         """Fuse alpha (B, C, H, W) with betas of any sizes."""
@@ -140,6 +144,9 @@ class PAT(nn.Module):
         if self.config.residual:
             image = image + self._enlarged(alpha)
         return Fused(image, *(list(part) for part in list(zip(*attended))[1:]))
+
+    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
+        """Nothing: each piece of a frame is fused by itself."""
 
     def _channels(self, picture: Tensor) -> Tensor:
         wanted = self.config.in_channels

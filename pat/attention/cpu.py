@@ -207,7 +207,7 @@ def _pieces(first: int, last: int, look: Look) -> list[tuple[int, int]]:
     return [(p, min(p + step, last)) for p in range(first, last, step)]
 
 
-def share(tasks: list[Callable[[], None]]) -> None:
+def share(tasks: Sequence[Callable[[], None]]) -> None:
     """Runs tasks on the threads that torch may use, this one included; raises what any of them raises."""
     left = iter(tasks)
 

@@ -33,7 +33,7 @@ def network_of(kind: str):
     torch.manual_seed(1)
     if kind == "PAT":
         return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4)).eval()
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
     torch.nn.init.normal_(network.head.last.weight, std=0.2)
     return network
 
