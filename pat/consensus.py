@@ -37,8 +37,13 @@ LIKENESS = 0.08
 """Difference of brightness at which the trust in a match falls to 1 / e."""
 DOUBT = 0.25
 """Trust in a match on which the two views do not agree, before the likeness."""
-REACH_FILL, COLOUR_FILL = (50.0, 4.0), (300.0, 3.0)
+REACH_FILL = (50.0, 4.0)
 """Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
+COLOUR_FILLS = ((300.0, 3.0), (1000.0, 20.0))
+"""The same of colour: over what is smoothly connected, and over texture."""
+FLOOR = 1e-3
+"""Regulariser (variance of brightness) of the regression of colour on brightness."""
+FILLS = len(COLOUR_FILLS)
 
 
 class Consensus(NamedTuple):
@@ -48,7 +53,8 @@ class Consensus(NamedTuple):
         not trusted, spread from where it is.
     facts: (B, 3, H / 2, W / 2), how far a look back from beta disagrees, by how much the match is better than
         others, and its cost; each 0 to 1.
-    colour: (B, C, H, W), beta's bands minus alpha, from pixels with trust spread to those without.
+    colour: (B, fills, C, H, W), beta's bands minus alpha, from pixels with trust spread to those without, once for
+        each of `COLOUR_FILLS`.
     """
 
     reach: Tensor
@@ -166,8 +172,28 @@ def _spread_colour(alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segment
     unlike = avg_pool2d((brightness - alpha).abs(), 3, 1, 1, count_include_pad=False)
     agreed = _enlarged(torch.where(found.facts[:, :1] < CONSISTENT, 1.0, DOUBT))
     trust = agreed * seen.valid.reshape(unlike.shape) * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
-    planes = zip(_numpy(bands - alpha), _numpy(trust[:, 0]), _bytes(alpha))
-    return torch.from_numpy(np.stack([_filled(p, t, g, COLOUR_FILL) for p, t, g in planes])).to(alpha)
+    planes = list(zip(_numpy(bands - alpha), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
+    filled = np.zeros((len(planes), FILLS, *bands.shape[1:]), np.float32)
+
+    def fill(picture: int, how: int) -> None:
+        filled[picture, how] = _regressed(*planes[picture], COLOUR_FILLS[how])
+
+    share([partial(fill, i, j) for i in range(len(planes)) for j in range(FILLS)])
+    return torch.from_numpy(filled).to(alpha)
+
+
+def _regressed(
+    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]
+) -> NDArray[np.float32]:
+    """Colour (c, h, w) as its weighted regression on brightness (h, w) says, over what is connected in the guide.
+
+    The moments of the guided filter (He et al. 2013), spread instead of averaged over a window: what no beta sees
+    has colour that varies with brightness as it does nearby.
+    """
+    moments = _filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
+    mean, square, (middle, product) = moments[0], moments[1], np.split(moments[2:], 2)
+    slope = (product - middle * mean) / (np.maximum(square - mean**2, 0) + FLOOR)
+    return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
 
 
 def _position(segments: Segments, reach: Tensor) -> Tensor:

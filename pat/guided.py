@@ -21,7 +21,7 @@ from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 
 from .attention import Attended, attend, attend_with_statistics
 from .blocks import ResidualBlock, conv, enlarge
-from .consensus import FINE, Consensus, consensus
+from .consensus import FILLS, FINE, Consensus, consensus
 from .images import luminance
 from .model import Fused, Look, Looks
 
@@ -59,9 +59,9 @@ class Seen(NamedTuple):
     """What one beta tells of alpha's view.
 
     colour: (B, C, H, W), its bands minus alpha, where attention found them.
-    spread: (B, C, H, W), the same spread by the consensus from pixels with trust.
+    spread: (B, fills, C, H, W), the same spread by the consensus from pixels with trust.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
-    choice: (B, 1, H, W), logit of taking `spread` where it is not, rather than what is carried within alpha.
+    choice: (B, 1 + fills, H, W), logits of taking, where it is not, what is carried within alpha or each `spread`.
     """
 
     attended: Attended
@@ -151,7 +151,8 @@ class GuidedPAT(nn.Module):
         colour = avg_pool2d(seen.colour * certain, COARSE) / (known + UNSURE)
         for carry in self.carry:
             colour, known = carry(own.quarter, colour, known)
-        return torch.lerp(enlarge(colour, COARSE), seen.spread, seen.choice.sigmoid())
+        choices = torch.cat([enlarge(colour, COARSE)[:, None], seen.spread], 1)
+        return (seen.choice.softmax(1)[:, :, None] * choices).sum(1)
 
     def _see(self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look) -> Seen:
         other = self.encoder(_guide(beta))
@@ -162,12 +163,12 @@ class GuidedPAT(nn.Module):
         found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
         value = found.value.to(alpha)
         facts = torch.cat([_guide(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
-        logit, choice = self._judged(own, known, facts, segments.valid[:, None]).chunk(2, 1)
+        logit, choice = self._judged(own, known, facts, segments.valid[:, None]).split([1, 1 + FILLS], 1)
         logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
         return Seen(found, value - alpha, known.colour, logit, choice)
 
     def _judged(self, own: Encoded, known: Consensus, facts: Tensor, valid: Tensor) -> Tensor:
-        """Logits (B, 2, H, W) of the confidence and of the choice."""
+        """Logits (B, 2 + fills, H, W) of the confidence and of the choices."""
         agreed = torch.cat([known.reach / 64, known.facts], 1)
         told = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(agreed, 2), avg_pool2d(told, COARSE)], 1)
@@ -194,11 +195,14 @@ def hw_of(picture: Tensor) -> tuple[int, int]:
 
 
 class Trust(nn.Sequential):
-    """Two logits at full size, worked out at half of it."""
+    """The logits of confidence and choices at full size, worked out at half of it."""
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__(
-            conv(inputs, width), ResidualBlock(width), nn.Conv2d(width, 8, 3, padding=1), nn.PixelShuffle(2)
+            conv(inputs, width),
+            ResidualBlock(width),
+            nn.Conv2d(width, 4 * (2 + FILLS), 3, padding=1),
+            nn.PixelShuffle(2),
         )
 
 
