@@ -26,7 +26,7 @@ from arraygeom import (
     Rig,
 )
 
-from .train import TrainConfig, train
+from .train import TrainConfig
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -157,6 +157,10 @@ class Evaluate:
     """Folder of other pairs, with any of these ways of naming."""
     rates: tuple[int, ...] = (2, 4)
     """How many times beta is reduced."""
+    protocol: Literal["table1", "table2"] = "table1"
+    """The paper's: mono + colour (table1), or mono + three bands (table2)."""
+    controls: bool = False
+    """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must fall."""
     out: Path = Path("out/evaluate")
     """Folder for scores.md, scores.csv and, for each data set, a strip of pictures a pair."""
     weights: str = "mono-colour"
@@ -164,7 +168,17 @@ class Evaluate:
 
     def run(self) -> None:
         """Do it."""
-        from .evaluate import DATA_SETS, METHODS, evaluate_sets, rectified_fusion, sets_markdown, write_csv
+        from .evaluate import (
+            BASELINES,
+            DATA_SETS,
+            PROTOCOLS,
+            controls,
+            evaluate_sets,
+            falls,
+            rectified_fusion,
+            sets_markdown,
+            write_csv,
+        )
         from .images import write_text
         from .weights import load_weights
 
@@ -173,11 +187,15 @@ class Evaluate:
             raise ValueError(f"no pictures: give at least one of --{', --'.join(DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
-        methods = {**METHODS, "fusion": rectified_fusion(load_weights(self.weights))}
+        network, bands = load_weights(self.weights), PROTOCOLS[self.protocol]
+        wrong = controls(network, bands=bands) if self.controls else {}
+        methods = {**BASELINES, "fusion": rectified_fusion(network, bands=bands), **wrong}
         rows = evaluate_sets(folders, methods, self.rates, out=self.out)
-        write_text(self.out / "scores.md", sets_markdown(rows))
-        write_csv(self.out / "scores.csv", [row for found in rows.values() for row in found])
-        print(sets_markdown(rows), end="")
+        every = [row for found in rows.values() for row in found]
+        text = sets_markdown(rows, protocol=self.protocol) + ("\n" + falls(every, names=wrong) if wrong else "")
+        write_text(self.out / "scores.md", text)
+        write_csv(self.out / "scores.csv", every)
+        print(text, end="")
         console.print(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, pictures in {self.out}")
 
 
@@ -234,16 +252,20 @@ class Show:
         console.print(f"written: {', '.join(map(str, written))}")
 
 
-@dataclass(frozen=True)
-class Train(TrainConfig):
-    """Train weights on scenes made from photographs while training.
+@dataclass
+class Train:
+    """Train weights by a recipe, on scenes made from photographs while training; see `pat train --help`.
 
-    Example: pat train --photos ~/pictures --out runs/mine --minutes 60
+    Example: pat train mono-colour-small --photos ~/pictures --out runs/mine --minutes 60
     """
+
+    config: TrainConfig
 
     def run(self) -> None:
         """Do it."""
-        console.print(f"written: {train(self)}")
+        from .train import train
+
+        console.print(f"written: {train(self.config)}")
 
 
 @dataclass
@@ -359,19 +381,26 @@ def _name_and_file(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
+def _command(arguments: list[str]) -> Any:
+    if arguments[:1] == ["train"]:
+        from .training.config import command_line
+
+        return Train(command_line(arguments[1:]))
+    return tyro.cli(
+        Command,  # type: ignore[arg-type]
+        prog="pat",
+        description="Fuse the pictures of an array of unlike cameras into one. --debug shows an error's traceback.",
+        args=arguments,
+    )
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run `pat`. Errors in what was given are one line on standard error, and exit status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
-    command = tyro.cli(
-        Command,  # type: ignore[arg-type]
-        prog="pat",
-        description="Fuse the pictures of an array of unlike cameras into one. --debug shows an error's traceback.",
-        args=[a for a in arguments if a != "--debug"],
-    )
     try:
-        command.run()
-    except (ValueError, OSError) as error:
+        _command([a for a in arguments if a != "--debug"]).run()
+    except (ValueError, OSError, FloatingPointError) as error:
         if debug:
             raise
         console.print(f"pat: {error}", style="red", markup=False, soft_wrap=True)

@@ -37,7 +37,8 @@ class Look:
     @classmethod
     def along(cls, field: ReceptiveField, pair: Pair) -> Look:
         """The field of a pair, with about one sample for each pixel of beta on the longest segment."""
-        sparse = pixel_grid(pair.alpha.hw)[::4, ::4].reshape(-1, 2)
+        device = pair.cameras[0].K.device if pair.calibrated else None
+        sparse = pixel_grid(pair.alpha.hw, device=device)[::4, ::4].reshape(-1, 2)
         at = lazily(field, pair)
         found = at(sparse)
         if isinstance(found, Positions):

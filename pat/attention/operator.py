@@ -58,9 +58,9 @@ def attend(
         key: features of beta that the query is compared with.
         value: features of beta that are returned.
         look: where to look in beta, for each alpha pixel: Segments or Positions with the leading axes (Ha,
-            Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to either, which is called on
-            one piece of alpha at a time and again in backward, so that not all explicit positions exist at
-            once.
+            Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to either, with the leading axes
+            (n) or (B, n), which is called on one piece of alpha at a time and again in backward, so that not
+            all explicit positions exist at once.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
@@ -220,10 +220,10 @@ def _attend_chunks(
         where = look(_pixel_rows(top, top + q.shape[2], wa, q))
         if not isinstance(where, Positions):
             raise TypeError(f"look returned Positions for some pixels and {type(where)} for others")
-        where = Positions(where.xy.unflatten(0, (-1, wa)), where.mask.unflatten(0, (-1, wa)))
+        where = Positions(where.xy.unflatten(-3, (-1, wa)), where.mask.unflatten(-2, (-1, wa)))
         return run(q, k, v, where, part)
 
-    step = max(1, CHUNK_SAMPLES // (wa * first.xy.shape[-2]))
+    step = max(1, CHUNK_SAMPLES // (first.xy.numel() // 2))
     chunks = [
         checkpoint(
             chunk,
@@ -255,8 +255,9 @@ def _all_segments(look: Callable[[Tensor], Where], query: Tensor) -> Segments:
     ha, wa = query.shape[2:]
     step = max(1, CHUNK_PIXELS // wa)
     parts = [look(_pixel_rows(top, min(top + step, ha), wa, query)) for top in range(0, ha, step)]
-    start, end, valid = (torch.cat([getattr(p, name) for p in parts]) for name in ("start", "end", "valid"))
-    return Segments(start.unflatten(0, (ha, wa)), end.unflatten(0, (ha, wa)), valid.unflatten(0, (ha, wa)))
+    axes = {"start": -2, "end": -2, "valid": -1}
+    whole = {name: torch.cat([getattr(p, name) for p in parts], axis) for name, axis in axes.items()}
+    return Segments(**{name: t.unflatten(axes[name], (ha, wa)) for name, t in whole.items()})
 
 
 def _bias_rows(bias: Tensor | None, top: int, step: int) -> Tensor | None:
