@@ -80,7 +80,7 @@ def backward(
     points_out = query.new_zeros((b, *look.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 0, dtype=counted)
 
-    stride = look.samples * (1 if nearest else 4) + kernels.TAP_BLOCK
+    stride = (look.samples * (1 if nearest else 4) // kernels.LANES + 2) * kernels.LANES
     step = max(64, SCRATCH_TAPS // stride)
     scratch = _scratch(min(step, b * ha * wa), stride, query)
     call = (

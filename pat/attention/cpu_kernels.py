@@ -25,6 +25,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 8
+WIDE = 8 * LANES
+"""Channels that are worked off at once."""
 TAP_BLOCK = 4
 BLOCK = 8
 """Alpha pixels that are worked off together, step by step, as long as what they look up is still at hand."""
@@ -42,7 +44,7 @@ def compiled(function=None, **options):
 
 
 class Vector(types.Type):
-    """`LANES` numbers of the accumulation type in one register (or two)."""
+    """`LANES` numbers of the accumulation type, or of int32, in one register (or two)."""
 
     def __init__(self, scalar):
         self.scalar = scalar
@@ -52,8 +54,7 @@ class Vector(types.Type):
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        lane = ir.DoubleType() if kind.scalar == types.float64 else ir.FloatType()
-        super().__init__(manager, kind, ir.VectorType(lane, LANES))
+        super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), LANES))
 
 
 def _accumulated(dtype):
@@ -188,6 +189,38 @@ def _arithmetic(instruction):
 
 
 add, sub, mul = _arithmetic("fadd"), _arithmetic("fsub"), _arithmetic("fmul")
+add_whole, mul_whole = _arithmetic("add"), _arithmetic("mul")
+
+
+@intrinsic
+def truncated(typing, a):
+    """A vector's numbers towards 0, as int32."""
+    whole = Vector(types.int32)
+
+    def code(context, builder, signature, args):
+        return builder.fptosi(args[0], context.get_value_type(whole))
+
+    return whole(a), code
+
+
+@intrinsic
+def numbers_of(typing, whole, like):
+    """A vector of int32 in the type of another."""
+
+    def code(context, builder, signature, args):
+        return builder.sitofp(args[0], args[1].type)
+
+    return like(whole, like), code
+
+
+@intrinsic
+def lesser_whole(typing, a, b):
+    """The smaller of the numbers of two vectors of int32."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.icmp_signed("<", *args), *args)
+
+    return a(a, b), code
 
 
 @intrinsic
@@ -196,6 +229,16 @@ def larger(typing, a, b):
 
     def code(context, builder, signature, args):
         return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return a(a, b), code
+
+
+@intrinsic
+def lesser(typing, a, b):
+    """The smaller of the numbers of two vectors; that of b if either is NaN."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered("<", *args), *args)
 
     return a(a, b), code
 
@@ -250,8 +293,8 @@ def _reduction(name, start):
 
 
 @intrinsic
-def store_totals(typing, array, index, a, b, c, d):
-    """Puts the sums of four vectors side by side."""
+def add_totals(typing, array, index, a, b, c, d):
+    """Adds the sums of four vectors to four numbers side by side."""
 
     def code(context, builder, signature, args):
         def pairs(p, q):
@@ -263,7 +306,10 @@ def store_totals(typing, array, index, a, b, c, d):
         low, high = (builder.shuffle_vector(v, v, _mask(half)) for half in ([0, 1, 2, 3], [4, 5, 6, 7]))
         lane = ir.VectorType(args[2].type.element, TAP_BLOCK)
         place = _at(builder, args[0], args[1], lane)
-        builder.store(builder.fadd(low, high), place, align=array.dtype.bitwidth // 8)
+        stored = builder.load(place, align=array.dtype.bitwidth // 8)
+        builder.store(
+            builder.fadd(stored, builder.fadd(low, high)), place, align=array.dtype.bitwidth // 8
+        )
         return context.get_dummy_value()
 
     return types.void(array, types.intp, a, b, c, d), code
@@ -271,6 +317,76 @@ def store_totals(typing, array, index, a, b, c, d):
 
 def _mask(lanes):
     return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
+
+
+FOURS = [[0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]]
+PAIRS = [[0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]]
+"""Shuffles that transpose a 4 by 4 block in each half of four vectors."""
+
+
+def _transpose(builder, a, b, c, d):
+    def shuffle(p, q, how):
+        return [builder.shuffle_vector(p, q, _mask(lanes)) for lanes in how]
+
+    (ab_low, ab_high), (cd_low, cd_high) = shuffle(a, b, FOURS), shuffle(c, d, FOURS)
+    return *shuffle(ab_low, cd_low, PAIRS), *shuffle(ab_high, cd_high, PAIRS)
+
+
+@intrinsic
+def load_fours(typing, array, starts, index):
+    """Four vectors, the k-th of array[start + k] for the `LANES` starts at an index."""
+    kind = types.UniTuple(Vector(array.dtype), 4)
+
+    def code(context, builder, signature, args):
+        lane = ir.VectorType(context.get_data_type(array.dtype), 4)
+
+        def four(k):
+            start = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(args[2].type, k))]))
+            return builder.load(_at(builder, args[0], start, lane), align=array.dtype.bitwidth // 8)
+
+        halves = [builder.shuffle_vector(four(k), four(k + 4), _mask([*range(LANES)])) for k in range(4)]
+        return context.make_tuple(builder, kind, _transpose(builder, *halves))
+
+    return kind(array, starts, types.intp), code
+
+
+@intrinsic
+def add_fours(typing, array, starts, index, a, b, c, d):
+    """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
+    in their order. By twos: what the next start touches is the second two of this one."""
+
+    def code(context, builder, signature, args):
+        two = ir.VectorType(context.get_data_type(array.dtype), 2)
+        fours = _transpose(builder, *args[3:])
+        for k in range(LANES):
+            start = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(args[2].type, k))]))
+            for half in range(2):
+                lanes = [2 * half + k // 4 * 4, 2 * half + k // 4 * 4 + 1]
+                number = builder.shuffle_vector(fours[k % 4], fours[k % 4], _mask(lanes))
+                place = _at(builder, args[0], builder.add(start, ir.Constant(start.type, 2 * half)), two)
+                stored = builder.load(place, align=array.dtype.bitwidth // 8)
+                builder.store(builder.fadd(stored, number), place, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, starts, types.intp, a, b, c, d), code
+
+
+@intrinsic
+def store_four(typing, array, index, number, offsets):
+    """array[index + k] = number + offsets[k], k from 0 to 3."""
+
+    def code(context, builder, signature, args):
+        lane = context.get_data_type(array.dtype)
+        numbers = shifts = ir.Constant(ir.VectorType(lane, 4), ir.Undefined)
+        for k in range(4):
+            shift = context.cast(builder, builder.extract_value(args[3], k), offsets.dtype, array.dtype)
+            numbers = builder.insert_element(numbers, args[2], ir.IntType(32)(k))
+            shifts = builder.insert_element(shifts, shift, ir.IntType(32)(k))
+        place = _at(builder, args[0], args[1], numbers.type)
+        builder.store(builder.add(numbers, shifts), place, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, array.dtype, offsets), code
 
 
 @intrinsic
@@ -347,8 +463,48 @@ def _exponentials32(x):
 @compiled
 def inner_products(x, rows, n, picture, channels, out):
     """out[t] = x . picture[rows[t]], for t < n; rows is padded to a multiple of TAP_BLOCK."""
-    whole = channels // LANES * LANES
-    nothing = splat(zero(x))
+    c = 0
+    for t in range(0, n, LANES):
+        store(out, t, splat(zero(x)))
+    while c + WIDE <= channels:
+        _inner_products_64(x, rows, n, picture, channels, c, out)
+        c += WIDE
+    if c < channels:
+        _inner_products_of_rest(x, rows, n, picture, channels, c, out)
+
+
+@compiled
+def _inner_products_64(x, rows, n, picture, channels, c, out):
+    """The 64 channels from c on, with x in registers."""
+    x0, x1, x2, x3 = load(x, c), load(x, c + 8), load(x, c + 16), load(x, c + 24)
+    x4, x5, x6, x7 = load(x, c + 32), load(x, c + 40), load(x, c + 48), load(x, c + 56)
+    for t in range(0, n, TAP_BLOCK):
+        add_totals(
+            out,
+            t,
+            _inner_product_64(picture, rows[t] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(picture, rows[t + 1] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(picture, rows[t + 2] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(picture, rows[t + 3] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+        )
+
+
+@compiled
+def _inner_product_64(picture, at, x0, x1, x2, x3, x4, x5, x6, x7):
+    a = mul(x0, load(picture, at))
+    a = fma(x1, load(picture, at + 8), a)
+    a = fma(x2, load(picture, at + 16), a)
+    a = fma(x3, load(picture, at + 24), a)
+    a = fma(x4, load(picture, at + 32), a)
+    a = fma(x5, load(picture, at + 40), a)
+    a = fma(x6, load(picture, at + 48), a)
+    return fma(x7, load(picture, at + 56), a)
+
+
+@compiled
+def _inner_products_of_rest(x, rows, n, picture, channels, first, out):
+    """The channels from `first` on."""
+    whole = first + (channels - first) // LANES * LANES
     for t in range(0, n, TAP_BLOCK):
         r0, r1, r2, r3 = (
             rows[t] * channels,
@@ -356,14 +512,14 @@ def inner_products(x, rows, n, picture, channels, out):
             rows[t + 2] * channels,
             rows[t + 3] * channels,
         )
-        a0 = a1 = a2 = a3 = nothing
-        for c in range(0, whole, LANES):
+        a0 = a1 = a2 = a3 = splat(zero(x))
+        for c in range(first, whole, LANES):
             q = load(x, c)
             a0 = fma(q, load(picture, r0 + c), a0)
             a1 = fma(q, load(picture, r1 + c), a1)
             a2 = fma(q, load(picture, r2 + c), a2)
             a3 = fma(q, load(picture, r3 + c), a3)
-        store_totals(out, t, a0, a1, a2, a3)
+        add_totals(out, t, a0, a1, a2, a3)
         for c in range(whole, channels):
             out[t] += x[c] * load_one(picture, r0 + c)
             out[t + 1] += x[c] * load_one(picture, r1 + c)
@@ -378,12 +534,12 @@ def weighted_sum(weights, rows, n, picture, channels, width, out):
     Weights and rows are padded to a multiple of TAP_BLOCK.
     """
     c = 0
+    while c + WIDE <= width:
+        _weighted_sum_64(weights, rows, n, picture, channels, c, out)
+        c += WIDE
     while c + 4 * LANES <= width:
         _weighted_sum_32(weights, rows, n, picture, channels, c, out)
         c += 4 * LANES
-    while c + 2 * LANES <= width:
-        _weighted_sum_16(weights, rows, n, picture, channels, c, out)
-        c += 2 * LANES
     while c + LANES <= width:
         _weighted_sum_8(weights, rows, n, picture, channels, c, out)
         c += LANES
@@ -392,6 +548,29 @@ def weighted_sum(weights, rows, n, picture, channels, width, out):
         for t in range(n):
             s += weights[t] * load_one(picture, rows[t] * channels + tail)
         out[tail] = s
+
+
+@compiled
+def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
+    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(zero(weights))
+    for t in range(n):
+        w, r = splat(weights[t]), rows[t] * channels + c
+        a0 = fma(w, load(picture, r), a0)
+        a1 = fma(w, load(picture, r + 8), a1)
+        a2 = fma(w, load(picture, r + 16), a2)
+        a3 = fma(w, load(picture, r + 24), a3)
+        a4 = fma(w, load(picture, r + 32), a4)
+        a5 = fma(w, load(picture, r + 40), a5)
+        a6 = fma(w, load(picture, r + 48), a6)
+        a7 = fma(w, load(picture, r + 56), a7)
+    store(out, c, a0)
+    store(out, c + 8, a1)
+    store(out, c + 16, a2)
+    store(out, c + 24, a3)
+    store(out, c + 32, a4)
+    store(out, c + 40, a5)
+    store(out, c + 48, a6)
+    store(out, c + 56, a7)
 
 
 @compiled
@@ -412,22 +591,6 @@ def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
     store(out, c + 8, add(a1, b1))
     store(out, c + 16, add(a2, b2))
     store(out, c + 24, add(a3, b3))
-
-
-@compiled
-def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
-    for t in range(0, n, TAP_BLOCK):
-        w0, r0 = splat(weights[t]), rows[t] * channels + c
-        w1, r1 = splat(weights[t + 1]), rows[t + 1] * channels + c
-        w2, r2 = splat(weights[t + 2]), rows[t + 2] * channels + c
-        w3, r3 = splat(weights[t + 3]), rows[t + 3] * channels + c
-        a0, b0 = fma(w0, load(picture, r0), a0), fma(w0, load(picture, r0 + 8), b0)
-        a1, b1 = fma(w1, load(picture, r1), a1), fma(w1, load(picture, r1 + 8), b1)
-        a2, b2 = fma(w2, load(picture, r2), a2), fma(w2, load(picture, r2 + 8), b2)
-        a3, b3 = fma(w3, load(picture, r3), a3), fma(w3, load(picture, r3 + 8), b3)
-    store(out, c, add(add(a0, a1), add(a2, a3)))
-    store(out, c + 8, add(add(b0, b1), add(b2, b3)))
 
 
 @compiled
@@ -511,8 +674,8 @@ class Samples(NamedTuple):
     tap: Any
     x: Any
     y: Any
-    right: Any
-    down: Any
+    ahead: Any
+    aside: Any
     score: Any
     weight: Any
     slope: Any
@@ -549,15 +712,15 @@ def _look(look):
 
 def room(samples, channels):
     """How many integers and how many numbers of scratch a task needs."""
-    n, m = samples + LANES, 4 * samples + LANES
-    return 6 * n + BLOCK * (m + 1), 8 * n + (BLOCK + 2) * m + channels
+    n, m = samples + LANES, 4 * samples + 2 * LANES
+    return 3 * n + BLOCK * (m + 1), 8 * n + (BLOCK + 2) * m + channels
 
 
 @compiled
 def _room(n, integers, numbers):
     """Scratch, cut up: for samples, taps, channels. Taps' rows and weights are there for BLOCK pixels, the
     numbers of taps behind those."""
-    n, m = n + LANES, 4 * n + LANES
+    n, m = n + LANES, 4 * n + 2 * LANES
     i, f = pointer(integers), pointer(numbers)
     t = from_index(f, 8 * n)
     samples = Samples(
@@ -573,14 +736,14 @@ def _room(n, integers, numbers):
         from_index(f, 6 * n),
         from_index(f, 7 * n),
     )
-    taps = Taps(from_index(i, 6 * n), t, from_index(t, m), from_index(t, 2 * m))
-    return samples, taps, from_index(t, (BLOCK + 2) * m), from_index(i, 6 * n + BLOCK * m)
+    taps = Taps(from_index(i, 3 * n), t, from_index(t, m), from_index(t, 2 * m))
+    return samples, taps, from_index(t, (BLOCK + 2) * m), from_index(i, 3 * n + BLOCK * m)
 
 
 @compiled
 def _slot(taps, slot, n):
     """The taps of a pixel of a block."""
-    m = slot * (4 * n + LANES)
+    m = slot * (4 * n + 2 * LANES)
     return Taps(from_index(taps.row, m), taps.by_key, taps.by_value, from_index(taps.weight, m))
 
 
@@ -599,10 +762,19 @@ def _walk(start, along, look, out):
 
 @compiled
 def _collect(p, look, samples):
-    """Positions of the samples of pixel p that count; how many."""
+    """Positions of the samples of pixel p that count, padded with 0; how many."""
     place = p % look.alpha_pixels if look.shared else p
     if look.straight:
-        return _collect_segment(place, look, samples) if look.mask[place] else 0
+        n = _collect_segment(place, look, samples) if look.mask[place] else 0
+    else:
+        n = _collect_positions(place, look, samples)
+    store(samples.x, n, splat(zero(samples.x)))
+    store(samples.y, n, splat(zero(samples.y)))
+    return n
+
+
+@compiled
+def _collect_positions(place, look, samples):
     points, mask = (
         from_index(look.points, 2 * place * look.samples),
         from_index(look.mask, place * look.samples),
@@ -649,11 +821,12 @@ def _tap(n, first, look, samples, taps):
 @compiled
 def _tap_nearest(n, first, look, samples, taps):
     """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
-    last_x, last_y, width = np.int32(look.width - 1), np.int32(look.height - 1), np.int32(look.width)
-    for j in range(n):
-        x = min(np.int32(samples.x[j] + HALF), last_x)
-        y = min(np.int32(samples.y[j] + HALF), last_y)
-        taps.row[j] = first + y * width + x
+    half, width, first = splat(HALF + zero(samples.x)), splat(np.int32(look.width)), splat(first)
+    last_x, last_y = splat(np.int32(look.width - 1)), splat(np.int32(look.height - 1))
+    for j in range(0, n, LANES):
+        x = lesser_whole(truncated(add(load(samples.x, j), half)), last_x)
+        y = lesser_whole(truncated(add(load(samples.y, j), half)), last_y)
+        store(taps.row, j, add_whole(add_whole(mul_whole(y, width), x), first))
     if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
         return n
     m = 0
@@ -667,50 +840,64 @@ def _tap_nearest(n, first, look, samples, taps):
     return m
 
 
+class Course(NamedTuple):
+    """Which way the samples of a pixel run on the whole: along y or x, backward or forward."""
+
+    steep: Any
+    backward: Any
+
+
+@compiled
+def _course(n, samples):
+    along_x, along_y = samples.x[n - 1] - samples.x[0], samples.y[n - 1] - samples.y[0]
+    steep = abs(along_y) > abs(along_x)
+    return Course(steep, along_y < 0 if steep else along_x < 0)
+
+
 @compiled
 def _tap_cells(n, first, look, samples, taps):
-    """Each cell has four taps, of which those that the cell before had, too, are taken from there."""
-    nothing = zero(samples.x)
+    """A cell's taps are four in a row: two behind, then the two ahead, as the samples run. A sample one cell
+    further has for its first two the last two of the sample before."""
+    course = _course(n, samples)
     width = np.int32(look.width)
-    cell_x, cell_y = np.int32(max(look.width - 2, 0)), np.int32(max(look.height - 2, 0))
     right, down = np.int32(min(1, look.width - 1)), np.int32(min(1, look.height - 1)) * width
+    ahead, aside = (down, right) if course.steep else (right, down)
+    _find_cells(n, first, look, samples, course)
+    if course.backward:
+        first_tap, ahead = ahead, -ahead
+    else:
+        first_tap = np.int32(0)
+    offsets = first_tap, first_tap + aside, first_tap + ahead, first_tap + ahead + aside
+    tap, before = np.int32(0), samples.cell[0]
     for j in range(n):
-        x, y = min(max(samples.x[j], nothing), look.last_x), min(max(samples.y[j], nothing), look.last_y)
-        cx, cy = min(np.int32(x), cell_x), min(np.int32(y), cell_y)
-        samples.right[j], samples.down[j] = x - np.float32(cx), y - np.float32(cy)
-        samples.cell[j] = first + cy * width + cx
-    t00 = t10 = t01 = t11 = m = np.int32(0)
-    cell = np.int32(0)
-    for j in range(n):
-        step, cell = samples.cell[j] - cell, samples.cell[j]
-        if j == 0 or step != 0:
-            if j == 0:
-                t00, t10, m = _fresh(cell, cell + right, m, taps)
-                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
-            elif step == right and right != 0:
-                t00, t01 = t10, t11
-                t10, t11, m = _fresh(cell + right, cell + right + down, m, taps)
-            elif step == -right and right != 0:
-                t10, t11 = t00, t01
-                t00, t01, m = _fresh(cell, cell + down, m, taps)
-            elif step == down and down != 0:
-                t00, t10 = t01, t11
-                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
-            elif step == -down and down != 0:
-                t01, t11 = t00, t10
-                t00, t10, m = _fresh(cell, cell + right, m, taps)
-            else:
-                t00, t10, m = _fresh(cell, cell + right, m, taps)
-                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
-        samples.tap[4 * j], samples.tap[4 * j + 1] = t00, t10
-        samples.tap[4 * j + 2], samples.tap[4 * j + 3] = t01, t11
-    return np.int64(m)
+        cell = samples.cell[j]
+        tap += np.int32(0) if cell == before else np.int32(2) if cell - before == ahead else np.int32(4)
+        before = cell
+        store_four(taps.row, tap, cell, offsets)
+        samples.tap[j] = tap
+    for j in range(n, n + LANES):
+        samples.tap[j] = tap
+    return np.int64(tap) + 4
 
 
 @compiled
-def _fresh(row, other, m, taps):
-    taps.row[m], taps.row[m + 1] = row, other
-    return m, np.int32(m + 1), np.int32(m + 2)
+def _find_cells(n, first, look, samples, course):
+    """The cell of each sample, as the index of its upper left pixel, and how far ahead and aside in it."""
+    nothing, one = splat(zero(samples.x)), splat(ONE + zero(samples.x))
+    last_x, last_y = splat(look.last_x), splat(look.last_y)
+    cell_x, cell_y = splat(np.int32(max(look.width - 2, 0))), splat(np.int32(max(look.height - 2, 0)))
+    width, first = splat(np.int32(look.width)), splat(first)
+    across, down = (samples.aside, samples.ahead) if course.steep else (samples.ahead, samples.aside)
+    for j in range(0, n, LANES):
+        x = lesser(larger(load(samples.x, j), nothing), last_x)
+        y = lesser(larger(load(samples.y, j), nothing), last_y)
+        cx, cy = lesser_whole(truncated(x), cell_x), lesser_whole(truncated(y), cell_y)
+        store(across, j, sub(x, numbers_of(cx, x)))
+        store(down, j, sub(y, numbers_of(cy, y)))
+        store(samples.cell, j, add_whole(add_whole(mul_whole(cy, width), cx), first))
+    if course.backward:
+        for j in range(0, n, LANES):
+            store(samples.ahead, j, sub(one, load(samples.ahead, j)))
 
 
 @compiled
@@ -724,35 +911,33 @@ def _interpolate(n, m, look, samples, by_tap, out):
             for j in range(n):
                 out[j] = by_tap[samples.tap[j]]
         return
-    for j in range(n):
-        u, v = samples.right[j], samples.down[j]
-        a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
-        c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
-        upper, lower = a + u * (b - a), c + u * (d - c)
-        out[j] = upper + v * (lower - upper)
+    for j in range(0, n, LANES):
+        ahead, aside = load(samples.ahead, j), load(samples.aside, j)
+        a, b, c, d = load_fours(by_tap, samples.tap, j)
+        behind, before = fma(aside, sub(b, a), a), fma(aside, sub(d, c), c)
+        store(out, j, fma(ahead, sub(before, behind), behind))
 
 
 @compiled
 def _distribute(n, m, look, samples, numbers, by_tap):
-    """From numbers on samples to numbers on taps: the transpose of `_interpolate`."""
+    """From numbers on samples, padded with 0, to numbers on taps: the transpose of `_interpolate`."""
     if look.nearest and m == n:
         for j in range(0, n, LANES):
             store(by_tap, j, load(numbers, j))
         _fill(by_tap, n, n + TAP_BLOCK, zero(by_tap))
         return
-    _fill(by_tap, 0, m + TAP_BLOCK, zero(by_tap))
+    for t in range(0, m + TAP_BLOCK, LANES):
+        store(by_tap, t, splat(zero(by_tap)))
     if look.nearest:
         for j in range(n):
             by_tap[samples.tap[j]] += numbers[j]
         return
-    for j in range(n):
-        u, v = samples.right[j], samples.down[j]
-        lower = v * numbers[j]
-        upper = numbers[j] - lower
-        by_tap[samples.tap[4 * j]] += upper - u * upper
-        by_tap[samples.tap[4 * j + 1]] += u * upper
-        by_tap[samples.tap[4 * j + 2]] += lower - u * lower
-        by_tap[samples.tap[4 * j + 3]] += u * lower
+    for j in range(0, n, LANES):
+        number, ahead, aside = load(numbers, j), load(samples.ahead, j), load(samples.aside, j)
+        before = mul(ahead, number)
+        behind = sub(number, before)
+        b, d = mul(aside, behind), mul(aside, before)
+        add_fours(by_tap, samples.tap, j, sub(behind, b), b, sub(before, d), d)
 
 
 @compiled
@@ -762,12 +947,13 @@ def _fill(numbers, first, last, filler):
 
 
 @compiled
-def _slopes(j, samples, by_tap):
+def _slopes(j, course, samples, by_tap):
     """How the interpolated number changes with x and with y, at sample j."""
-    u, v = samples.right[j], samples.down[j]
-    a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
-    c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
-    return (ONE - v) * (b - a) + v * (d - c), (ONE - u) * (c - a) + u * (d - b)
+    u, v, t = samples.ahead[j], samples.aside[j], samples.tap[j]
+    a, b, c, d = by_tap[t], by_tap[t + 1], by_tap[t + 2], by_tap[t + 3]
+    ahead, aside = (ONE - v) * (c - a) + v * (d - b), (ONE - u) * (b - a) + u * (d - c)
+    ahead = -ahead if course.backward else ahead
+    return (aside, ahead) if course.steep else (ahead, aside)
 
 
 # ---- forward and backward ------------------------------------------------------------------------
@@ -842,8 +1028,6 @@ def _exponentiate(n, samples, top):
 def _measure(n, samples, statistics):
     """Expected position, spread and largest of the weights, which are padded with 0."""
     nothing = zero(samples.x)
-    _fill(samples.x, n, n + LANES, nothing)
-    _fill(samples.y, n, n + LANES, nothing)
     x = y = squared = peak = splat(nothing)
     for j in range(0, n, LANES):
         w = load(samples.weight, j)
@@ -898,8 +1082,8 @@ def forward(
                 counts[p - begin] = m
                 _distribute(n, m, look, samples, samples.weight, own.weight)
                 _measure(n, samples, from_index(statistics, 4 * p))
-        for c in range(0, value_channels, 4 * LANES):
-            width = min(4 * LANES, value_channels - c)
+        for c in range(0, value_channels, WIDE):
+            width = min(WIDE, value_channels - c)
             for p in range(begin, end):
                 own = _slot(taps, p - begin, look.samples)
                 weighted_sum(own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q)
@@ -951,12 +1135,13 @@ def _move(n, p, look, samples, taps, statistics, upstream, out):
     centre_x, centre_y, spread, gx, gy, gspread = _six(statistics, upstream)
     pull = gspread / spread if spread > 0 else nothing
     x0 = y0 = x1 = y1 = nothing
+    course = _course(n, samples)
     for j in range(n):
         x, y, w = samples.x[j], samples.y[j], samples.weight[j]
         dx, dy = w * (gx + pull * (x - centre_x)), w * (gy + pull * (y - centre_y))
         if not look.nearest:
-            kx, ky = _slopes(j, samples, taps.by_key)
-            vx, vy = _slopes(j, samples, taps.by_value)
+            kx, ky = _slopes(j, course, samples, taps.by_key)
+            vx, vy = _slopes(j, course, samples, taps.by_value)
             dx += samples.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= look.last_x) else nothing
             dy += samples.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= look.last_y) else nothing
         i = samples.index[j]
