@@ -29,7 +29,9 @@ WIDE = 8 * LANES
 """Channels that are worked off at once."""
 TAP_BLOCK = 4
 BLOCK = 8
-"""Alpha pixels that are worked off together, step by step, as long as what they look up is still at hand."""
+"""Alpha pixels that are worked off together, step by step."""
+CHUNK = 64
+"""Taps that the pixels of a block have in turn, while these lie in the first cache: 16 KiB."""
 LEAST_SPREAD = np.float32(1e-4)
 ONE, HALF = np.float32(1), np.float32(0.5)
 """In float32, so that they make a float64 of nothing that is not."""
@@ -461,24 +463,24 @@ def _exponentials32(x):
 
 
 @compiled
-def inner_products(x, rows, n, picture, channels, out):
-    """out[t] = x . picture[rows[t]], for t < n; rows is padded to a multiple of TAP_BLOCK."""
+def inner_products(x, rows, first, last, picture, channels, out):
+    """out[t] = x . picture[rows[t]], for first <= t < last; rows is padded to a multiple of TAP_BLOCK."""
     c = 0
-    for t in range(0, n, LANES):
+    for t in range(first, last, LANES):
         store(out, t, splat(zero(x)))
     while c + WIDE <= channels:
-        _inner_products_64(x, rows, n, picture, channels, c, out)
+        _inner_products_64(x, rows, first, last, picture, channels, c, out)
         c += WIDE
     if c < channels:
-        _inner_products_of_rest(x, rows, n, picture, channels, c, out)
+        _inner_products_of_rest(x, rows, first, last, picture, channels, c, out)
 
 
 @compiled
-def _inner_products_64(x, rows, n, picture, channels, c, out):
+def _inner_products_64(x, rows, first, last, picture, channels, c, out):
     """The 64 channels from c on, with x in registers."""
     x0, x1, x2, x3 = load(x, c), load(x, c + 8), load(x, c + 16), load(x, c + 24)
     x4, x5, x6, x7 = load(x, c + 32), load(x, c + 40), load(x, c + 48), load(x, c + 56)
-    for t in range(0, n, TAP_BLOCK):
+    for t in range(first, last, TAP_BLOCK):
         add_totals(
             out,
             t,
@@ -502,10 +504,9 @@ def _inner_product_64(picture, at, x0, x1, x2, x3, x4, x5, x6, x7):
 
 
 @compiled
-def _inner_products_of_rest(x, rows, n, picture, channels, first, out):
-    """The channels from `first` on."""
-    whole = first + (channels - first) // LANES * LANES
-    for t in range(0, n, TAP_BLOCK):
+def _inner_products_of_rest(x, rows, first, last, picture, channels, first_channel, out):
+    whole = first_channel + (channels - first_channel) // LANES * LANES
+    for t in range(first, last, TAP_BLOCK):
         r0, r1, r2, r3 = (
             rows[t] * channels,
             rows[t + 1] * channels,
@@ -513,7 +514,7 @@ def _inner_products_of_rest(x, rows, n, picture, channels, first, out):
             rows[t + 3] * channels,
         )
         a0 = a1 = a2 = a3 = splat(zero(x))
-        for c in range(first, whole, LANES):
+        for c in range(first_channel, whole, LANES):
             q = load(x, c)
             a0 = fma(q, load(picture, r0 + c), a0)
             a1 = fma(q, load(picture, r1 + c), a1)
@@ -528,32 +529,31 @@ def _inner_products_of_rest(x, rows, n, picture, channels, first, out):
 
 
 @compiled
-def weighted_sum(weights, rows, n, picture, channels, width, out):
-    """out[c] = sum over t < n of weights[t] picture[rows[t], c], for c < width.
+def weighted_sum(weights, rows, first, last, picture, channels, begin, end, out):
+    """out[c] += weights[t] picture[rows[t], c] for first <= t < last and the channels begin <= c < end.
 
     Weights and rows are padded to a multiple of TAP_BLOCK.
     """
-    c = 0
-    while c + WIDE <= width:
-        _weighted_sum_64(weights, rows, n, picture, channels, c, out)
+    c = begin
+    while c + WIDE <= end:
+        _weighted_sum_64(weights, rows, first, last, picture, channels, c, out)
         c += WIDE
-    while c + 4 * LANES <= width:
-        _weighted_sum_32(weights, rows, n, picture, channels, c, out)
+    while c + 4 * LANES <= end:
+        _weighted_sum_32(weights, rows, first, last, picture, channels, c, out)
         c += 4 * LANES
-    while c + LANES <= width:
-        _weighted_sum_8(weights, rows, n, picture, channels, c, out)
+    while c + LANES <= end:
+        _weighted_sum_8(weights, rows, first, last, picture, channels, c, out)
         c += LANES
-    for tail in range(c, width):
-        s = zero(weights)
-        for t in range(n):
-            s += weights[t] * load_one(picture, rows[t] * channels + tail)
-        out[tail] = s
+    for tail in range(c, end):
+        for t in range(first, last):
+            out[tail] += weights[t] * load_one(picture, rows[t] * channels + tail)
 
 
 @compiled
-def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = a4 = a5 = a6 = a7 = splat(zero(weights))
-    for t in range(n):
+def _weighted_sum_64(weights, rows, first, last, picture, channels, c, out):
+    a0, a1, a2, a3 = load(out, c), load(out, c + 8), load(out, c + 16), load(out, c + 24)
+    a4, a5, a6, a7 = load(out, c + 32), load(out, c + 40), load(out, c + 48), load(out, c + 56)
+    for t in range(first, last):
         w, r = splat(weights[t]), rows[t] * channels + c
         a0 = fma(w, load(picture, r), a0)
         a1 = fma(w, load(picture, r + 8), a1)
@@ -563,20 +563,15 @@ def _weighted_sum_64(weights, rows, n, picture, channels, c, out):
         a5 = fma(w, load(picture, r + 40), a5)
         a6 = fma(w, load(picture, r + 48), a6)
         a7 = fma(w, load(picture, r + 56), a7)
-    store(out, c, a0)
-    store(out, c + 8, a1)
-    store(out, c + 16, a2)
-    store(out, c + 24, a3)
-    store(out, c + 32, a4)
-    store(out, c + 40, a5)
-    store(out, c + 48, a6)
-    store(out, c + 56, a7)
+    _store_32(out, c, a0, a1, a2, a3)
+    _store_32(out, c + 32, a4, a5, a6, a7)
 
 
 @compiled
-def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
-    for t in range(0, n, 2):
+def _weighted_sum_32(weights, rows, first, last, picture, channels, c, out):
+    a0, a1, a2, a3 = load(out, c), load(out, c + 8), load(out, c + 16), load(out, c + 24)
+    b0 = b1 = b2 = b3 = splat(zero(weights))
+    for t in range(first, last, 2):
         w, r = splat(weights[t]), rows[t] * channels + c
         a0 = fma(w, load(picture, r), a0)
         a1 = fma(w, load(picture, r + 8), a1)
@@ -587,21 +582,57 @@ def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
         b1 = fma(w, load(picture, r + 8), b1)
         b2 = fma(w, load(picture, r + 16), b2)
         b3 = fma(w, load(picture, r + 24), b3)
-    store(out, c, add(a0, b0))
-    store(out, c + 8, add(a1, b1))
-    store(out, c + 16, add(a2, b2))
-    store(out, c + 24, add(a3, b3))
+    _store_32(out, c, add(a0, b0), add(a1, b1), add(a2, b2), add(a3, b3))
 
 
 @compiled
-def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = splat(zero(weights))
-    for t in range(0, n, TAP_BLOCK):
+def _store_32(out, c, a, b, d, e):
+    store(out, c, a)
+    store(out, c + 8, b)
+    store(out, c + 16, d)
+    store(out, c + 24, e)
+
+
+@compiled
+def _weighted_sum_8(weights, rows, first, last, picture, channels, c, out):
+    a0, a1 = load(out, c), splat(zero(weights))
+    a2 = a3 = a1
+    for t in range(first, last, TAP_BLOCK):
         a0 = fma(splat(weights[t]), load(picture, rows[t] * channels + c), a0)
         a1 = fma(splat(weights[t + 1]), load(picture, rows[t + 1] * channels + c), a1)
         a2 = fma(splat(weights[t + 2]), load(picture, rows[t + 2] * channels + c), a2)
         a3 = fma(splat(weights[t + 3]), load(picture, rows[t + 3] * channels + c), a3)
     store(out, c, add(add(a0, a1), add(a2, a3)))
+
+
+@compiled
+def _block_products(pixels, counts, x, rows, picture, channels, out):
+    """`inner_products` for the pixels of a block. Neighbours look at much the same pixels of beta: at a few of
+    those in turn, which then lie in the first cache."""
+    for t in range(0, _most(counts, pixels), CHUNK):
+        for i in range(pixels):
+            inner_products(_of(x, i), _of(rows, i), t, min(t + CHUNK, counts[i]), picture, channels, _of(out, i))
+
+
+@compiled
+def _block_sums(pixels, counts, weights, rows, picture, channels, out):
+    """`weighted_sum` likewise, from 0."""
+    for i in range(pixels):
+        _fill(_of(out, i), 0, channels, zero(out.first))
+    for c in range(0, channels, WIDE):
+        end = min(c + WIDE, channels)
+        for t in range(0, _most(counts, pixels), CHUNK):
+            for i in range(pixels):
+                last = min(t + CHUNK, counts[i])
+                weighted_sum(_of(weights, i), _of(rows, i), t, last, picture, channels, c, end, _of(out, i))
+
+
+@compiled
+def _most(counts, n):
+    most = 0
+    for i in range(n):
+        most = max(most, counts[i])
+    return most
 
 
 @compiled(nogil=True, cache=True)
@@ -666,8 +697,8 @@ class Look(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """Room for the samples of one pixel that count: which they are, where, in which cell, with what
-    weight."""
+    """Room for the samples of one pixel that count: which they are, where, in which cell, where in that
+    cell, and numbers for each."""
 
     index: Any
     cell: Any
@@ -682,13 +713,26 @@ class Samples(NamedTuple):
     score_slope: Any
 
 
-class Taps(NamedTuple):
-    """Room for the taps of one pixel: their pixels in beta, and numbers for each."""
+class Column(NamedTuple):
+    """A list for each pixel of a block: where the first one's begins, and how far it is to the next."""
 
-    row: Any
-    by_key: Any
-    by_value: Any
-    weight: Any
+    first: Any
+    step: Any
+
+
+class Block(NamedTuple):
+    """Room for some neighbouring alpha pixels: for each the number of its samples and taps, its samples, its
+    taps' rows (pixels in beta), numbers for each tap, and for each channel."""
+
+    sample_counts: Any
+    tap_counts: Any
+    integers: Column
+    numbers: Column
+    rows: Column
+    by_key: Column
+    by_value: Column
+    query: Column
+    upstream: Column
 
 
 @compiled
@@ -710,20 +754,49 @@ def _look(look):
     )
 
 
+@compiled
+def _lengths(samples):
+    """Room for a pixel's samples and for its taps."""
+    return samples + LANES, 4 * samples + 2 * LANES
+
+
 def room(samples, channels):
     """How many integers and how many numbers of scratch a task needs."""
     n, m = samples + LANES, 4 * samples + 2 * LANES
-    return 3 * n + BLOCK * (m + 1), 8 * n + (BLOCK + 2) * m + channels
+    return BLOCK * (3 * n + m + 2), BLOCK * (8 * n + 2 * m + 2 * channels)
 
 
 @compiled
-def _room(n, integers, numbers):
-    """Scratch, cut up: for samples, taps, channels. Taps' rows and weights are there for BLOCK pixels, the
-    numbers of taps behind those."""
-    n, m = n + LANES, 4 * n + 2 * LANES
-    i, f = pointer(integers), pointer(numbers)
-    t = from_index(f, 8 * n)
-    samples = Samples(
+def _block(samples, channels, integers, numbers):
+    """Scratch, cut up."""
+    n, m = _lengths(samples)
+    i, f = from_index(pointer(integers), 2 * BLOCK), pointer(numbers)
+    i_step, f_step = 3 * n + m, 8 * n + 2 * m + 2 * channels
+    return Block(
+        pointer(integers),
+        from_index(pointer(integers), BLOCK),
+        Column(i, i_step),
+        Column(f, f_step),
+        Column(from_index(i, 3 * n), i_step),
+        Column(from_index(f, 8 * n), f_step),
+        Column(from_index(f, 8 * n + m), f_step),
+        Column(from_index(f, 8 * n + 2 * m), f_step),
+        Column(from_index(f, 8 * n + 2 * m + channels), f_step),
+    )
+
+
+@compiled
+def _of(column, slot):
+    """The list of one pixel of a block."""
+    return from_index(column.first, slot * column.step)
+
+
+@compiled
+def _samples(block, slot, n):
+    """The samples of one pixel of a block."""
+    n, _ = _lengths(n)
+    i, f = _of(block.integers, slot), _of(block.numbers, slot)
+    return Samples(
         i,
         from_index(i, n),
         from_index(i, 2 * n),
@@ -736,15 +809,6 @@ def _room(n, integers, numbers):
         from_index(f, 6 * n),
         from_index(f, 7 * n),
     )
-    taps = Taps(from_index(i, 3 * n), t, from_index(t, m), from_index(t, 2 * m))
-    return samples, taps, from_index(t, (BLOCK + 2) * m), from_index(i, 3 * n + BLOCK * m)
-
-
-@compiled
-def _slot(taps, slot, n):
-    """The taps of a pixel of a block."""
-    m = slot * (4 * n + 2 * LANES)
-    return Taps(from_index(taps.row, m), taps.by_key, taps.by_value, from_index(taps.weight, m))
 
 
 @compiled
@@ -807,35 +871,35 @@ def _collect_segment(place, look, samples):
 
 
 @compiled
-def _tap(n, first, look, samples, taps):
+def _tap(n, first, look, samples, rows):
     """Finds the taps of n samples; how many. `first` is the index of the first pixel of this beta."""
     if look.nearest:
-        m = _tap_nearest(n, np.int32(first), look, samples, taps)
+        m = _tap_nearest(n, np.int32(first), look, samples, rows)
     else:
-        m = _tap_cells(n, np.int32(first), look, samples, taps)
+        m = _tap_cells(n, np.int32(first), look, samples, rows)
     for t in range(m, m + TAP_BLOCK):
-        taps.row[t] = taps.row[m - 1]
+        rows[t] = rows[m - 1]
     return m
 
 
 @compiled
-def _tap_nearest(n, first, look, samples, taps):
+def _tap_nearest(n, first, look, samples, rows):
     """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
     half, width, first = splat(HALF + zero(samples.x)), splat(np.int32(look.width)), splat(first)
     last_x, last_y = splat(np.int32(look.width - 1)), splat(np.int32(look.height - 1))
     for j in range(0, n, LANES):
         x = lesser_whole(truncated(add(load(samples.x, j), half)), last_x)
         y = lesser_whole(truncated(add(load(samples.y, j), half)), last_y)
-        store(taps.row, j, add_whole(add_whole(mul_whole(y, width), x), first))
+        store(rows, j, add_whole(add_whole(mul_whole(y, width), x), first))
     if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
         return n
     m = 0
     row = np.int32(-1)
     for j in range(n):
-        here = taps.row[j]
+        here = rows[j]
         m += here != row
         row = here
-        taps.row[m - 1] = row
+        rows[m - 1] = row
         samples.tap[j] = m - 1
     return m
 
@@ -855,7 +919,7 @@ def _course(n, samples):
 
 
 @compiled
-def _tap_cells(n, first, look, samples, taps):
+def _tap_cells(n, first, look, samples, rows):
     """A cell's taps are four in a row: two behind, then the two ahead, as the samples run. A sample one cell
     further has for its first two the last two of the sample before."""
     course = _course(n, samples)
@@ -873,7 +937,7 @@ def _tap_cells(n, first, look, samples, taps):
         cell = samples.cell[j]
         tap += np.int32(0) if cell == before else np.int32(2) if cell - before == ahead else np.int32(4)
         before = cell
-        store_four(taps.row, tap, cell, offsets)
+        store_four(rows, tap, cell, offsets)
         samples.tap[j] = tap
     for j in range(n, n + LANES):
         samples.tap[j] = tap
@@ -972,19 +1036,23 @@ def _pack(numbers, n, array, at):
 
 
 @compiled
-def _score(p, q, key, channels, look, bias, biased, samples, taps):
-    """Collects pixel p's samples and scores them: how many samples, how many taps."""
-    n = _collect(p, look, samples)
-    if n == 0:
-        return 0, 0
-    m = _tap(n, p // look.alpha_pixels * (look.height * look.width), look, samples, taps)
-    inner_products(q, taps.row, m, key, channels, taps.by_key)
-    _interpolate(n, m, look, samples, taps.by_key, samples.score)
+def _find(p, slot, look, block):
+    """The samples and taps of pixel p."""
+    samples = _samples(block, slot, look.samples)
+    block.sample_counts[slot] = n = _collect(p, look, samples)
+    first = p // look.alpha_pixels * (look.height * look.width)
+    block.tap_counts[slot] = _tap(n, first, look, samples, _of(block.rows, slot)) if n > 0 else 0
+
+
+@compiled
+def _score(p, slot, look, bias, biased, block):
+    """The scores of pixel p's samples."""
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
+    _interpolate(n, block.tap_counts[slot], look, samples, _of(block.by_key, slot), samples.score)
     if biased:
         for j in range(n):
             samples.score[j] += bias[p * look.samples + samples.index[j]]
-    _fill(samples.score, n, n + LANES, zero(q) - np.float32(np.inf))
-    return n, m
+    _fill(samples.score, n, n + LANES, zero(samples.score) - np.float32(np.inf))
 
 
 @compiled
@@ -1066,28 +1134,39 @@ def forward(
     exponentials."""
     biased = len(bias) > 0
     look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
-    out, statistics = pointer(out), pointer(statistics)
-    samples, taps, q, counts = _room(look.samples, integers, numbers)
+    out, statistics, logsum = pointer(out), pointer(statistics), pointer(logsum)
+    block = _block(look.samples, max(channels, value_channels), integers, numbers)
+    counts = block.tap_counts
     for begin in range(first, last, BLOCK):
-        end = min(begin + BLOCK, last)
-        for p in range(begin, end):
-            _unpack(query, p * channels, channels, q)
-            own = _slot(taps, p - begin, look.samples)
-            n, m = _score(p, q, key, channels, look, bias, biased, samples, own)
-            logsum[p] = _softmax(n, samples) if n > 0 else -np.inf
-            if logsum[p] == -np.inf:
-                counts[p - begin] = 0
-                _fill(statistics, 4 * p, 4 * p + 4, zero(q))
-            else:
-                counts[p - begin] = m
-                _distribute(n, m, look, samples, samples.weight, own.weight)
-                _measure(n, samples, from_index(statistics, 4 * p))
-        for c in range(0, value_channels, WIDE):
-            width = min(WIDE, value_channels - c)
-            for p in range(begin, end):
-                own = _slot(taps, p - begin, look.samples)
-                weighted_sum(own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q)
-                _pack(q, width, out, p * value_channels + c)
+        pixels = min(BLOCK, last - begin)
+        for i in range(pixels):
+            _unpack(query, (begin + i) * channels, channels, _of(block.query, i))
+            _find(begin + i, i, look, block)
+        _block_products(pixels, counts, block.query, block.rows, key, channels, block.by_key)
+        for i in range(pixels):
+            p = begin + i
+            logsum[p] = _weigh(p, i, look, bias, biased, block, from_index(statistics, 4 * p))
+        _block_sums(pixels, counts, block.by_key, block.rows, value, value_channels, block.query)
+        for i in range(pixels):
+            _pack(_of(block.query, i), value_channels, out, (begin + i) * value_channels)
+
+
+@compiled
+def _weigh(p, slot, look, bias, biased, block, statistics):
+    """From the inner products of pixel p's taps to their weights, in the same place; gives the logarithm of
+    the sum of exponentials."""
+    samples, n, by_tap = _samples(block, slot, look.samples), block.sample_counts[slot], _of(block.by_key, slot)
+    logsum = zero(by_tap) - np.float32(np.inf)
+    if n > 0:
+        _score(p, slot, look, bias, biased, block)
+        logsum = _softmax(n, samples)
+    if logsum == -np.inf:
+        block.tap_counts[slot] = 0
+        _fill(statistics, 0, 4, zero(statistics))
+    else:
+        _distribute(n, block.tap_counts[slot], look, samples, samples.weight, by_tap)
+        _measure(n, samples, statistics)
+    return logsum
 
 
 class Scratch(NamedTuple):
@@ -1129,8 +1208,10 @@ def _six(statistics, upstream):
 
 
 @compiled
-def _move(n, p, look, samples, taps, statistics, upstream, out):
+def _move(p, slot, look, block, statistics, upstream, out):
     """Gradients by the positions of the samples, and by the points that made them."""
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
+    by_key, by_value = _of(block.by_key, slot), _of(block.by_value, slot)
     nothing = zero(upstream)
     centre_x, centre_y, spread, gx, gy, gspread = _six(statistics, upstream)
     pull = gspread / spread if spread > 0 else nothing
@@ -1140,8 +1221,8 @@ def _move(n, p, look, samples, taps, statistics, upstream, out):
         x, y, w = samples.x[j], samples.y[j], samples.weight[j]
         dx, dy = w * (gx + pull * (x - centre_x)), w * (gy + pull * (y - centre_y))
         if not look.nearest:
-            kx, ky = _slopes(j, course, samples, taps.by_key)
-            vx, vy = _slopes(j, course, samples, taps.by_value)
+            kx, ky = _slopes(j, course, samples, by_key)
+            vx, vy = _slopes(j, course, samples, by_value)
             dx += samples.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= look.last_x) else nothing
             dy += samples.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= look.last_y) else nothing
         i = samples.index[j]
@@ -1184,52 +1265,99 @@ def backward(
 
     Outputs that are not wanted have length 0; points_out and bias_out come zeroed.
     """
-    biased, wants_query, wants_points = len(bias) > 0, len(query_out) > 0, len(points_out) > 0
+    biased, wants_points, wants_bias = len(bias) > 0, len(points_out) > 0, len(bias_out) > 0
+    wants_query = len(query_out) > 0
     look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
     statistics, value_upstream = pointer(statistics), pointer(value_upstream)
-    statistics_upstream, query_out, points_out = (
+    statistics_upstream, query_out, points_out, bias_out = (
         pointer(statistics_upstream),
         pointer(query_out),
         pointer(points_out),
+        pointer(bias_out),
     )
-    counts, rows = pointer(scratch.counts), pointer(scratch.rows)
-    by_key, by_value = pointer(scratch.by_key), pointer(scratch.by_value)
-    samples, taps, q, _ = _room(look.samples, integers, numbers)
-    for p in range(first, last):
-        slot = p - scratch_first
-        _unpack(query, p * channels, channels, q)
-        n, m = 0, 0
-        if logsum[p] > -np.inf:
-            n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
-        counts[slot] = m
-        if n == 0:
-            if wants_query:
-                _fill(q, 0, channels, zero(q))
-                _pack(q, channels, query_out, p * channels)
-            continue
-        _exponentiate(n, samples, logsum[p])
-        _unpack(value_upstream, p * value_channels, value_channels, q)
-        inner_products(q, taps.row, m, value, value_channels, taps.by_value)
-        _interpolate(n, m, look, samples, taps.by_value, samples.slope)
-        _blame(n, samples, from_index(statistics, 4 * p), from_index(statistics_upstream, 4 * p))
-        if wants_points:
-            _move(
-                n,
-                p,
-                look,
-                samples,
-                taps,
-                from_index(statistics, 4 * p),
-                from_index(statistics_upstream, 4 * p),
-                points_out,
-            )
-        if len(bias_out) > 0:
-            for j in range(n):
-                bias_out[p * look.samples + samples.index[j]] = samples.score_slope[j]
-        _distribute(n, m, look, samples, samples.weight, from_index(by_value, slot * stride))
-        _distribute(n, m, look, samples, samples.score_slope, from_index(by_key, slot * stride))
-        for t in range(m):
-            rows[slot * stride + t] = taps.row[t]
+    block = _block(look.samples, max(channels, value_channels), integers, numbers)
+    for begin in range(first, last, BLOCK):
+        pixels, left = min(BLOCK, last - begin), _left(scratch, begin - scratch_first, stride)
+        counts, rows = from_index(pointer(scratch.counts), begin - scratch_first), left.rows
+        block = _with_rows(block, counts, rows)
+        for i in range(pixels):
+            p = begin + i
+            _unpack(query, p * channels, channels, _of(block.query, i))
+            _unpack(value_upstream, p * value_channels, value_channels, _of(block.upstream, i))
+            counts[i] = 0
+            if logsum[p] > -np.inf:
+                _find(p, i, look, block)
+        _block_products(pixels, counts, block.query, rows, key, channels, block.by_key)
+        _block_products(pixels, counts, block.upstream, rows, value, value_channels, block.by_value)
+        for i in range(pixels):
+            p = begin + i
+            if counts[i] > 0:
+                own, upstream = from_index(statistics, 4 * p), from_index(statistics_upstream, 4 * p)
+                _reweigh(p, i, look, bias, biased, block, logsum[p], own, upstream)
+                _leave(i, look, block, left)
+                if wants_points:
+                    _move(p, i, look, block, own, upstream, points_out)
+                if wants_bias:
+                    _leave_bias(p, i, look, block, bias_out)
         if wants_query:
-            weighted_sum(from_index(by_key, slot * stride), taps.row, m, key, channels, channels, q)
-            _pack(q, channels, query_out, p * channels)
+            _block_sums(pixels, counts, left.by_key, rows, key, channels, block.query)
+            for i in range(pixels):
+                _pack(_of(block.query, i), channels, query_out, (begin + i) * channels)
+
+
+class Left(NamedTuple):
+    """The part of `Scratch` that belongs to a block."""
+
+    rows: Column
+    by_key: Column
+    by_value: Column
+
+
+@compiled
+def _left(scratch, slot, stride):
+    return Left(
+        Column(from_index(pointer(scratch.rows), slot * stride), stride),
+        Column(from_index(pointer(scratch.by_key), slot * stride), stride),
+        Column(from_index(pointer(scratch.by_value), slot * stride), stride),
+    )
+
+
+@compiled
+def _with_rows(block, counts, rows):
+    """A block whose taps are put elsewhere."""
+    return Block(
+        block.sample_counts,
+        counts,
+        block.integers,
+        block.numbers,
+        rows,
+        block.by_key,
+        block.by_value,
+        block.query,
+        block.upstream,
+    )
+
+
+@compiled
+def _reweigh(p, slot, look, bias, biased, block, logsum, statistics, upstream):
+    """The weights of pixel p's samples again, and the gradients by them and by the scores."""
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
+    _score(p, slot, look, bias, biased, block)
+    _exponentiate(n, samples, logsum)
+    _interpolate(n, block.tap_counts[slot], look, samples, _of(block.by_value, slot), samples.slope)
+    _blame(n, samples, statistics, upstream)
+
+
+@compiled
+def _leave(slot, look, block, left):
+    """What `scatter` needs."""
+    samples, n, m = _samples(block, slot, look.samples), block.sample_counts[slot], block.tap_counts[slot]
+    _distribute(n, m, look, samples, samples.weight, _of(left.by_value, slot))
+    _distribute(n, m, look, samples, samples.score_slope, _of(left.by_key, slot))
+
+
+@compiled
+def _leave_bias(p, slot, look, block, out):
+    samples = _samples(block, slot, look.samples)
+    for j in range(block.sample_counts[slot]):
+        out[p * look.samples + samples.index[j]] = samples.score_slope[j]
