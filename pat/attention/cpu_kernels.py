@@ -28,9 +28,9 @@ LANES = 8
 WIDE = 8 * LANES
 """Channels that are worked off at once."""
 TAP_BLOCK = 4
-BLOCK = 8
+BLOCK = 16
 """Alpha pixels that are worked off together, step by step."""
-CHUNK = 64
+CHUNK = 48
 """Taps that the pixels of a block have in turn, while these lie in the first cache: 16 KiB."""
 LEAST_SPREAD = np.float32(1e-4)
 ONE, HALF = np.float32(1), np.float32(0.5)
@@ -86,6 +86,16 @@ def pointer(typing, array):
         return context.make_array(array)(context, builder, args[0]).data
 
     return types.CPointer(array.dtype)(array), code
+
+
+@intrinsic
+def take(typing, counter):
+    """The number at a pointer, which is one more for whoever asks next."""
+
+    def code(context, builder, signature, args):
+        return builder.atomic_rmw("add", args[0], ir.Constant(args[0].type.pointee, 1), "monotonic")
+
+    return counter.dtype(counter), code
 
 
 @intrinsic
@@ -636,17 +646,17 @@ def _most(counts, n):
 
 
 @compiled(nogil=True, cache=True)
-def scatter(counts, rows, weights, stride, x, channels, first, last, first_channel, last_channel, out):
-    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels first .. last, in their order.
+def scatter(scratch, weights, last, x, channels, first_channel, last_channel, out):
+    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels scratch.first .. last, in their order.
 
-    `counts` says how many taps each of the pixels has; theirs start at multiples of `stride`. One caller owns
-    the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the same
-    however many callers share the work.
+    `weights` is one of scratch's. One caller owns the channels first_channel .. last_channel, so the order of
+    additions, and with it every bit, is the same however many callers share the work.
     """
-    counts, rows, weights, x, out = pointer(counts), pointer(rows), pointer(weights), pointer(x), pointer(out)
-    for p in range(first, last):
-        begin = (p - first) * stride
-        end = begin + counts[p - first]
+    counts, rows = pointer(scratch.counts), pointer(scratch.rows)
+    weights, x, out = pointer(weights), pointer(x), pointer(out)
+    for p in range(scratch.first, last):
+        begin = (p - scratch.first) * scratch.stride
+        end = begin + counts[p - scratch.first]
         c = first_channel
         while c + 4 * LANES <= last_channel:
             _scatter_32(rows, weights, begin, end, x, p * channels + c, channels, c, out)
@@ -694,6 +704,60 @@ class Look(NamedTuple):
     last_x: Any
     last_y: Any
     slack: Any
+
+
+class Call(NamedTuple):
+    """The inputs of a call: pictures, where to look, bias (of no length if there is none), and the numbers of
+    channels of the query and the value."""
+
+    query: Any
+    key: Any
+    value: Any
+    look: Look
+    bias: Any
+    channels: int
+    value_channels: int
+
+
+class Share(NamedTuple):
+    """What one of several callers works on, and with: pieces of `size` of the alpha pixels first .. last, for
+    which all of them ask one counter, and scratch of its own."""
+
+    first: int
+    last: int
+    size: int
+    counter: Any
+    integers: Any
+    numbers: Any
+
+
+class Saved(NamedTuple):
+    """What forward found, and the gradients by what it gave."""
+
+    statistics: Any
+    logsum: Any
+    value_upstream: Any
+    statistics_upstream: Any
+
+
+class Gradients(NamedTuple):
+    """Those that belong to alpha's pixels; of no length where not wanted. points and bias come zeroed."""
+
+    query: Any
+    points: Any
+    bias: Any
+
+
+class Scratch(NamedTuple):
+    """What backward leaves for `scatter`: for each of the alpha pixels from `first` on how many taps it has;
+    their rows and weights, which start at multiples of `stride`."""
+
+    first: int
+    stride: int
+    counts: Any
+    rows: Any
+    by_key: Any
+    by_value: Any
 
 
 class Samples(NamedTuple):
@@ -755,6 +819,20 @@ def _look(look):
 
 
 @compiled
+def _call(call):
+    """With pointers for arrays."""
+    return Call(
+        pointer(call.query),
+        pointer(call.key),
+        pointer(call.value),
+        _look(call.look),
+        pointer(call.bias),
+        call.channels,
+        call.value_channels,
+    )
+
+
+@compiled
 def _lengths(samples):
     """Room for a pixel's samples and for its taps."""
     return samples + LANES, 4 * samples + 2 * LANES
@@ -767,14 +845,15 @@ def room(samples, channels):
 
 
 @compiled
-def _block(samples, channels, integers, numbers):
+def _block(call, share):
     """Scratch, cut up."""
-    n, m = _lengths(samples)
-    i, f = from_index(pointer(integers), 2 * BLOCK), pointer(numbers)
+    n, m = _lengths(call.look.samples)
+    i, f = from_index(pointer(share.integers), 2 * BLOCK), pointer(share.numbers)
+    channels = max(call.channels, call.value_channels)
     i_step, f_step = 3 * n + m, 8 * n + 2 * m + 2 * channels
     return Block(
-        pointer(integers),
-        from_index(pointer(integers), BLOCK),
+        pointer(share.integers),
+        from_index(pointer(share.integers), BLOCK),
         Column(i, i_step),
         Column(f, f_step),
         Column(from_index(i, 3 * n), i_step),
@@ -1045,8 +1124,9 @@ def _find(p, slot, look, block):
 
 
 @compiled
-def _score(p, slot, look, bias, biased, block):
+def _score(p, slot, call, biased, block):
     """The scores of pixel p's samples."""
+    look, bias = call.look, call.bias
     samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
     _interpolate(n, block.tap_counts[slot], look, samples, _of(block.by_key, slot), samples.score)
     if biased:
@@ -1114,51 +1194,44 @@ def _measure(n, samples, statistics):
 
 
 @compiled(nogil=True, cache=True)
-def forward(
-    query,
-    key,
-    value,
-    look,
-    bias,
-    channels,
-    value_channels,
-    integers,
-    numbers,
-    first,
-    last,
-    out,
-    statistics,
-    logsum,
-):
-    """The alpha pixels first .. last: values out, statistics (pixel, 4) and log of the sum of
-    exponentials."""
-    biased = len(bias) > 0
-    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
+def forward(call, share, out, statistics, logsum):
+    """Values, statistics (pixel, 4) and logarithm of the sum of exponentials of a share of alpha's pixels."""
+    biased = len(call.bias) > 0
+    block, counter, call = _block(call, share), pointer(share.counter), _call(call)
     out, statistics, logsum = pointer(out), pointer(statistics), pointer(logsum)
-    block = _block(look.samples, max(channels, value_channels), integers, numbers)
-    counts = block.tap_counts
-    for begin in range(first, last, BLOCK):
-        pixels = min(BLOCK, last - begin)
-        for i in range(pixels):
-            _unpack(query, (begin + i) * channels, channels, _of(block.query, i))
-            _find(begin + i, i, look, block)
-        _block_products(pixels, counts, block.query, block.rows, key, channels, block.by_key)
-        for i in range(pixels):
-            p = begin + i
-            logsum[p] = _weigh(p, i, look, bias, biased, block, from_index(statistics, 4 * p))
-        _block_sums(pixels, counts, block.by_key, block.rows, value, value_channels, block.query)
-        for i in range(pixels):
-            _pack(_of(block.query, i), value_channels, out, (begin + i) * value_channels)
+    begin = share.first + take(counter) * share.size
+    while begin < share.last:
+        end = min(begin + share.size, share.last)
+        for first in range(begin, end, BLOCK):
+            _forward(first, min(BLOCK, end - first), call, biased, block, out, statistics, logsum)
+        begin = share.first + take(counter) * share.size
 
 
 @compiled
-def _weigh(p, slot, look, bias, biased, block, statistics):
+def _forward(first, pixels, call, biased, block, out, statistics, logsum):
+    """A block of alpha's pixels."""
+    d, dv, counts = call.channels, call.value_channels, block.tap_counts
+    for i in range(pixels):
+        _unpack(call.query, (first + i) * d, d, _of(block.query, i))
+        _find(first + i, i, call.look, block)
+    _block_products(pixels, counts, block.query, block.rows, call.key, d, block.by_key)
+    for i in range(pixels):
+        p = first + i
+        logsum[p] = _weigh(p, i, call, biased, block, from_index(statistics, 4 * p))
+    _block_sums(pixels, counts, block.by_key, block.rows, call.value, dv, block.query)
+    for i in range(pixels):
+        _pack(_of(block.query, i), dv, out, (first + i) * dv)
+
+
+@compiled
+def _weigh(p, slot, call, biased, block, statistics):
     """From the inner products of pixel p's taps to their weights, in the same place; gives the logarithm of
     the sum of exponentials."""
-    samples, n, by_tap = _samples(block, slot, look.samples), block.sample_counts[slot], _of(block.by_key, slot)
+    look, by_tap = call.look, _of(block.by_key, slot)
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
     logsum = zero(by_tap) - np.float32(np.inf)
     if n > 0:
-        _score(p, slot, look, bias, biased, block)
+        _score(p, slot, call, biased, block)
         logsum = _softmax(n, samples)
     if logsum == -np.inf:
         block.tap_counts[slot] = 0
@@ -1167,15 +1240,6 @@ def _weigh(p, slot, look, bias, biased, block, statistics):
         _distribute(n, block.tap_counts[slot], look, samples, samples.weight, by_tap)
         _measure(n, samples, statistics)
     return logsum
-
-
-class Scratch(NamedTuple):
-    """What backward leaves for `scatter`: for each pixel of a piece of alpha its taps and their weights."""
-
-    counts: np.ndarray
-    rows: np.ndarray
-    by_key: np.ndarray
-    by_value: np.ndarray
 
 
 @compiled
@@ -1237,127 +1301,86 @@ def _move(p, slot, look, block, statistics, upstream, out):
 
 
 @compiled(nogil=True, cache=True)
-def backward(
-    query,
-    key,
-    value,
-    look,
-    bias,
-    channels,
-    value_channels,
-    logsum,
-    statistics,
-    value_upstream,
-    statistics_upstream,
-    integers,
-    numbers,
-    first,
-    last,
-    scratch_first,
-    stride,
-    scratch,
-    query_out,
-    points_out,
-    bias_out,
-):
-    """The alpha pixels first .. last: gradients by query, points and bias, and what `scatter` needs for the
-    rest.
-
-    Outputs that are not wanted have length 0; points_out and bias_out come zeroed.
-    """
-    biased, wants_points, wants_bias = len(bias) > 0, len(points_out) > 0, len(bias_out) > 0
-    wants_query = len(query_out) > 0
-    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
-    statistics, value_upstream = pointer(statistics), pointer(value_upstream)
-    statistics_upstream, query_out, points_out, bias_out = (
-        pointer(statistics_upstream),
-        pointer(query_out),
-        pointer(points_out),
-        pointer(bias_out),
+def backward(call, saved, share, scratch, gradients):
+    """Gradients of a share of alpha's pixels, and what `scatter` needs for those of beta's."""
+    biased = len(call.bias) > 0
+    block, counter, call = _block(call, share), pointer(share.counter), _call(call)
+    saved = Saved(
+        pointer(saved.statistics),
+        pointer(saved.logsum),
+        pointer(saved.value_upstream),
+        pointer(saved.statistics_upstream),
     )
-    block = _block(look.samples, max(channels, value_channels), integers, numbers)
-    for begin in range(first, last, BLOCK):
-        pixels, left = min(BLOCK, last - begin), _left(scratch, begin - scratch_first, stride)
-        counts, rows = from_index(pointer(scratch.counts), begin - scratch_first), left.rows
-        block = _with_rows(block, counts, rows)
-        for i in range(pixels):
-            p = begin + i
-            _unpack(query, p * channels, channels, _of(block.query, i))
-            _unpack(value_upstream, p * value_channels, value_channels, _of(block.upstream, i))
-            counts[i] = 0
-            if logsum[p] > -np.inf:
-                _find(p, i, look, block)
-        _block_products(pixels, counts, block.query, rows, key, channels, block.by_key)
-        _block_products(pixels, counts, block.upstream, rows, value, value_channels, block.by_value)
-        for i in range(pixels):
-            p = begin + i
-            if counts[i] > 0:
-                own, upstream = from_index(statistics, 4 * p), from_index(statistics_upstream, 4 * p)
-                _reweigh(p, i, look, bias, biased, block, logsum[p], own, upstream)
-                _leave(i, look, block, left)
-                if wants_points:
-                    _move(p, i, look, block, own, upstream, points_out)
-                if wants_bias:
-                    _leave_bias(p, i, look, block, bias_out)
-        if wants_query:
-            _block_sums(pixels, counts, left.by_key, rows, key, channels, block.query)
-            for i in range(pixels):
-                _pack(_of(block.query, i), channels, query_out, (begin + i) * channels)
-
-
-class Left(NamedTuple):
-    """The part of `Scratch` that belongs to a block."""
-
-    rows: Column
-    by_key: Column
-    by_value: Column
+    begin = share.first + take(counter) * share.size
+    while begin < share.last:
+        end = min(begin + share.size, share.last)
+        for first in range(begin, end, BLOCK):
+            _backward(first, min(BLOCK, end - first), call, biased, saved, block, scratch, gradients)
+        begin = share.first + take(counter) * share.size
 
 
 @compiled
-def _left(scratch, slot, stride):
-    return Left(
-        Column(from_index(pointer(scratch.rows), slot * stride), stride),
-        Column(from_index(pointer(scratch.by_key), slot * stride), stride),
-        Column(from_index(pointer(scratch.by_value), slot * stride), stride),
-    )
+def _backward(first, pixels, call, biased, saved, block, scratch, gradients):
+    """A block of alpha's pixels."""
+    d, dv = call.channels, call.value_channels
+    block, by_key, by_value = _left(first, block, scratch)
+    for i in range(pixels):
+        p = first + i
+        _unpack(call.query, p * d, d, _of(block.query, i))
+        _unpack(saved.value_upstream, p * dv, dv, _of(block.upstream, i))
+        block.tap_counts[i] = 0
+        if saved.logsum[p] > -np.inf:
+            _find(p, i, call.look, block)
+    _block_products(pixels, block.tap_counts, block.query, block.rows, call.key, d, block.by_key)
+    _block_products(pixels, block.tap_counts, block.upstream, block.rows, call.value, dv, block.by_value)
+    for i in range(pixels):
+        if block.tap_counts[i] > 0:
+            _blame_pixel(first + i, i, call, biased, saved, block, gradients)
+            _leave(i, call.look, block, _of(by_key, i), _of(by_value, i))
+    if len(gradients.query) > 0:
+        _block_sums(pixels, block.tap_counts, by_key, block.rows, call.key, d, block.query)
+        for i in range(pixels):
+            _pack(_of(block.query, i), d, pointer(gradients.query), (first + i) * d)
 
 
 @compiled
-def _with_rows(block, counts, rows):
-    """A block whose taps are put elsewhere."""
-    return Block(
+def _left(first, block, scratch):
+    """A block whose taps are put where `scatter` finds them, and where their weights go."""
+    i, stride = first - scratch.first, scratch.stride
+    block = Block(
         block.sample_counts,
-        counts,
+        from_index(pointer(scratch.counts), i),
         block.integers,
         block.numbers,
-        rows,
+        Column(from_index(pointer(scratch.rows), i * stride), stride),
         block.by_key,
         block.by_value,
         block.query,
         block.upstream,
     )
+    by_key = Column(from_index(pointer(scratch.by_key), i * stride), stride)
+    return block, by_key, Column(from_index(pointer(scratch.by_value), i * stride), stride)
 
 
 @compiled
-def _reweigh(p, slot, look, bias, biased, block, logsum, statistics, upstream):
-    """The weights of pixel p's samples again, and the gradients by them and by the scores."""
-    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
-    _score(p, slot, look, bias, biased, block)
-    _exponentiate(n, samples, logsum)
-    _interpolate(n, block.tap_counts[slot], look, samples, _of(block.by_value, slot), samples.slope)
+def _blame_pixel(p, slot, call, biased, saved, block, gradients):
+    """Pixel p's weights again, and the gradients by them, by the scores, by points and bias."""
+    samples, n = _samples(block, slot, call.look.samples), block.sample_counts[slot]
+    statistics, upstream = from_index(saved.statistics, 4 * p), from_index(saved.statistics_upstream, 4 * p)
+    _score(p, slot, call, biased, block)
+    _exponentiate(n, samples, saved.logsum[p])
+    _interpolate(n, block.tap_counts[slot], call.look, samples, _of(block.by_value, slot), samples.slope)
     _blame(n, samples, statistics, upstream)
+    if len(gradients.points) > 0:
+        _move(p, slot, call.look, block, statistics, upstream, pointer(gradients.points))
+    if len(gradients.bias) > 0:
+        for j in range(n):
+            gradients.bias[p * call.look.samples + samples.index[j]] = samples.score_slope[j]
 
 
 @compiled
-def _leave(slot, look, block, left):
-    """What `scatter` needs."""
+def _leave(slot, look, block, by_key, by_value):
+    """What `scatter` needs of a pixel."""
     samples, n, m = _samples(block, slot, look.samples), block.sample_counts[slot], block.tap_counts[slot]
-    _distribute(n, m, look, samples, samples.weight, _of(left.by_value, slot))
-    _distribute(n, m, look, samples, samples.score_slope, _of(left.by_key, slot))
-
-
-@compiled
-def _leave_bias(p, slot, look, block, out):
-    samples = _samples(block, slot, look.samples)
-    for j in range(block.sample_counts[slot]):
-        out[p * look.samples + samples.index[j]] = samples.score_slope[j]
+    _distribute(n, m, look, samples, samples.weight, by_value)
+    _distribute(n, m, look, samples, samples.score_slope, by_key)
