@@ -185,7 +185,7 @@ def _channel_tasks(
     if not out.numel():
         return []
     lanes = kernels.LANES
-    width = min(4, -(-channels // (lanes * torch.get_num_threads()))) * lanes
+    width = -(-channels // (lanes * torch.get_num_threads())) * lanes
     flat = _flat(out)
     return [
         partial(kernels.scatter, scratch, weights, last, x, channels, c, min(c + width, channels), flat)

@@ -647,36 +647,46 @@ def _most(counts, n):
 
 @compiled(nogil=True, cache=True)
 def scatter(scratch, weights, last, x, channels, first_channel, last_channel, out):
-    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels scratch.first .. last, in their order.
+    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels scratch.first .. last: those of a block
+    in turn, as in `_block_products`.
 
     `weights` is one of scratch's. One caller owns the channels first_channel .. last_channel, so the order of
     additions, and with it every bit, is the same however many callers share the work.
     """
     counts, rows = pointer(scratch.counts), pointer(scratch.rows)
     weights, x, out = pointer(weights), pointer(x), pointer(out)
-    for p in range(scratch.first, last):
-        begin = (p - scratch.first) * scratch.stride
-        end = begin + counts[p - scratch.first]
-        c = first_channel
-        while c + 4 * LANES <= last_channel:
-            _scatter_32(rows, weights, begin, end, x, p * channels + c, channels, c, out)
-            c += 4 * LANES
-        while c + LANES <= last_channel:
-            q = load(x, p * channels + c)
-            for t in range(begin, end):
-                r = rows[t] * channels + c
-                store(out, r, fma(splat(weights[t]), q, load(out, r)))
-            c += LANES
-        for tail in range(c, last_channel):
-            one = load_one(x, p * channels + tail)
-            for t in range(begin, end):
-                out[rows[t] * channels + tail] += weights[t] * one
+    for first in range(0, last - scratch.first, BLOCK):
+        end = min(first + BLOCK, last - scratch.first)
+        for t in range(0, _most(from_index(counts, first), end - first), CHUNK):
+            for i in range(first, end):
+                at = i * scratch.stride
+                taps = at + t, at + min(t + CHUNK, counts[i])
+                pixel = from_index(x, (scratch.first + i) * channels)
+                _scatter(rows, weights, taps, pixel, channels, first_channel, last_channel, out)
 
 
 @compiled
-def _scatter_32(rows, weights, begin, end, x, at, channels, c, out):
-    q0, q1, q2, q3 = load(x, at), load(x, at + 8), load(x, at + 16), load(x, at + 24)
-    for t in range(begin, end):
+def _scatter(rows, weights, taps, x, channels, first_channel, last_channel, out):
+    c = first_channel
+    while c + 4 * LANES <= last_channel:
+        _scatter_32(rows, weights, taps, x, channels, c, out)
+        c += 4 * LANES
+    while c + LANES <= last_channel:
+        q = load(x, c)
+        for t in range(taps[0], taps[1]):
+            r = rows[t] * channels + c
+            store(out, r, fma(splat(weights[t]), q, load(out, r)))
+        c += LANES
+    for tail in range(c, last_channel):
+        one = load_one(x, tail)
+        for t in range(taps[0], taps[1]):
+            out[rows[t] * channels + tail] += weights[t] * one
+
+
+@compiled
+def _scatter_32(rows, weights, taps, x, channels, c, out):
+    q0, q1, q2, q3 = load(x, c), load(x, c + 8), load(x, c + 16), load(x, c + 24)
+    for t in range(taps[0], taps[1]):
         w = splat(weights[t])
         r = rows[t] * channels + c
         store(out, r, fma(w, q0, load(out, r)))
