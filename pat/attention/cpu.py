@@ -161,9 +161,7 @@ def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
     integers, numbers = kernels.room(call.look.samples, max(call.channels, call.value_channels))
     number = call.look.fractions.dtype
     return [
-        kernels.Share(
-            first, last, size, counter, np.empty(integers, np.int32), np.empty(numbers, number)
-        )
+        kernels.Share(first, last, size, counter, np.empty(integers, np.int32), np.empty(numbers, number))
         for _ in range(min(torch.get_num_threads(), -(-(last - first) // size)))
     ]
 

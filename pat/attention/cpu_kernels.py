@@ -319,9 +319,7 @@ def add_totals(typing, array, index, a, b, c, d):
         lane = ir.VectorType(args[2].type.element, TAP_BLOCK)
         place = _at(builder, args[0], args[1], lane)
         stored = builder.load(place, align=array.dtype.bitwidth // 8)
-        builder.store(
-            builder.fadd(stored, builder.fadd(low, high)), place, align=array.dtype.bitwidth // 8
-        )
+        builder.store(builder.fadd(stored, builder.fadd(low, high)), place, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, a, b, c, d), code
