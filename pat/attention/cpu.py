@@ -22,9 +22,9 @@ from arraygeom.segments import sample_fractions
 from pat.attention import cpu_kernels as kernels
 from pat.attention.reference import EDGE_SLACK, Look
 
-PIECE_SAMPLES = 2**17
-"""Samples of one task: a millisecond or two."""
-SCRATCH_TAPS = 2**19
+PIECE_SAMPLES = 2**15
+"""Samples that a thread takes at a time: a fraction of a millisecond."""
+SCRATCH_TAPS = 2**20
 """Taps that backward holds at a time, 12 bytes each (16 in float64)."""
 
 
@@ -65,7 +65,7 @@ def backward(
     counted = _accumulated(query)
     call = _call(query, key, value, look, bias, nearest)
     upstream = _flat(_channels_last(cotangents[0]))
-    saved = kernels.Saved(*(_flat(t) for t in saved), upstream, _flat(cotangents[1].to(counted).contiguous()))
+    found = kernels.Saved(_flat(saved[0]), _flat(saved[1]), upstream, _flat(cotangents[1].to(counted).contiguous()))
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
     key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
@@ -78,7 +78,7 @@ def backward(
     step = len(scratch.counts)
     for first in range(0, b * ha * wa, step):
         last, here = min(first + step, b * ha * wa), scratch._replace(first=first)
-        _share([partial(kernels.backward, call, saved, s, here, gradients) for s in _shares(first, last, call)])
+        _share([partial(kernels.backward, call, found, s, here, gradients) for s in _shares(first, last, call)])
         _share(
             [
                 *_channel_tasks(here, here.by_key, last, call.query, d, key_out),
@@ -146,8 +146,9 @@ def _number(like: Tensor) -> type:
 
 
 def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> kernels.Call:
+    q, k, v = (_flat(_channels_last(t)) for t in (query, key, value))
     return kernels.Call(
-        *(_flat(_channels_last(t)) for t in (query, key, value)),
+        *(q, k, v),
         _geometry(look, query, key, nearest),
         _flat(_bias(bias, _accumulated(query))),
         query.shape[1],

@@ -365,8 +365,8 @@ def _by_position(s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height
 
 @compiled
 def _mean_slope(
-    q, g, key, value, points, mask, fractions, bias, statistics, statistics_upstream, p, place, first, alive, lse, height,
-    width, samples, c, cv, D, DV, PIXELS: tl.constexpr, STRAIGHT, NEAREST, BIASED, NUMBER: tl.constexpr,
+    q, g, key, value, points, mask, fractions, bias, statistics, statistics_upstream, p, place, first, alive, lse,
+    height, width, samples, c, cv, D, DV, PIXELS: tl.constexpr, STRAIGHT, NEAREST, BIASED, NUMBER: tl.constexpr,
 ):  # fmt: skip
     """The first walk: the mean of the gradients by the weights, and which sample weighs most."""
     mean_x, mean_y, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
