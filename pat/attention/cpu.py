@@ -29,14 +29,14 @@ SCRATCH_TAPS = 2**20
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
+    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4); log of the sum of exponentials (b,
-    ha, wa)."""
+    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
+    the sum of exponentials (b, ha, wa)."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
     out = _new(b, ha, wa, value.shape[1], dtype=query.dtype)
-    statistics = _new(b, ha, wa, 4, dtype=counted)
+    statistics = _new(*((b, ha, wa, 4) if measured else (0,)), dtype=counted)
     logsum = _new(b, ha, wa, dtype=counted)
     call = _call(query, key, value, look, bias, nearest)
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
@@ -65,7 +65,8 @@ def backward(
     counted = _accumulated(query)
     call = _call(query, key, value, look, bias, nearest)
     upstream = _flat(_channels_last(cotangents[0]))
-    found = kernels.Saved(_flat(saved[0]), _flat(saved[1]), upstream, _flat(cotangents[1].to(counted).contiguous()))
+    statistics, pulls = (t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous()))
+    found = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(pulls))
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
     key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()

@@ -740,7 +740,7 @@ class Share(NamedTuple):
 
 
 class Saved(NamedTuple):
-    """What forward found, and the gradients by what it gave."""
+    """What forward found, and the gradients by what it gave. Statistics may be of one pixel, for all."""
 
     statistics: Any
     logsum: Any
@@ -1181,9 +1181,13 @@ def _exponentiate(n, samples, top):
 
 
 @compiled
-def _measure(n, samples, statistics):
-    """Expected position, spread and largest of the weights, which are padded with 0."""
+def _measure(slot, look, block, statistics):
+    """Expected position, spread and largest of the weights, which are padded with 0; all 0 without taps."""
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
     nothing = zero(samples.x)
+    if block.tap_counts[slot] == 0:
+        _fill(statistics, 0, 4, nothing)
+        return
     x = y = squared = peak = splat(nothing)
     for j in range(0, n, LANES):
         w = load(samples.weight, j)
@@ -1203,7 +1207,9 @@ def _measure(n, samples, statistics):
 
 @compiled(nogil=True, cache=True)
 def forward(call, share, out, statistics, logsum):
-    """Values, statistics (pixel, 4) and logarithm of the sum of exponentials of a share of alpha's pixels."""
+    """Values, statistics (pixel, 4; if it has a length) and logarithm of the sum of exponentials of a share of
+    alpha's pixels."""
+    measured = len(statistics) > 0
     biased = len(call.bias) > 0
     block, counter, call = _block(call, share), pointer(share.counter), _call(call)
     out, statistics, logsum = pointer(out), pointer(statistics), pointer(logsum)
@@ -1211,12 +1217,12 @@ def forward(call, share, out, statistics, logsum):
     while begin < share.last:
         end = min(begin + share.size, share.last)
         for first in range(begin, end, BLOCK):
-            _forward(first, min(BLOCK, end - first), call, biased, block, out, statistics, logsum)
+            _forward(first, min(BLOCK, end - first), call, biased, measured, block, out, statistics, logsum)
         begin = share.first + take(counter) * share.size
 
 
 @compiled
-def _forward(first, pixels, call, biased, block, out, statistics, logsum):
+def _forward(first, pixels, call, biased, measured, block, out, statistics, logsum):
     """A block of alpha's pixels."""
     d, dv, counts = call.channels, call.value_channels, block.tap_counts
     for i in range(pixels):
@@ -1225,14 +1231,16 @@ def _forward(first, pixels, call, biased, block, out, statistics, logsum):
     _block_products(pixels, counts, block.query, block.rows, call.key, d, block.by_key)
     for i in range(pixels):
         p = first + i
-        logsum[p] = _weigh(p, i, call, biased, block, from_index(statistics, 4 * p))
+        logsum[p] = _weigh(p, i, call, biased, block)
+        if measured:
+            _measure(i, call.look, block, from_index(statistics, 4 * p))
     _block_sums(pixels, counts, block.by_key, block.rows, call.value, dv, block.query)
     for i in range(pixels):
         _pack(_of(block.query, i), dv, out, (first + i) * dv)
 
 
 @compiled
-def _weigh(p, slot, call, biased, block, statistics):
+def _weigh(p, slot, call, biased, block):
     """From the inner products of pixel p's taps to their weights, in the same place; gives the logarithm of
     the sum of exponentials."""
     look, by_tap = call.look, _of(block.by_key, slot)
@@ -1243,10 +1251,8 @@ def _weigh(p, slot, call, biased, block, statistics):
         logsum = _softmax(n, samples)
     if logsum == -np.inf:
         block.tap_counts[slot] = 0
-        _fill(statistics, 0, 4, zero(statistics))
     else:
         _distribute(n, block.tap_counts[slot], look, samples, samples.weight, by_tap)
-        _measure(n, samples, statistics)
     return logsum
 
 
@@ -1313,6 +1319,7 @@ def backward(call, saved, share, scratch, gradients):
     """Gradients of a share of alpha's pixels, and what `scatter` needs for those of beta's."""
     biased = len(call.bias) > 0
     block, counter, call = _block(call, share), pointer(share.counter), _call(call)
+    step = 4 if len(saved.statistics) > 4 else 0
     saved = Saved(
         pointer(saved.statistics),
         pointer(saved.logsum),
@@ -1323,12 +1330,12 @@ def backward(call, saved, share, scratch, gradients):
     while begin < share.last:
         end = min(begin + share.size, share.last)
         for first in range(begin, end, BLOCK):
-            _backward(first, min(BLOCK, end - first), call, biased, saved, block, scratch, gradients)
+            _backward(first, min(BLOCK, end - first), call, biased, saved, step, block, scratch, gradients)
         begin = share.first + take(counter) * share.size
 
 
 @compiled
-def _backward(first, pixels, call, biased, saved, block, scratch, gradients):
+def _backward(first, pixels, call, biased, saved, step, block, scratch, gradients):
     """A block of alpha's pixels."""
     d, dv = call.channels, call.value_channels
     block, by_key, by_value = _left(first, block, scratch)
@@ -1343,7 +1350,7 @@ def _backward(first, pixels, call, biased, saved, block, scratch, gradients):
     _block_products(pixels, block.tap_counts, block.upstream, block.rows, call.value, dv, block.by_value)
     for i in range(pixels):
         if block.tap_counts[i] > 0:
-            _blame_pixel(first + i, i, call, biased, saved, block, gradients)
+            _blame_pixel(first + i, i, call, biased, saved, step, block, gradients)
             _leave(i, call.look, block, _of(by_key, i), _of(by_value, i))
     if len(gradients.query) > 0:
         _block_sums(pixels, block.tap_counts, by_key, block.rows, call.key, d, block.query)
@@ -1371,10 +1378,10 @@ def _left(first, block, scratch):
 
 
 @compiled
-def _blame_pixel(p, slot, call, biased, saved, block, gradients):
+def _blame_pixel(p, slot, call, biased, saved, step, block, gradients):
     """Pixel p's weights again, and the gradients by them, by the scores, by points and bias."""
     samples, n = _samples(block, slot, call.look.samples), block.sample_counts[slot]
-    statistics, upstream = from_index(saved.statistics, 4 * p), from_index(saved.statistics_upstream, 4 * p)
+    statistics, upstream = from_index(saved.statistics, step * p), from_index(saved.statistics_upstream, step * p)
     _score(p, slot, call, biased, block)
     _exponentiate(n, samples, saved.logsum[p])
     _interpolate(n, block.tap_counts[slot], call.look, samples, _of(block.by_value, slot), samples.slope)

@@ -29,7 +29,7 @@ FIXED_BITS = 61
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
+    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `cpu.forward`."""
     b, _, ha, wa = query.shape
@@ -39,7 +39,7 @@ def forward(
     logsum = query.new_empty(b, ha, wa, dtype=counted)
     inputs, options = _call(query, key, value, look, bias, nearest)
     _forward[_programs(query)](*inputs, out, statistics, logsum, **options)
-    return out.permute(0, 3, 1, 2), statistics, logsum
+    return out.permute(0, 3, 1, 2), statistics if measured else statistics.new_empty(0), logsum
 
 
 def backward(
@@ -56,7 +56,10 @@ def backward(
     """As `cpu.backward`."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
-    upstream, statistics_upstream = _channels_last(cotangents[0]), cotangents[1].to(counted).contiguous()
+    upstream = _channels_last(cotangents[0])
+    statistics, statistics_upstream = (
+        t.contiguous() if t.numel() else t.new_zeros(b, ha, wa, 4) for t in (saved[0], cotangents[1].to(counted))
+    )
     fixed = torch.are_deterministic_algorithms_enabled()
     scales = _scales(query, key, value, upstream, statistics_upstream) if fixed else query.new_ones(2, dtype=counted)
     sums = torch.int64 if fixed else counted
@@ -67,7 +70,7 @@ def backward(
     inputs, options = _call(query, key, value, look, bias, nearest)
     _backward[_programs(query)](
         *inputs,
-        *(saved[0], saved[1], upstream, statistics_upstream, scales),
+        *(statistics, saved[1], upstream, statistics_upstream, scales),
         *(query_out, *pictures, points_out, bias_out),
         **options,
         WANTS_BIAS=wanted[4],

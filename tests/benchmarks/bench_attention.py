@@ -117,7 +117,7 @@ def measure(job: dict) -> dict:
     before = _peak(device, reset=True)
     times = [once()]
     peak = _peak(device)
-    while len(times) < REPEATS and sum(times) < ENOUGH:
+    while len(times) < job["repeats"] and sum(times) < ENOUGH:
         times.append(once())
     return {
         "time": statistics.median(times),
@@ -244,6 +244,7 @@ def job(device, method, interpolation, ha, wa, samples, backward, *, dtype="floa
         "dtype": dtype,
         "d": 64,
         "warm": method in ("cpu", "triton"),
+        "repeats": REPEATS,
     }
 
 

@@ -93,6 +93,16 @@ def test_any_number_of_threads_gives_the_same_bits(interpolation):
         assert all(torch.equal(a, b) for a, b in zip(result, results[0]))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_without_statistics_the_values_and_their_gradients_are_the_same(seed):
+    tensors, options = random_case(seed, dtype=torch.float32)
+    alone = call(attend, tensors, options, backend="cpu")
+    measured = call(attend_with_statistics, tensors, options, backend="cpu").value
+    assert torch.equal(alone, measured)
+    here, there = gradients([alone], tensors, seed=seed), gradients([measured], tensors, seed=seed)
+    assert all(torch.equal(here[name], there[name]) for name in tensors)
+
+
 def test_gradcheck_also_twice():
     tensors, options = random_case(21)
     options["interpolation"] = "bilinear"
@@ -103,6 +113,9 @@ def test_gradcheck_also_twice():
 
     assert gradcheck(run, tuple(small.values()), fast_mode=True)
     assert gradgradcheck(run, tuple(small.values()), fast_mode=True)
+    assert gradgradcheck(
+        lambda *values: call(attend, dict(zip(small, values)), options), tuple(small.values()), fast_mode=True
+    )
     with pytest.raises(RuntimeError, match="second-order"):
         gradgradcheck(lambda *values: run(*values, backend="cpu"), tuple(small.values()), fast_mode=True)
 
@@ -161,10 +174,11 @@ def test_whole_graph_compilation_and_autocast():
     subprocess.run([sys.executable, "-c", COMPILED], check=True)
 
 
-def test_the_operator_passes_torchs_own_checks():
+@pytest.mark.parametrize("measured", [True, False])
+def test_the_operator_passes_torchs_own_checks(measured):
     q, key, value = (torch.randn(2, 8, h, 5, requires_grad=True) for h in (3, 4, 4))
     points = (torch.rand(2, 3, 5, 2, 2) * 4).requires_grad_()
     mask = torch.rand(2, 3, 5, 1) > 0.3
     torch.library.opcheck(
-        torch.ops.pat.attend.default, (q, key, value, points, mask, None, 4, True, False, "cpu", False)
+        torch.ops.pat.attend.default, (q, key, value, points, mask, None, 4, True, False, measured, "cpu", False)
     )
