@@ -37,6 +37,26 @@ def test_random_cases_in_float32(seeds):
         assert max(worst.values()) < 1e-5, (seed, worst)
 
 
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
+@pytest.mark.parametrize(("d", "dv"), [(64, 130), (107, 64)])
+def test_more_samples_and_channels_than_are_worked_off_at_once(interpolation, d, dv):
+    torch.manual_seed(d)
+    tensors = {
+        name: torch.randn(1, *shape, dtype=torch.float64)
+        for name, shape in (("query", (d, 3, 37)), ("key", (d, 30, 40)), ("value", (dv, 30, 40)))
+    }
+    tensors["query"] /= d**0.5
+    tensors |= {name: torch.rand(3, 37, 2, dtype=torch.float64) * 42 - 1.5 for name in ("start", "end")}
+    tensors = {name: t.requires_grad_() for name, t in tensors.items()}
+    options = {"samples": 120, "mask": torch.rand(3, 37) > 0.1, "interpolation": interpolation}
+    found, expected = (
+        call(attend_with_statistics, tensors, options, backend=backend) for backend in ("cpu", "reference")
+    )
+    assert all(relative(a, b) < 1e-10 for a, b in zip(found, expected))
+    here, there = gradients(found, tensors, seed=1), gradients(expected, tensors, seed=1)
+    assert all(relative(here[name], there[name]) < 1e-10 for name in tensors)
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = random_case(3, dtype=torch.float32)
