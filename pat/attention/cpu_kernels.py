@@ -4,8 +4,9 @@ point.
 The work on one alpha pixel is done on *taps*, the pixels of beta that its samples touch. Neighbouring
 samples share them (a bilinear look-up has four, of which the next sample usually needs two again), so all
 work along the channels is done once a tap: inner products of the query with its taps, sums of taps with
-weights, and in backward the addition of the query to the taps' gradients. Everything else is scalar work on
-samples.
+weights, and in backward the addition of the query to the taps' gradients. Some neighbouring alpha pixels do so
+in turn, a few taps at a time, since they share most of them. Everything else is work on samples, eight at a
+time.
 
 Pictures come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
 integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the
@@ -848,7 +849,7 @@ def _lengths(samples):
 
 def room(samples, channels):
     """How many integers and how many numbers of scratch a task needs."""
-    n, m = samples + LANES, 4 * samples + 2 * LANES
+    n, m = _lengths.py_func(samples)
     return BLOCK * (3 * n + m + 2), BLOCK * (8 * n + 2 * m + 2 * channels)
 
 
