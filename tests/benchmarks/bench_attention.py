@@ -34,6 +34,7 @@ RESULTS = Path(__file__).with_name("RESULTS.md")
 REPEATS, ENOUGH = 9, 6.0
 """A measurement ends after so many repetitions or seconds, whichever comes first."""
 GIB = 2**30
+ONE_THREAD = "cpu, one thread"
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -91,7 +92,7 @@ METHODS = {
     "index": index_everything,
     "index, channels last": index_channels_last,
     "grid_sample": grid_sampled,
-} | {name: fused(name) for name in ("reference", "cpu", "triton")}
+} | {name: fused(name.split(",")[0]) for name in ("reference", "cpu", ONE_THREAD, "triton")}
 
 
 def measure(job: dict) -> dict:
@@ -99,6 +100,8 @@ def measure(job: dict) -> dict:
     device, dtype = job["device"], DTYPES[job["dtype"]]
     ha, wa, d, samples = job["ha"], job["wa"], job["d"], job["samples"]
     torch.manual_seed(0)
+    if job["method"] == ONE_THREAD:
+        torch.set_num_threads(1)
     q, k, v = (features(ha, wa, d, dtype, device).requires_grad_(job["backward"]) for _ in range(3))
     look, run = field(ha, wa, samples, device), METHODS[job["method"]]
     cotangent = torch.ones_like(q) if job["backward"] else None
@@ -181,6 +184,17 @@ def matmul_rate(device: str) -> float:
     return 2 * n**3 / _best(lambda: a @ a, device)
 
 
+def _rates(device: str) -> dict[bool, float]:
+    """Of all threads, and of one."""
+    threads = torch.get_num_threads()
+    every = matmul_rate(device)
+    torch.set_num_threads(1)
+    try:
+        return {False: every, True: matmul_rate(device)}
+    finally:
+        torch.set_num_threads(threads)
+
+
 def copy_bandwidth(device: str) -> float:
     """Bytes read and written a second."""
     a = torch.zeros(2**26 if device == "cpu" else 2**29, device=device)
@@ -220,6 +234,7 @@ def jobs(device: str, quick: bool) -> list[dict]:
         plan = [
             (SMALL, 80, "float32", [*BASELINES, *plain, *own], both),
             (LARGE, 80, "float32", [*BASELINES, *own], both),
+            (LARGE, 80, "float32", [(ONE_THREAD, "nearest"), (ONE_THREAD, "bilinear")], both[:1]),
         ]
         more = [(LARGE, 40), (LARGE, 640), ((800, 1280), 80)]
         plan += [] if quick else [(hw, samples, "float32", own, both) for hw, samples in more]
@@ -243,7 +258,7 @@ def job(device, method, interpolation, ha, wa, samples, backward, *, dtype="floa
         "backward": backward,
         "dtype": dtype,
         "d": 64,
-        "warm": method in ("cpu", "triton"),
+        "warm": method in ("cpu", ONE_THREAD, "triton"),
         "repeats": REPEATS,
     }
 
@@ -252,7 +267,7 @@ def obstacle(entry: dict) -> str | None:
     """Why an entry cannot be measured here, if so."""
     if entry["device"] == "cuda" and not torch.cuda.is_available():
         return "no GPU on this machine: not measured"
-    if entry["method"] in ("cpu", "triton", "reference"):
+    if entry["method"] in ("cpu", ONE_THREAD, "triton", "reference"):
         return None
     gathered = entry["ha"] * entry["wa"] * entry["samples"] * entry["d"] * DTYPES[entry["dtype"]].itemsize
     needed, free = gathered * (2 + 3 * entry["backward"]), _free(entry["device"])
@@ -273,8 +288,9 @@ def name(entry: dict) -> tuple[str, str, str, str]:
     return shape, "forward + backward" if entry["backward"] else "forward", entry["method"], entry["interpolation"]
 
 
-def row(entry: dict, done: dict, rate: float, bandwidth: float) -> str:
+def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
     """One line of the table."""
+    rate = rates[entry["method"] == ONE_THREAD]
     result, (shape, work, *_) = done[name(entry)], name(entry)
     start = f"| {' | '.join(name(entry))} |"
     if "failed" in result:
@@ -317,9 +333,12 @@ COLUMNS = (
 def table(device: str, *, quick: bool) -> list[str]:
     """Measures everything on a device, printing as it goes."""
     here = device == "cpu" or torch.cuda.is_available()
-    rate, bandwidth = (matmul_rate(device), copy_bandwidth(device)) if here else (1.0, 1.0)
+    rates, bandwidth = (_rates(device), copy_bandwidth(device)) if here else ({False: 1.0, True: 1.0}, 1.0)
     machine = f"{torch.get_num_threads()} threads" if device == "cpu" else torch.cuda.get_device_name() if here else ""
-    limits = f"{machine}: float32 matmul {rate / 1e12:.3f} TFLOP/s, copy {bandwidth / 1e9:.1f} GB/s (read and written)."
+    limits = (
+        f"{machine}: float32 matmul {rates[False] / 1e12:.3f} TFLOP/s (one thread {rates[True] / 1e12:.3f}), "
+        f"copy {bandwidth / 1e9:.1f} GB/s (read and written)."
+    )
     lines = [
         *("", f"## {device}", "", limits if here else "No GPU on this machine.", ""),
         *(f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"),
@@ -329,14 +348,14 @@ def table(device: str, *, quick: bool) -> list[str]:
     for entry in jobs(device, quick):
         reason = obstacle(entry)
         done[name(entry)] = {"failed": reason} if reason else in_own_process(entry)
-        lines.append(row(entry, done, rate, bandwidth))
+        lines.append(row(entry, done, rates, bandwidth))
         print(lines[-1], flush=True)
-    found = bars(done, rate) if device == "cpu" else []
+    found = bars(done, rates) if device == "cpu" else []
     print("\n".join(found), flush=True)
     return lines + found
 
 
-def bars(done: dict, rate: float) -> list[str]:
+def bars(done: dict, rates: dict) -> list[str]:
     """What was asked for, of the CPU, against what was measured."""
 
     def get(
@@ -346,6 +365,7 @@ def bars(done: dict, rate: float) -> list[str]:
         return done.get(name(entry), {}).get(what, math.nan)
 
     own = {(b, i): get("time", b, "cpu", i) for b in (False, True) for i in ("nearest", "bilinear")}
+    one = {i: get("time", False, ONE_THREAD, i) for i in ("nearest", "bilinear")}
     memory = {(b, n): get("extra", b, "cpu", samples=n) for b in (False, True) for n in (40, 80, 640)}
     unit = get("unit", False, "cpu")
     flops = 4 * LARGE[0] * LARGE[1] * 80 * 64
@@ -353,8 +373,10 @@ def bars(done: dict, rate: float) -> list[str]:
     asked = [
         ("nearest forward, times faster than (a)", get("time", False, "index") / own[False, "nearest"], ">=", 80),
         ("nearest forward + backward, times faster", get("time", True, "index") / own[True, "nearest"], ">=", 45),
-        ("nearest forward, of the matmul rate", flops / own[False, "nearest"] / rate, ">=", 0.3),
+        ("nearest forward, of the matmul rate", flops / own[False, "nearest"] / rates[False], ">=", 0.3),
+        ("the same with one thread, of one thread's rate", flops / one["nearest"] / rates[True], ">=", 0.3),
         ("bilinear forward, times nearest", own[False, "bilinear"] / own[False, "nearest"], "<=", 2),
+        ("the same with one thread", one["bilinear"] / one["nearest"], "<=", 2),
         ("extra memory, forward", memory[False, 80] / unit, "<=", 1.2),
         ("extra memory, forward + backward", memory[True, 80] / unit, "<=", 3),
         ("extra memory, forward, 640 over 40 samples", memory[False, 640] / memory[False, 40], "<=", 1.1),
