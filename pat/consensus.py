@@ -24,7 +24,7 @@ from arraygeom import Segments
 from arraygeom.sampling import sample
 
 from . import consensus_kernels as kernels
-from .attention.cpu import share
+from .threads import in_parallel
 
 FINE = 2
 """The consensus is found on pictures this many times smaller."""
@@ -128,12 +128,12 @@ def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray,
     reach = np.zeros(own.shape, np.float32)
     facts = np.ones((*own.shape, 3), np.float32)
     bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
-    share([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
+    in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
     tasks = []
     for i, (a, b) in enumerate(zip(own, other)):
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
         tasks += [partial(_block, views, box, labels, reach[i], facts[i]) for box in _blocks(a.shape, labels)]
-    share(tasks)
+    in_parallel(tasks)
     return reach, facts
 
 
@@ -178,7 +178,7 @@ def _spread_colour(alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segment
     def fill(picture: int, how: int) -> None:
         filled[picture, how] = _regressed(*planes[picture], COLOUR_FILLS[how])
 
-    share([partial(fill, i, j) for i in range(len(planes)) for j in range(FILLS)])
+    in_parallel([partial(fill, i, j) for i in range(len(planes)) for j in range(FILLS)])
     return torch.from_numpy(filled).to(alpha)
 
 
