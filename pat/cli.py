@@ -200,6 +200,40 @@ class Evaluate:
 
 
 @dataclass
+class Ablate:
+    """What knowing the rig is worth: the same weights on the same scenes with every family of receptive fields.
+
+    Scenes are layered photographs seen by unrectified rigs, alpha's focal length 1 to 3 times beta's.
+    Example: pat ablate --scenes 12 --out out/ablate
+    """
+
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs; those that scikit-image ships if none is given."""
+    scenes: int = 12
+    """How many scenes."""
+    hw: tuple[int, int] = (240, 320)
+    """Height and width of both pictures."""
+    seed: int = 0
+    """Of the scenes."""
+    out: Path = Path("out/ablate")
+    """Folder for ablation.md, ablation.csv and ablation.png."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .ablate import ablate, layered_cases
+        from .weights import load_weights
+
+        if self.scenes < 1:
+            raise ValueError(f"--scenes: {self.scenes}: give at least 1")
+        cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
+        ablate(load_weights(self.weights), cases, out=self.out)
+        print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
+        console.print(f"written: {self.out / 'ablation.md'}, ablation.csv and ablation.png beside it")
+
+
+@dataclass
 class Showcase:
     """Fuse real pictures: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
 
@@ -344,6 +378,7 @@ Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fuse, tyro.conf.subcommand("fuse")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
+    | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Train, tyro.conf.subcommand("train")]

@@ -67,6 +67,10 @@ class Consensus(NamedTuple):
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         return Consensus(self.reach[half], self.facts[half], self.colour[..., top:bottom, left:right])
 
+    def band(self, i: int) -> Consensus:
+        """The same of one band alone."""
+        return self._replace(colour=self.colour[:, :, i : i + 1])
+
 
 class _Geometry(NamedTuple):
     """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32."""

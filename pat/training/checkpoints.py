@@ -16,6 +16,7 @@ from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
 from pat.images import write_atomically
+from pat.weights import misfit
 
 FORMAT = "pat-checkpoint 1"
 KEPT = 2
@@ -43,9 +44,9 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
     for name, tensor in checkpoint.tensors.items():
         part, _, rest = name.partition("/")
         parts[part][rest] = tensor
-    own = {k: tuple(v.shape) for k, v in network.state_dict().items()}
-    if own != {k: tuple(v.shape) for k, v in parts["network"].items()}:
-        raise ValueError("the checkpoint is of another network: give the recipe it was made with, or another --out")
+    wrong = misfit(network, parts["network"])
+    if wrong:
+        raise ValueError(f"the checkpoint is of another network ({wrong}): give its own recipe, or another --out")
     network.load_state_dict(parts["network"])
     average.load_state_dict(parts["average"])
     state: dict[int, dict[str, Tensor]] = {}

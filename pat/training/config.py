@@ -11,6 +11,7 @@ from typing import Any, Literal
 import tyro
 import yaml
 
+from pat.bandwise import BandwisePATConfig
 from pat.guided import GuidedPATConfig
 from pat.images import write_text
 from pat.model import PATConfig
@@ -58,7 +59,7 @@ class TrainConfig:
     """Folder for weights, checkpoints, figures and pictures."""
     start: Path | None = None
     """File of weights to go on from."""
-    network: GuidedPATConfig | PATConfig = dataclasses.field(default_factory=GuidedPATConfig)
+    network: GuidedPATConfig | PATConfig | BandwisePATConfig = dataclasses.field(default_factory=GuidedPATConfig)
     steps: int = 4000
     """Steps of the whole run."""
     minutes: float = float("inf")

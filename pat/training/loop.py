@@ -20,11 +20,11 @@ from torch.utils._pytree import tree_map
 from arraygeom import ReceptiveField
 from pat.images import write_atomically
 from pat.model import AttentionEngine
-from pat.weights import NETWORKS, load_weights, save_weights
+from pat.weights import NETWORKS, Network, load_weights, save_weights
 
 from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
 from .config import TrainConfig, config_text, difference, parse_config, save_config
-from .losses import Network, Objective, validation
+from .losses import Objective, validation
 from .processes import Process, process
 from .samples import Sample, Source, alone, scenes
 from .watch import Watch

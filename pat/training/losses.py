@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
+from pat.bandwise import BandwisePAT
 from pat.guided import GuidedPAT, Seen
-from pat.model import PAT, Fused
+from pat.model import Fused
+from pat.weights import Network
 
 from .samples import Sample
-
-Network = PAT | GuidedPAT
 
 
 def picture_loss(image: Tensor, truth: Tensor) -> Tensor:
@@ -63,7 +63,7 @@ class Objective(nn.Module):
 
 def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Seen]]:
     """The network's answer, and what each beta told where it says."""
-    if isinstance(network, GuidedPAT):
+    if isinstance(network, (GuidedPAT, BandwisePAT)):
         return network.explain(given.alpha, given.betas, given.looks)
     return network(given.alpha, given.betas, given.looks), []
 

@@ -49,7 +49,7 @@ def test_the_papers_recipes_are_the_papers():
         ("batchs: 4", "c: batchs: unknown entry; did you mean 'batch'?"),
         ("recording: {gian: 1}", "c: recording.gian: unknown entry; did you mean 'gain'?"),
         ("network: {kind: PAT, dimm: 8}", "c: network.dimm: unknown entry; did you mean 'dim'?"),
-        ("network: {kind: Pat}", "c: network.kind: no network 'Pat' (there are: PAT, GuidedPAT)"),
+        ("network: {kind: Pat}", "c: network.kind: no network 'Pat' (there are: PAT, GuidedPAT, BandwisePAT)"),
         ("network: 3", "c: network: wanted entries such as kind: GuidedPAT, got 3"),
         ("batch: four", "c: batch: is 'four'; wanted a whole number"),
         ("batch: 4.5", "c: batch: is 4.5; wanted a whole number"),

@@ -62,9 +62,9 @@ def stopped(config, step, monkeypatch, what="_advance"):
 def test_a_run_leaves_what_it_says(whole):
     assert load_weights(whole.out / "best.safetensors").config == SMALL
     lines = [json.loads(line) for line in (whole.out / "log.jsonl").read_text().splitlines()]
-    assert [line["step"] for line in lines] == [6, 12]
-    assert len(losses(whole.out)) == 1 + 12
-    assert sorted(p.name for p in (whole.out / "pictures").iterdir()) == ["step-000006.png", "step-000012.png"]
+    assert [line["step"] for line in lines] == [4, 8]
+    assert len(losses(whole.out)) == 1 + 8
+    assert sorted(p.name for p in (whole.out / "pictures").iterdir()) == ["step-000004.png", "step-000008.png"]
     assert len(list((whole.out / "checkpoints").iterdir())) == 2
     again = load_weights(whole.out / "best.safetensors").state_dict()
     assert train(whole) == whole.out / "best.safetensors"
@@ -74,10 +74,10 @@ def test_a_run_leaves_what_it_says(whole):
 @pytest.mark.parametrize(
     ("step", "what"),
     [
-        (7, "_advance"),
-        (8, "_save"),
-        pytest.param(3, "_advance", marks=pytest.mark.slow),
-        pytest.param(12, "_validate", marks=pytest.mark.slow),
+        (5, "_advance"),
+        (6, "_save"),
+        pytest.param(2, "_advance", marks=pytest.mark.slow),
+        pytest.param(8, "_validate", marks=pytest.mark.slow),
     ],
 )
 def test_a_stopped_run_goes_on_bit_for_bit(step, what, folder, whole, monkeypatch):
@@ -161,23 +161,23 @@ def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatc
         assert kept.get_tensor("truth")[1].isnan().any()
         assert kept.get_tensor("betas/0").isfinite().all()
         assert kept.metadata()["samples"] == "[1]"
-    assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 4
+    assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
 
 
 def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
     """The system refuses to write, as on a full disk; the older checkpoint stays, and the run can go on from it."""
     config = replace(whole, out=folder / "full")
-    stopped(config, 6, monkeypatch)
+    stopped(config, 5, monkeypatch)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     room = 2 * (whole.out / "best.safetensors").stat().st_size
     resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
     try:
-        with pytest.raises(OSError, match=r"checkpoint of step 8 .* could not be written.*step-00000004") as caught:
+        with pytest.raises(OSError, match=r"checkpoint of step 6 .* could not be written.*step-00000003") as caught:
             train(config)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert "\n" not in str(caught.value)
-    assert [p.name for p in (config.out / "checkpoints").iterdir()] == ["step-00000004.safetensors"]
+    assert [p.name for p in (config.out / "checkpoints").iterdir()] == ["step-00000003.safetensors"]
     train(config)
     assert losses(config.out) == losses(whole.out)
 
