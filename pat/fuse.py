@@ -21,6 +21,7 @@ from arraygeom import (
     Curved,
     Epipolar,
     HomographyDisplacement,
+    Moved,
     Pair,
     Positions,
     ReceptiveField,
@@ -36,7 +37,8 @@ from arraygeom import (
     retaken,
 )
 from arraygeom.fields import pinhole_track
-from arraygeom.pixels import HW
+from arraygeom.pixels import HW, map_homogeneous
+from arraygeom.undistortion import pixels_between
 
 from .images import luminance
 from .model import Fused, FusionNetwork, Look
@@ -60,11 +62,15 @@ class FusedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Beta:
-    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look."""
+    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look.
+
+    `points` says where alpha's pixels are when beta records: elsewhere only if they move (`Moved`).
+    """
 
     picture: Tensor
     pair: Pair
     look: Look
+    points: Callable[[Tensor], Tensor]
 
 
 class Tile(NamedTuple):
@@ -81,7 +87,7 @@ def fuse(
     *,
     alpha: str,
     depth: tuple[float, float] | None = None,
-    field: ReceptiveField | None = None,
+    field: ReceptiveField | Mapping[str, ReceptiveField] | None = None,
     max_memory: float | str | None = None,
     match_levels: bool = False,
     progress: Progress | None = None,
@@ -100,7 +106,8 @@ def fuse(
         alpha: the camera whose view is wanted.
         depth: (near, far) in metres, instead of the rig's.
         field: where to look; by default the depth-bounded epipolar segment of calibrated cameras, the run of the
-            epipolar line around H x of those known by F, and a row of beta of those known only by size.
+            epipolar line around H x of those known by F, and a row of beta of those known only by size. Or a field for
+            each of some betas, by name.
         max_memory: bytes, or like "4GiB"; about what the work may take on top of the pictures. Default: no limit.
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
@@ -111,14 +118,16 @@ def fuse(
     """
     rig = rig if depth is None else rig.replace(depth=depth)
     _check(rig, images, alpha)
-    if any(_has_lens(rig[name]) for name in images) and not _follows_lenses(field):
+    fields = field if isinstance(field, Mapping) else dict.fromkeys(rig.betas(alpha), field)
+    if any(_has_lens(rig[name]) for name in images) and not any(map(_follows_lenses, fields.values())):
         straight_rig, straight = without_lenses(rig, images)
+        fields = {name: _straightened(f, rig[alpha], straight_rig[alpha]) for name, f in fields.items()}
         seen = fuse(
             network,
             straight_rig,
             straight,
             alpha=alpha,
-            field=field,
+            field={name: f for name, f in fields.items() if f is not None},
             max_memory=max_memory,
             match_levels=match_levels,
             progress=progress,
@@ -126,7 +135,9 @@ def fuse(
         return _bent(seen, straight[alpha], images[alpha], straight_rig[alpha], rig[alpha])
     own = _grey(images[alpha])[None]
     betas = [
-        _prepare(network, rig.pair(alpha, name), images[name][None], field, own if match_levels else None, name)
+        _prepare(
+            network, rig.pair(alpha, name), images[name][None], fields.get(name), own if match_levels else None, name
+        )
         for name in rig.betas(alpha)
         if name in images
     ]
@@ -158,7 +169,21 @@ def _has_lens(view: View) -> bool:
 
 
 def _follows_lenses(field: ReceptiveField | None) -> bool:
-    return isinstance(field.field if isinstance(field, Widened) else field, Curved)
+    while isinstance(field, Widened | Moved):
+        field = field.field
+    return isinstance(field, Curved)
+
+
+def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
+    """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
+    if not (isinstance(field, Moved) and isinstance(lens, Camera) and isinstance(pinhole, Camera) and _has_lens(lens)):
+        return field
+    x, seen = pixels_between(lens, pinhole)
+    rays, valid = lens.to(torch.float64).rays(field.points(x))
+    there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
+    known = seen & valid & (rays[..., 2] > 0)
+    step = torch.where(known[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
+    return Moved(field.field, step.movedim(-1, 0).to(field.displacement))
 
 
 def _bent(frame: FusedFrame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> FusedFrame:
@@ -259,11 +284,12 @@ def _prepare(
         pair, picture = _at_equal_pitch(pair, picture)
     if levels is not None:
         picture = levelled(picture, levels)
-    look = Look.along(field or default_field(pair), pair)
+    field = field or default_field(pair)
+    look = Look.along(field, pair)
     if not _reaches(look, pair):
         bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
         raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
-    return Beta(picture, pair, look)
+    return Beta(picture, pair, look, field.points if isinstance(field, Moved) else lambda x: x)
 
 
 def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
@@ -330,6 +356,7 @@ class Strip:
     look: Look
     pair: Pair
     offset: tuple[int, int]
+    points: Callable[[Tensor], Tensor]
 
 
 def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) -> Strip:
@@ -345,7 +372,7 @@ def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork)
             return Positions(found.xy - shift.to(x), found.mask)
         return Segments(found.start - shift.to(x), found.end - shift.to(x), found.valid)
 
-    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples), beta.pair, (x0, y0))
+    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples), beta.pair, (x0, y0), beta.points)
 
 
 def _touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
@@ -382,7 +409,7 @@ def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -
         if piece.pair.link is not None or not piece.pair.calibrated:
             continue
         seen = position[0, :, :h, :w].movedim(0, -1) + like.new_tensor(piece.offset)
-        found = depth_from_track(pinhole_track(piece.pair, x), seen.reshape(-1, 2))
+        found = depth_from_track(pinhole_track(piece.pair, piece.points(x)), seen.reshape(-1, 2))
         told = found.valid.reshape(h, w) & (confidence[0, :h, :w] > UNSEEN)
         weight = torch.where(told, confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
