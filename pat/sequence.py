@@ -9,7 +9,7 @@ and a frame depends on nothing but pictures: any one can be made alone, in any o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import pairwise
@@ -133,7 +133,7 @@ class Timeline:
         """The time between key frames, seconds."""
         return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
 
-    def keys(self) -> list[KeyFrame]:
+    def key_frames(self) -> list[KeyFrame]:
         """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an interval.
 
         Raises ValueError if there is none: then the recordings do not overlap.
@@ -206,6 +206,12 @@ class SequenceFusion:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")
         return mixed(own, sources)
 
+    def keys_of(self, frames: Iterable[int]) -> list[KeyFrame]:
+        """The key frames that some frames get their colour from."""
+        keys = self.timeline.key_frames()
+        found = {key.alpha: key for i in frames for key in self._around(i, keys)}
+        return [found[i] for i in sorted(found)]
+
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
@@ -260,7 +266,7 @@ class SequenceFusion:
 
     def _levelled(self, name: str, image: Tensor, i: int) -> Tensor:
         """Beta's picture with alpha's mean and spread, both over several key frames so that they do not flicker."""
-        keys = self.timeline.keys()
+        keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - NEIGHBOURS, 0) : nearest + NEIGHBOURS + 1]
         wanted = torch.tensor([_levels(self.grey(k.alpha)) for k in around]).mean(0)
@@ -325,7 +331,7 @@ def fuse_sequence(
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """
     job = SequenceFusion(network, rig, frames, alpha, speed, field, match_levels, options)
-    keys = job.timeline.keys()
+    keys = job.timeline.key_frames()
 
     @lru_cache(maxsize=2 * int(REACH) + 1)
     def colour(number: int) -> KeyColour:
