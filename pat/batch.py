@@ -27,7 +27,7 @@ from arraygeom.io.native import write as rig_text
 
 from .develop import read_views
 from .fuse import fuse
-from .images import read_image, write_atomically, write_text
+from .images import read_image, sweep, write_atomically, write_text
 from .jobs import HERE, OnError, Report, Task, Workers, run_tasks
 from .results import PictureKind, save_frame, view_of
 from .sequence import KeyColour, KeyFrame, PictureFiles, SequenceFusion
@@ -138,6 +138,8 @@ class Batch:
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
             for i in range(len(self.names)):
                 self.picture(i).unlink(missing_ok=True)
+        for folder in (self.out, self.out / KEYS):
+            sweep(folder)
         write_text(file, text)
         with write_atomically(self.out / KEYS / PLAN) as temporary:
             temporary.write_bytes(pickle.dumps(self))

@@ -31,7 +31,7 @@ from .train import TrainConfig, train
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from .fuse import FusedFrame, Tile
+    from .fuse import FusedFrame, Plan, Tile
 
 FIELDS: dict[str, Callable[[], ReceptiveField]] = {
     "epipolar": Epipolar,
@@ -393,12 +393,78 @@ class RigCommand:
         self.command.run()
 
 
+@dataclass
+class SystemsList:
+    """The paper's four arrays."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .systems import NAMES, load_system
+
+        for name in NAMES:
+            print(f"{name:12s} {load_system(name).title}")
+
+
+@dataclass
+class SystemsRun:
+    """Render a scene for an array, record it, fuse it, compare with the truth: PSNR, SSIM and pictures.
+
+    Example: pat systems run fast-slow --out out/fast-slow
+    """
+
+    name: Positional[str]
+    """One of those that `pat systems list` names."""
+    full: bool = False
+    """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
+    photos: Path | None = None
+    """Folder of photographs for the scene's surfaces; by default patterns and pictures that scikit-image ships."""
+    out: Path | None = None
+    """Folder for the results; by default out/systems/NAME."""
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+    max_memory: str | None = None
+    """Working memory allowed, like 4GiB."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .systems import load_system, run_system
+
+        out = self.out or Path("out/systems") / self.name
+        result = run_system(
+            self.name,
+            out,
+            full=self.full,
+            photos=self.photos,
+            weights=self.weights,
+            max_memory=self.max_memory,
+            say=lambda text: console.print(text, soft_wrap=True),
+        )
+        print(result.table, end="")
+        if not self.full and load_system(self.name).expected:
+            console.print(f"\nexpected:\n{load_system(self.name).expected}", markup=False)
+        console.print(f"written: {', '.join(map(str, result.written))}", soft_wrap=True)
+
+
+@dataclass
+class Systems:
+    """The paper's four arrays, each from a rendered scene to figures."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[SystemsList, tyro.conf.subcommand("list")] | Annotated[SystemsRun, tyro.conf.subcommand("run")]
+    ]
+
+    def run(self) -> None:
+        """Do it."""
+        self.command.run()
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fuse, tyro.conf.subcommand("fuse")]
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[Systems, tyro.conf.subcommand("systems")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
@@ -412,7 +478,10 @@ def fuse_frame(weights: str, rig: Rig, images: dict[str, Tensor], **options: Any
     def bar(tiles: Iterable[Tile], total: int) -> Iterable[Tile]:
         return track(tiles, "fusing", total=total, console=console)
 
-    return fuse(load_weights(weights), rig, images, progress=bar, **options)
+    def tell(planned: Plan) -> None:
+        console.print(f"plan: {planned}")
+
+    return fuse(load_weights(weights), rig, images, progress=bar, announce=tell, **options)
 
 
 def _numbers(values: tuple[float, float] | None, between: str = ", ") -> str:

@@ -30,16 +30,17 @@ OVER = 3.0
 def record_scene(stage: Stage) -> Recording:
     """One frame. The truth is in alpha's exposure, not cut at white."""
     rig, alpha = stage.rig, stage.alpha
-    raw, bands = {}, {}
+    raw, bands, lights = {}, {}, {}
     for name in rig.names:
         lit = light(stage, name)
         sensor = rig[name].sensor
         own = luminance(lit) if name == alpha else banded(lit, sensor.response)
         seen = own * light_of(sensor, rig[alpha].sensor)
+        lights[name] = own[0]
         raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name)).image[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
-    return Recording(raw, [coded(torch.cat([bands[name] for name in rig.betas(alpha)]))])
+    return Recording(raw, [coded(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
 
 
 def light(stage: Stage, name: str) -> Tensor:
