@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -31,7 +31,7 @@ from .train import TrainConfig
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from .fuse import FusedFrame, Tile
+    from .fuse import FusedFrame, Plan, Tile
 
 FIELDS: dict[str, Callable[[], ReceptiveField]] = {
     "epipolar": Epipolar,
@@ -81,9 +81,13 @@ class Demo:
 
 @dataclass
 class Fuse:
-    """Fuse one frame: a rig file and a picture of each camera in, one picture at alpha's view out.
+    """Fuse one frame: a rig file and a picture of each camera in, one picture at alpha's view out. Or many frames.
 
     Example: pat fuse --rig rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
+
+    With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the pictures, frames are fused one by one:
+    the first of each camera, the second, and so on. With --sequence the cameras have clocks of their own (frame_rate
+    and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
     """
 
     rig: Path
@@ -91,7 +95,7 @@ class Fuse:
     alpha: str
     """The camera whose view is wanted."""
     image: UseAppendAction[tuple[str, ...]]
-    """NAME=FILE, once for each camera."""
+    """NAME=FILE, once for each camera; or NAME=FOLDER, or NAME=PATTERN."""
     depth: tuple[float, float] | None = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Path = Path("out")
@@ -108,28 +112,68 @@ class Fuse:
     """Bits a channel of the fused picture: 8 or 16 coded as sRGB, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
     """Format of the fused picture."""
+    sequence: bool = False
+    """Frames in the order of time, the cameras not synchronised; also writes a video."""
+    frame_rate: UseAppendAction[tuple[str, ...]] = ()
+    """NAME=FRAMES A SECOND, instead of the rig's."""
+    time_offset: UseAppendAction[tuple[str, ...]] = ()
+    """NAME=SECONDS of the first frame after a common clock, instead of the rig's."""
+    speed: float | None = None
+    """How fast things move at most, pixels of alpha a second; by default estimated from alpha's frames."""
+    video: float = 25.0
+    """Frames a second of the video of a sequence; 0 for none."""
+    carry: bool = True
+    """Carry colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
+    resume: bool = False
+    """Fuse only the frames that are not in --out."""
+    on_error: Literal["stop", "skip"] = "stop"
+    """What to do when a frame cannot be fused (a corrupt picture, a full disk): stop, or report it and go on."""
+    workers: int = 1
+    """Processes on this machine, for many frames."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler whose workers fuse the frames, like tcp://host:8786."""
+    threads: int | None = None
+    """Threads in each process: 1 with several, else all cores."""
 
     def run(self) -> None:
         """Do it."""
-        from .develop import read_views
+        from .batch import find_pictures
         from .fuse import parse_bytes
-        from .results import save_frame, view_of
 
-        rig = Rig.load(self.rig)
+        if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
+            raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
+        if self.max_memory is not None:
+            parse_bytes(self.max_memory)
+        rig = self._rig()
         files = dict(_name_and_file(text) for text in self.image)
         if len(files) < len(self.image):
             raise ValueError("--image: a camera is given twice; give each camera one picture")
-        if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
-            raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
-        rig, images = read_views(rig, {rig.known(name): path for name, path in files.items()}, alpha=self.alpha)
-        if self.max_memory is not None:
-            parse_bytes(self.max_memory)
+        found = {rig.known(name): find_pictures(path, name=name) for name, path in files.items()}
+        if self.sequence or max(map(len, found.values())) > 1:
+            return self._many(rig, found)
+        self._one(rig, {name: paths[0] for name, paths in found.items()})
+
+    def _rig(self) -> Rig:
+        rig = Rig.load(self.rig)
+        rig = rig if self.depth is None else rig.replace(depth=self.depth)
+        for text in self.frame_rate:
+            name, rate = _name_and_number(text, "frame-rate")
+            rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
+        for text in self.time_offset:
+            name, offset = _name_and_number(text, "time-offset")
+            rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
+        return rig
+
+    def _one(self, rig: Rig, files: dict[str, Path]) -> None:
+        from .develop import read_views
+        from .results import save_frame, view_of
+
+        rig, images = read_views(rig, files, alpha=rig.known(self.alpha))
         frame = fuse_frame(
             self.weights,
             rig,
             images,
             alpha=self.alpha,
-            depth=self.depth,
             field=None if self.field == "auto" else FIELDS[self.field](),
             max_memory=self.max_memory,
             match_levels=self.match_levels,
@@ -137,6 +181,37 @@ class Fuse:
         view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
         written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
         console.print(f"written: {', '.join(map(str, written))}")
+
+    def _many(self, rig: Rig, files: dict[str, list[Path]]) -> None:
+        from .batch import Batch
+        from .jobs import Workers, cores
+
+        batch = Batch(
+            rig,
+            files,
+            rig.known(self.alpha),
+            self.out,
+            weights=self.weights,
+            sequence=self.sequence,
+            speed=self.speed,
+            field=None if self.field == "auto" else FIELDS[self.field](),
+            match_levels=self.match_levels,
+            max_memory=self.max_memory,
+            bits=self.bits,
+            kind=self.kind,
+            alone=not self.carry,
+        )
+        several = self.workers > 1 or self.scheduler is not None
+        report = batch.run(
+            workers=Workers(self.workers, self.scheduler, self.threads or (1 if several else cores())),
+            resume=self.resume,
+            on_error=self.on_error,
+            video=self.video if self.sequence and self.video and self.bits != 32 else None,
+            console=console,
+        )
+        console.print(f"{self.out}: {report}")
+        if report.failed:
+            sys.exit(1)
 
 
 @dataclass
@@ -374,6 +449,71 @@ class RigCommand:
         self.command.run()
 
 
+@dataclass
+class SystemsList:
+    """The paper's four arrays."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .systems import NAMES, load_system
+
+        for name in NAMES:
+            print(f"{name:12s} {load_system(name).title}")
+
+
+@dataclass
+class SystemsRun:
+    """Render a scene for an array, record it, fuse it, compare with the truth: PSNR, SSIM and pictures.
+
+    Example: pat systems run fast-slow --out out/fast-slow
+    """
+
+    name: Positional[str]
+    """One of those that `pat systems list` names."""
+    full: bool = False
+    """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
+    photos: Path | None = None
+    """Folder of photographs for the scene's surfaces; by default patterns and pictures that scikit-image ships."""
+    out: Path | None = None
+    """Folder for the results; by default out/systems/NAME."""
+    weights: str = "mono-colour"
+    """Name of weights in the package, or a file."""
+    max_memory: str | None = None
+    """Working memory allowed, like 4GiB."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .systems import load_system, run_system
+
+        out = self.out or Path("out/systems") / self.name
+        result = run_system(
+            self.name,
+            out,
+            full=self.full,
+            photos=self.photos,
+            weights=self.weights,
+            max_memory=self.max_memory,
+            say=lambda text: console.print(text, soft_wrap=True),
+        )
+        print(result.table, end="")
+        if not self.full and load_system(self.name).expected:
+            console.print(f"\nexpected:\n{load_system(self.name).expected}", markup=False)
+        console.print(f"written: {', '.join(map(str, result.written))}", soft_wrap=True)
+
+
+@dataclass
+class Systems:
+    """The paper's four arrays, each from a rendered scene to figures."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[SystemsList, tyro.conf.subcommand("list")] | Annotated[SystemsRun, tyro.conf.subcommand("run")]
+    ]
+
+    def run(self) -> None:
+        """Do it."""
+        self.command.run()
+
+
 Command = (
     Annotated[Demo, tyro.conf.subcommand("demo")]
     | Annotated[Fuse, tyro.conf.subcommand("fuse")]
@@ -381,6 +521,7 @@ Command = (
     | Annotated[Ablate, tyro.conf.subcommand("ablate")]
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[Systems, tyro.conf.subcommand("systems")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
@@ -394,7 +535,10 @@ def fuse_frame(weights: str, rig: Rig, images: dict[str, Tensor], **options: Any
     def bar(tiles: Iterable[Tile], total: int) -> Iterable[Tile]:
         return track(tiles, "fusing", total=total, console=console)
 
-    return fuse(load_weights(weights), rig, images, progress=bar, **options)
+    def tell(planned: Plan) -> None:
+        console.print(f"plan: {planned}")
+
+    return fuse(load_weights(weights), rig, images, progress=bar, announce=tell, **options)
 
 
 def _numbers(values: tuple[float, float] | None, between: str = ", ") -> str:
@@ -427,6 +571,14 @@ def _command(arguments: list[str]) -> Any:
         description="Fuse the pictures of an array of unlike cameras into one. --debug shows an error's traceback.",
         args=arguments,
     )
+
+
+def _name_and_number(text: str, option: str) -> tuple[str, float]:
+    name, _, number = text.partition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise ValueError(f"--{option}: '{text}' is not NAME=NUMBER, such as mono=30") from None
 
 
 def main(arguments: list[str] | None = None) -> None:

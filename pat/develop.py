@@ -89,6 +89,11 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
     return torch.from_numpy(colours).movedim(-1, 0).contiguous().to(raw)
 
 
+def light_of(sensor: Sensor, like: Sensor) -> float:
+    """The value (0..1 is up to white) that `sensor` gives to light that is 1 on `like`'s scale, in grey or green."""
+    return 1 / _light(sensor, like)[1]
+
+
 def _light(sensor: Sensor, like: Sensor) -> tuple[float, float, float]:
     """What to multiply linear red, green and blue with; a grey picture takes the middle one."""
     both = sensor.exposure is not None and like.exposure is not None

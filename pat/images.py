@@ -7,6 +7,7 @@ pictures), colours in the order red, green, blue. Files appear whole or not at a
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,6 +82,13 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what `write_atomically` left half-written in a folder because its process was killed."""
+    for path in folder.glob(".*"):
+        if re.fullmatch(r"\..*-[0-9a-f]{32}(\.\w+)?", path.name):
+            path.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

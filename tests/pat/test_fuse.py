@@ -79,6 +79,42 @@ def test_memory_decides_the_tiles():
         pat.fuse.plan(network, hw, [], 2.0**20)
 
 
+def test_tiles_are_those_with_the_least_work():
+    """No square tiles under the same limit make less; and a halo nearly as wide as the frame makes strips of it."""
+    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), 3.0 * 2**30
+
+    def work(tiles):
+        return sum((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
+
+    ours = pat.fuse.plan(network, hw, [], limit)
+    side = int(math.sqrt(limit / network.bytes_per_pixel)) - 2 * network.halo
+    assert work(ours) < 0.8 * work(tiles_of(hw, side, network.halo))
+    assert all(pat.fuse.working_memory(network, t, []) <= limit for t in ours)
+
+
+def test_the_plan_is_told_before_the_work():
+    told, rig = [], rig_of((50, 70), (40, 60))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
+    fuse(network_of("PAT"), rig, images, alpha="mono", announce=told.append)
+    assert str(told[0]).startswith("1 piece, 0.0")
+    assert told[0].seconds is None
+
+
+def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
+    """Beta sees ten times alpha's field: what fusing gives is the same, and what is worked on is small."""
+    hw, wide = (64, 96), (300, 440)
+    rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
+    pair = rig.pair("mono", "colour")
+    beta = pat.fuse._prepare(network, pair, texture(3, wide)[None], None, None, "colour")
+    assert beta.picture.shape[-1] * beta.picture.shape[-2] < 0.6 * 9 * math.prod(wide)
+    images = {"mono": texture(1, hw), "colour": texture(3, wide)}
+    cut = fuse(network, rig, images, alpha="mono")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pat.fuse, "_common_part", lambda pair, picture, field, network: (pair, picture))
+        whole = fuse(network, rig, images, alpha="mono")
+    assert (cut.image - whole.image).abs().mean() < 2e-3
+
+
 def test_bytes_are_read():
     assert parse_bytes("4GiB") == 4 * 2**30
     assert parse_bytes("500 MB") == 5e8
