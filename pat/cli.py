@@ -298,13 +298,46 @@ class Convert:
 
 
 @dataclass
+class Doctor:
+    """Find the usual mistakes in a rig, by features matched between one picture of each camera.
+
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, units, cameras swapped, pictures resized, cropped,
+    turned or mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --fix better.yaml
+    """
+
+    rig: Positional[Path]
+    """Rig file of any format known."""
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each of two or more cameras."""
+    fix: Path | None = None
+    """Write the repaired rig there, if a mistake is named."""
+    json: bool = False
+    """Print JSON instead of text."""
+
+    def run(self) -> None:
+        """Do it."""
+        from calib.doctor import diagnose
+
+        rig = Rig.load(self.rig)
+        found = diagnose(rig, named_pictures(rig, self.image))
+        print(found.as_json() if self.json else found.as_text())
+        if self.fix is not None and found.named.kind != "nothing":
+            found.repaired.save(self.fix)
+            console.print(f"written: {self.fix} ({found.named.words}: undone)")
+        elif self.fix is not None:
+            console.print("no rig written: no mistake was named")
+
+
+@dataclass
 class RigCommand:
-    """Look at rig files and convert them."""
+    """Look at rig files, convert them, find what is wrong with them and make them better."""
 
     command: OmitSubcommandPrefixes[
         Annotated[Info, tyro.conf.subcommand("info")]
         | Annotated[Convert, tyro.conf.subcommand("convert")]
         | Annotated[Show, tyro.conf.subcommand("show")]
+        | Annotated[Doctor, tyro.conf.subcommand("doctor")]
     ]
 
     def run(self) -> None:
@@ -344,6 +377,17 @@ def _spread_out(hw: tuple[int, int]) -> Tensor:
 
     spots = (pixel_grid((3, 4)) + 0.5) / pixel_grid((3, 4)).new_tensor([4, 3])
     return (spots * spots.new_tensor([hw[1], hw[0]])).floor().reshape(-1, 2)
+
+
+def named_pictures(rig: Rig, texts: Iterable[str]) -> dict[str, Tensor]:
+    """The pictures of `--image NAME=FILE`, by camera. Raises ValueError for a camera given twice, or not of the rig."""
+    from .images import read_image
+
+    pairs = [_name_and_file(text) for text in texts]
+    files = dict(pairs)
+    if len(files) < len(pairs):
+        raise ValueError("--image: a camera is given twice; give each camera one picture")
+    return {rig.known(name): read_image(path, name=name) for name, path in files.items()}
 
 
 def _name_and_file(text: str) -> tuple[str, Path]:

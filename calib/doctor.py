@@ -1,0 +1,261 @@
+"""What is wrong with a rig, from one picture of each camera: the usual mistakes, told apart by matched points."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from scipy.optimize import minimize_scalar
+from torch import Tensor
+
+from arraygeom import Camera, Pair, Rig
+from arraygeom.pixels import HW
+
+from .matches import Matches, match_cameras
+from .mistakes import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
+from .residuals import depths, epipolar_residuals, lines_basis
+
+MOST = 500
+"""Matches of a pair that are used."""
+FAR_OFF = 1000.0
+"""Pixels that a match counts as off its line at most, and one whose pixels have no ray."""
+UNSEEN = 0.2
+"""A misfit, in pixels, below which a rig has nothing wrong with it."""
+TRIMMED = 0.85
+"""The part of the points, those nearest to their lines, that figures are made of."""
+EQUAL = 0.02
+"""Explanations whose misfits differ by less, in pixels, cannot be told apart."""
+WRONG_WAY = 100.0
+"""Pixels of misfit that points behind the cameras, or outside the depth range, count for."""
+BETTER = {"half-pixel shift": 0.35, "one-pixel shift": 0.35, "distortion": 0.35}
+"""A mistake is named if undoing it leaves no more than this part of the misfit; else 0.5."""
+
+Pairs = Mapping[tuple[str, str], Matches]
+
+
+class Figures(NamedTuple):
+    """What matched points say of a rig.
+
+    off: median distance in pixels of a point from its epipolar line.
+    misfit: the part of it (root mean square, pixels) that is the rig's and not the matches' own.
+    front: share of the points that lie in front of both cameras, of those whose depth can be told.
+    inside: share of those in front that lie in the rig's depth range; NaN without one.
+    """
+
+    off: float
+    misfit: float
+    front: float
+    inside: float
+
+    @property
+    def badness(self) -> float:
+        """All of it in one number, pixels."""
+        return self.misfit + WRONG_WAY * ((self.front < 0.5) + (self.inside < 0.5))
+
+    def __str__(self) -> str:
+        parts = [f"{self.off:.2f} px off the lines, {self.misfit:.2f} px of it the rig's"]
+        if not math.isnan(self.front):
+            parts.append(f"{self.front:.0%} in front")
+        if not math.isnan(self.inside):
+            parts.append(f"{self.inside:.0%} within the depth range")
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the doctor found.
+
+    named: the mistake, or `NOTHING`. equal: other kinds of mistake that explain the pictures as well.
+    before, after: figures of the rig as given and of the repaired one. tried: all explanations, best first.
+    matches: how many points were used. healthy: the rig as given fits the pictures.
+    """
+
+    named: Remedy
+    equal: tuple[Remedy, ...]
+    before: Figures
+    after: Figures
+    tried: tuple[tuple[Remedy, Figures], ...]
+    matches: int
+    healthy: bool
+    repaired: Rig
+
+    @property
+    def verdict(self) -> str:
+        """In a sentence or two."""
+        if self.named.kind != "nothing":
+            others = "".join(f"; or: {remedy.words}" for remedy in self.equal)
+            return f"likely mistake: {self.named.words}{others}"
+        if self.healthy:
+            return "nothing wrong: the points lie on their lines as well as they can be located"
+        return (
+            f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these pictures: "
+            "it has drifted or was never better; `pat rig refine` may repair it"
+        )
+
+    def as_text(self) -> str:
+        """The verdict, and the figures before and after, as people read them."""
+        lines = [self.verdict, f"as given: {self.before}"]
+        if self.named.kind != "nothing":
+            lines.append(f"repaired: {self.after}")
+        return "\n".join([*lines, f"from {self.matches} points seen in two pictures"])
+
+    def as_json(self) -> str:
+        """The same for programs, with the ten best explanations."""
+        tried = [{"kind": r.kind, "words": r.words, **_plain(f)} for r, f in self.tried[:10]]
+        document = {
+            "verdict": self.verdict,
+            "mistake": self.named.kind,
+            "words": self.named.words,
+            "as_good": [{"mistake": remedy.kind, "words": remedy.words} for remedy in self.equal],
+            "healthy": self.healthy,
+            "matches": self.matches,
+            "before": _plain(self.before),
+            "after": _plain(self.after),
+            "tried": tried,
+        }
+        return json.dumps(document, indent=2)
+
+
+def _plain(figures: Figures) -> dict[str, float | None]:
+    return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
+
+
+def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosis:
+    """Which usual mistake, if any, was made with a rig, by one picture (C, H, W) of two or more of its cameras.
+
+    Raises ValueError, one line, for a camera that the rig lacks, fewer than two pictures, equal ones, and pictures in
+    which too few points match; and for a rig that says nothing of how its cameras are related.
+    """
+    for name in images:
+        rig.known(name)
+    sizes = {name: (int(image.shape[1]), int(image.shape[2])) for name, image in images.items()}
+    return diagnose_matches(rig, sizes, match_cameras(images))
+
+
+def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
+    """The same of points matched already, of pictures of these sizes."""
+    pairs = {names: _some(matches) for names, matches in pairs.items()}
+    tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
+    figures = _examine(rig, tried, pairs)
+    order = sorted(range(len(tried)), key=lambda i: figures[i].badness)
+    least = figures[order[0]].badness + EQUAL
+    best = next(i for i in range(len(tried)) if figures[i].badness <= least)
+    fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    healthy = fits and figures[0].badness < UNSEEN
+    if healthy or figures[best].badness > BETTER.get(tried[best].kind, 0.5) * figures[0].badness:
+        best = 0
+    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].badness <= least and best}
+    equal.pop(tried[best].kind, None)
+    table = tuple((tried[i], figures[i]) for i in order)
+    count = sum(len(matches.alpha) for matches in pairs.values())
+    repaired = tried[best].repair(rig)
+    return Diagnosis(tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired)
+
+
+def _some(matches: Matches) -> Matches:
+    """At most `MOST` of them, evenly through the list."""
+    step = max(1, -(-len(matches.alpha) // MOST))
+    return Matches(matches.alpha[::step], matches.beta[::step])
+
+
+def _examine(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[Figures]:
+    """The figures of every explanation, from the same points: those that agree under the best of them."""
+    off = [_off_lines(remedy.repair(rig), pairs) for remedy in tried]
+    inliers, floor = _agreement(rig, tried, off, pairs)
+    return [_figures(remedy.repair(rig), pairs, o[inliers], floor) for remedy, o in zip(tried, off)]
+
+
+def _off_lines(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
+    """Signed distances in pixels of all points of all pairs from their lines, in beta."""
+    parts = []
+    for (a, b), matches in pairs.items():
+        _, line, valid = epipolar_residuals(rig.pair(a, b), matches)
+        parts.append(torch.where(valid, line, FAR_OFF).nan_to_num(FAR_OFF).clamp(-FAR_OFF, FAR_OFF))
+    return torch.cat(parts).detach()
+
+
+def _agreement(rig: Rig, tried: Sequence[Remedy], off: Sequence[Tensor], pairs: Pairs) -> tuple[Tensor, float]:
+    """Which points agree with some pose of the cameras, and their mean square distance then, in square pixels.
+
+    The pose is free, so only the lens makes a difference: of the explanations that change it, the best is taken.
+    """
+    fits = []
+    for remedy, o in zip(tried, off):
+        if remedy.kind in ("nothing", "distortion"):
+            repaired = remedy.repair(rig)
+            lengths = [len(matches.alpha) for matches in pairs.values()]
+            left = [_beyond_pose(repaired.pair(*n), m, r) for (n, m), r in zip(pairs.items(), o.split(lengths))]
+            fits.append(torch.cat(left))
+    left_over = min(fits, key=lambda e: float(e.abs().median()))
+    inliers = left_over.abs() <= max(4 * float(left_over.abs().median()), 0.2)
+    return inliers, _trimmed_square(left_over[inliers])
+
+
+def _trimmed_square(off: Tensor) -> float:
+    """The mean square of all but the largest."""
+    squares = off.square().sort().values
+    return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
+
+
+def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
+    """What of the distances no change of F explains, to first order; robustly."""
+    basis = lines_basis(pair, matches)
+    weight = torch.ones_like(off)
+    left = off
+    for _ in range(8):
+        solution = torch.linalg.lstsq(weight[:, None] * basis, (weight * off)[:, None], driver="gelsd").solution
+        left = off - (basis @ solution)[:, 0]
+        scale = left.abs().median().clamp(min=1e-3)
+        weight = 1 / (1 + (left / (2 * scale)).square())
+    return left
+
+
+def _figures(rig: Rig, pairs: Pairs, off: Tensor, floor: float) -> Figures:
+    misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
+    depth, front = [], []
+    for (a, b), matches in pairs.items():
+        pair = rig.pair(a, b)
+        if pair.calibrated:
+            seen = depths(pair, matches)
+            depth.append(seen.depth[seen.known])
+            front.append(seen.front[seen.known])
+    known = torch.cat(front) if front else torch.zeros(0, dtype=torch.bool)
+    share = float(known.double().mean()) if len(known) >= 10 else math.nan
+    return Figures(float(off.abs().median()), misfit, share, _inside(rig, depth, known))
+
+
+def _inside(rig: Rig, depth: Sequence[Tensor], front: Tensor) -> float:
+    if rig.depth is None or int(front.sum()) < 10:
+        return math.nan
+    near, far = (float(bound) for bound in rig.depth)
+    found = torch.cat(list(depth))[front]
+    return float(((found > 0.5 * near) & (found < 2 * far)).double().mean())
+
+
+def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remedy]:
+    """The distortion that would explain the points best, in the cameras that have none."""
+    bare = bare_cameras(rig, sizes)
+    if not bare or any(rig[name].hw != hw for name, hw in sizes.items()):
+        return []
+    squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
+
+    def median(k1: float) -> float:
+        return float(_off_lines(lens_remedy(rig, bare, k1).repair(rig), pairs).abs().median())
+
+    candidates = torch.linspace(-0.145, 0.4, 24).double() / squared
+    coarse = min(candidates.tolist(), key=median)
+    step = float(candidates[1] - candidates[0])
+    found = minimize_scalar(median, bounds=(max(coarse - step, float(candidates[0])), coarse + step), method="bounded")
+    return [lens_remedy(rig, bare, float(found.x))]
+
+
+def _corner_radius(camera: Camera) -> float:
+    """Distance from the axis, at z = 1, of the farthest corner."""
+    h, w = camera.hw
+    corners = camera.K.new_tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]])
+    return float(camera.rays(corners)[0][:, :2].norm(dim=-1).max())
