@@ -9,18 +9,18 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
-from scipy.optimize import minimize_scalar
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
 from arraygeom.pixels import HW
+from arraygeom.rig import Depths
 
 from .matches import Matches, match_cameras
 from .mistakes import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
-from .residuals import depths, epipolar_residuals, lines_basis
+from .residuals import lines_basis, nature, residuals_and_depths, stacked
 
-MOST = 500
+MOST = 250
 """Matches of a pair that are used."""
 FAR_OFF = 1000.0
 """Pixels that a match counts as off its line at most, and one whose pixels have no ray."""
@@ -28,12 +28,17 @@ UNSEEN = 0.2
 """A misfit, in pixels, below which a rig has nothing wrong with it."""
 TRIMMED = 0.85
 """The part of the points, those nearest to their lines, that figures are made of."""
-EQUAL = 0.02
-"""Explanations whose misfits differ by less, in pixels, cannot be told apart."""
+EQUAL = (1.4, 0.03)
+"""Explanations cannot be told apart whose misfit is less than 1.4 times the best one's and 0.03 px."""
 WRONG_WAY = 100.0
 """Pixels of misfit that points behind the cameras, or outside the depth range, count for."""
 BETTER = {"half-pixel shift": 0.35, "one-pixel shift": 0.35, "distortion": 0.35}
 """A mistake is named if undoing it leaves no more than this part of the misfit; else 0.5."""
+
+FEW = 10
+"""Shares of fewer points than this say nothing."""
+STRONGEST_BARREL, STRONGEST_PINCUSHION = -0.145, 0.4
+"""k1 times the squared radius of the farthest corner, at z = 1; beyond -4/27 that corner has no ray."""
 
 Pairs = Mapping[tuple[str, str], Matches]
 
@@ -143,7 +148,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
     figures = _examine(rig, tried, pairs)
     order = sorted(range(len(tried)), key=lambda i: figures[i].badness)
-    least = figures[order[0]].badness + EQUAL
+    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
     best = next(i for i in range(len(tried)) if figures[i].badness <= least)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     healthy = fits and figures[0].badness < UNSEEN
@@ -165,21 +170,46 @@ def _some(matches: Matches) -> Matches:
 
 def _examine(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[Figures]:
     """The figures of every explanation, from the same points: those that agree under the best of them."""
-    off = [_off_lines(remedy.repair(rig), pairs) for remedy in tried]
-    inliers, floor = _agreement(rig, tried, off, pairs)
-    return [_figures(remedy.repair(rig), pairs, o[inliers], floor) for remedy, o in zip(tried, off)]
+    seen = _observe([remedy.repair(rig) for remedy in tried], pairs)
+    inliers, floor = _agreement(rig, tried, seen.off, pairs)
+    return [_figures(rig.depth, *(part[i] for part in seen), inliers, floor) for i in range(len(tried))]
 
 
-def _off_lines(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Signed distances in pixels of all points of all pairs from their lines, in beta."""
-    parts = []
-    for (a, b), matches in pairs.items():
-        _, line, valid = epipolar_residuals(rig.pair(a, b), matches)
-        parts.append(torch.where(valid, line, FAR_OFF).nan_to_num(FAR_OFF).clamp(-FAR_OFF, FAR_OFF))
-    return torch.cat(parts).detach()
+class Observed(NamedTuple):
+    """All points of all pairs (n) by several rigs (k): signed distance in pixels from the line, depth, in front.
+
+    Where the depth cannot be told it is NaN.
+    """
+
+    off: Float[Tensor, "k n"]
+    depth: Float[Tensor, "k n"]
+    front: Bool[Tensor, "k n"]
 
 
-def _agreement(rig: Rig, tried: Sequence[Remedy], off: Sequence[Tensor], pairs: Pairs) -> tuple[Tensor, float]:
+def _observe(rigs: Sequence[Rig], pairs: Pairs) -> Observed:
+    parts = [_observe_pair([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
+    return Observed(*(torch.cat(part, 1) for part in zip(*parts)))
+
+
+def _observe_pair(pairs: Sequence[Pair], matches: Matches) -> Observed:
+    """One pair of cameras by several rigs, those with the same kind of lenses at a time."""
+    count = len(matches.alpha)
+    off, depth = torch.full((2, len(pairs), count), torch.nan, dtype=torch.float64)
+    front = torch.zeros(len(pairs), count, dtype=torch.bool)
+    groups: dict[object, list[int]] = {}
+    for i, pair in enumerate(pairs):
+        groups.setdefault(nature(pair), []).append(i)
+    for group in groups.values():
+        pair = stacked([pairs[i] for i in group])
+        (_, line, valid), seen = residuals_and_depths(pair, matches)
+        line = torch.where(valid, line.detach(), FAR_OFF)
+        off[group] = line.nan_to_num(FAR_OFF).clamp(-FAR_OFF, FAR_OFF)
+        if seen is not None:
+            depth[group], front[group] = torch.where(seen.known, seen.depth, torch.nan), seen.front
+    return Observed(off, depth, front)
+
+
+def _agreement(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
     """Which points agree with some pose of the cameras, and their mean square distance then, in square pixels.
 
     The pose is free, so only the lens makes a difference: of the explanations that change it, the best is taken.
@@ -215,26 +245,22 @@ def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
     return left
 
 
-def _figures(rig: Rig, pairs: Pairs, off: Tensor, floor: float) -> Figures:
+def _figures(
+    bounds: Depths | None, off: Tensor, depth: Tensor, front: Tensor, inliers: Tensor, floor: float
+) -> Figures:
+    off = off[inliers]
     misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
-    depth, front = [], []
-    for (a, b), matches in pairs.items():
-        pair = rig.pair(a, b)
-        if pair.calibrated:
-            seen = depths(pair, matches)
-            depth.append(seen.depth[seen.known])
-            front.append(seen.front[seen.known])
-    known = torch.cat(front) if front else torch.zeros(0, dtype=torch.bool)
-    share = float(known.double().mean()) if len(known) >= 10 else math.nan
-    return Figures(float(off.abs().median()), misfit, share, _inside(rig, depth, known))
+    told = ~depth.isnan()
+    share = float(front[told].double().mean()) if int(told.sum()) >= FEW else math.nan
+    return Figures(float(off.abs().median()), misfit, share, _inside(bounds, depth[told & front]))
 
 
-def _inside(rig: Rig, depth: Sequence[Tensor], front: Tensor) -> float:
-    if rig.depth is None or int(front.sum()) < 10:
+def _inside(bounds: Depths | None, depth: Tensor) -> float:
+    """The share of depths between half the near and twice the far bound."""
+    if bounds is None or len(depth) < FEW:
         return math.nan
-    near, far = (float(bound) for bound in rig.depth)
-    found = torch.cat(list(depth))[front]
-    return float(((found > 0.5 * near) & (found < 2 * far)).double().mean())
+    near, far = (float(bound) for bound in bounds)
+    return float(((depth > 0.5 * near) & (depth < 2 * far)).double().mean())
 
 
 def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remedy]:
@@ -244,14 +270,15 @@ def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remed
         return []
     squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
 
-    def median(k1: float) -> float:
-        return float(_off_lines(lens_remedy(rig, bare, k1).repair(rig), pairs).abs().median())
-
-    candidates = torch.linspace(-0.145, 0.4, 24).double() / squared
-    coarse = min(candidates.tolist(), key=median)
-    step = float(candidates[1] - candidates[0])
-    found = minimize_scalar(median, bounds=(max(coarse - step, float(candidates[0])), coarse + step), method="bounded")
-    return [lens_remedy(rig, bare, float(found.x))]
+    lowest, highest = STRONGEST_BARREL / squared, STRONGEST_PINCUSHION / squared
+    k1 = lowest
+    for _ in range(3):
+        candidates = torch.linspace(lowest, highest, 13, dtype=torch.float64).tolist()
+        off = _observe([lens_remedy(rig, bare, k).repair(rig) for k in candidates], pairs).off
+        best = int(off.abs().median(1).values.argmin())
+        k1, step = candidates[best], candidates[1] - candidates[0]
+        lowest, highest = max(k1 - step, STRONGEST_BARREL / squared), k1 + step
+    return [lens_remedy(rig, bare, k1)]
 
 
 def _corner_radius(camera: Camera) -> float:

@@ -29,8 +29,6 @@ from calib.mistakes import (
     TRANSPOSE,
     TURNS,
     on_cameras,
-    on_pixels,
-    turned_view,
 )
 from tests.calib.real import RealPair, every_pair
 
