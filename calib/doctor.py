@@ -32,9 +32,9 @@ EQUAL = (1.4, 0.03)
 """Explanations cannot be told apart whose misfit is less than 1.4 times the best one's and 0.03 px."""
 WRONG_WAY = 100.0
 """Pixels of misfit that points behind the cameras, or outside the depth range, count for."""
-BETTER = {"half-pixel shift": 0.35, "one-pixel shift": 0.35, "distortion": 0.35}
-"""A mistake is named if undoing it leaves no more than this part of the misfit; else 0.5."""
-
+BETTER = 0.4
+"""A mistake is named if undoing it leaves no more than this part of the misfit: a drifted rig is made somewhat better
+by many wrong remedies."""
 FEW = 10
 """Shares of fewer points than this say nothing."""
 STRONGEST_BARREL, STRONGEST_PINCUSHION = -0.145, 0.4
@@ -152,7 +152,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     best = next(i for i in range(len(tried)) if figures[i].badness <= least)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     healthy = fits and figures[0].badness < UNSEEN
-    if healthy or figures[best].badness > BETTER.get(tried[best].kind, 0.5) * figures[0].badness:
+    if healthy or figures[best].badness > BETTER * figures[0].badness:
         best = 0
     equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].badness <= least and best}
     equal.pop(tried[best].kind, None)

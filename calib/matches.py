@@ -107,15 +107,15 @@ def _agreeing(a: Features, b: Features, picture: Tensor) -> Matches:
     return max(straight, mirrored, key=lambda m: len(m.alpha))
 
 
-def agreeing(matches: Matches, *, within: float | None = None) -> Matches:
-    """The matches that some fundamental matrix (by MAGSAC++) puts within some pixels of their lines."""
+def agreeing(matches: Matches, *, within: float = AGREE) -> Matches:
+    """The matches that some fundamental matrix puts within some pixels of their lines; none if there are few."""
     if len(matches.alpha) < ENOUGH:
         return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
     try:
-        F = _fundamental(matches)
+        F = fit_fundamental(matches)
     except ValueError:
         return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
-    return near_lines(matches, F, within=AGREE if within is None else within)
+    return near_lines(matches, F, within=within)
 
 
 def _movement(matches: Matches) -> Tensor:
@@ -153,7 +153,7 @@ def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) 
     ValueError for fewer than 20 matches that agree.
     """
     near = near_lines(matches, F, within=within)
-    fitted = _fundamental(near) if len(near.alpha) >= ENOUGH else F
+    fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
     kept = near_lines(near, fitted, within=3)
     if len(kept.alpha) < ENOUGH:
         raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
@@ -180,7 +180,8 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
     return 0.9 * low, 1.25 * high
 
 
-def _fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
+def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
+    """F by MAGSAC++ (Barath et al. 2020) to 1 px. Raises ValueError if none fits."""
     x, y = (points.numpy() for points in matches)
     try:
         found, _ = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 1.0, 0.999, 10_000)

@@ -6,13 +6,14 @@ Chosen numbers z, in standard deviations of what they were known to (a calibrati
 
 with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points' own noise:
 Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). Numbers of which the
-pictures say nothing new keep their values. Points held out decide whether the result is accepted.
+pictures say nothing new keep their values. Points held out decide whether the result is accepted. What the points
+told is then the prior of a second fit, to the photometric error of the fusion itself: see `photometric`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -22,6 +23,7 @@ from torch import Tensor
 from arraygeom import Rig
 
 from .matches import Matches, match_cameras
+from .photometric import Views, photometric_errors, with_depths
 from .residuals import epipolar_residuals
 from .unknowns import Unknown, changed, unknowns
 
@@ -38,6 +40,10 @@ CELL = 24
 SIGNIFICANT = 2.0
 """Held-out points must come nearer to their lines by so many standard errors."""
 STEPS = 40
+TOGETHER = 10.0
+"""So many neighbouring errors of the fusion count as one."""
+ROUNDS = 8
+"""Steps of the search for the least photometric error."""
 LEAST_NOISE = 0.03
 """Matched points are never taken to be better than this, pixels."""
 
@@ -67,14 +73,21 @@ class Agreement(NamedTuple):
         return f"{self.median:.2f} px"
 
 
+class Photometric(NamedTuple):
+    """The fusion's photometric error on held-out pixels, before and after its own stage, and whether that was kept."""
+
+    before: float
+    after: float
+    accepted: bool
+
+
 @dataclass(frozen=True)
 class Refined:
     """A rig made better, or not.
 
     rig: the better one if `accepted`, else the one given. changes: what is different in it. left_alone: numbers that
     the pictures do not determine. fitted, held_out: agreement before and after of the points that were used, and of
-    those that were not. covariance: of all free numbers, in the order of `order`, in squared standard deviations of
-    what was known before.
+    those that were not. photometric: what the fusion's own error did, if it was asked.
     """
 
     rig: Rig
@@ -83,8 +96,7 @@ class Refined:
     left_alone: tuple[str, ...]
     fitted: tuple[Agreement, Agreement]
     held_out: tuple[Agreement, Agreement]
-    order: tuple[Unknown, ...] = field(repr=False)
-    covariance: Float[Tensor, "p p"] = field(repr=False)
+    photometric: Photometric | None = None
 
     def as_text(self) -> str:
         """What changed and whether points that were held out agree, as people read it."""
@@ -96,6 +108,10 @@ class Refined:
             lines.append("not accepted: held-out points come no nearer to their lines; the rig stays as it is")
         if self.left_alone:
             lines.append(f"left alone, not determined by these pictures: {', '.join(self.left_alone)}")
+        if self.photometric is not None:
+            b, a, kept = self.photometric
+            verdict = "kept" if kept else "not kept"
+            lines.append(f"the fusion's own error on held-out pixels: {b:.4f} before, {a:.4f} after: {verdict}")
         return "\n".join(lines)
 
 
@@ -105,17 +121,25 @@ def refine(
     *,
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
+    photometric: bool = True,
 ) -> Refined:
     """The rig after its free numbers are fitted to points matched in frames, each with a picture of every camera.
 
     The first camera that has pictures keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
-    always free. With two frames or more, whole frames are held out, else parts of the picture.
+    always free. With two frames or more, whole frames are held out, else parts of the picture. With `photometric`,
+    the fusion's own error then has its say, with what the points told as its prior.
     Raises ValueError, one line: a camera that the rig lacks, a picture of another size than the rig says, equal
     pictures, too few points.
     """
     for frame in frames:
         _check(rig, frame)
-    return refine_matches(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
+    fit = Fit.of(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
+    solution = fit.solve()
+    told = fit.report(solution)
+    if not (photometric and told.accepted):
+        return told
+    polished, errors = polish(fit, solution, frames)
+    return replace(fit.report(polished), photometric=errors) if errors.accepted else replace(told, photometric=errors)
 
 
 def refine_matches(
@@ -125,22 +149,86 @@ def refine_matches(
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
 ) -> Refined:
-    """The same from points matched already."""
-    used, kept = _split(frames)
-    names = [name for name in rig.names if any(name in pair for pairs in (used, kept) for pair in pairs)]
-    given = unknowns(rig, names, free=free, sigma=sigma)
-    if not given:
-        raise ValueError("nothing is free: the first camera keeps its pose; free more with --free, such as centre")
-    solution = solve(lambda z: sampson(changed(rig, given, z), used), sum(len(u.sigma) for u in given))
-    better = changed(rig, given, solution.z)
-    off = [(_off(rig, pairs), _off(better, pairs)) for pairs in (used, kept)]
-    fitted, held_out = ((agreement(before), agreement(after)) for before, after in off)
-    accepted = bool(solution.active.any()) and nearer(*off[1])
-    changes = tuple(_changes(given, solution)) if accepted else ()
-    alone = tuple(_left_alone(given, solution.active))
-    return Refined(
-        better if accepted else rig, accepted, changes, alone, fitted, held_out, tuple(given), solution.covariance
-    )
+    """The same from points matched already, without the fusion's error."""
+    fit = Fit.of(rig, frames, free=free, sigma=sigma)
+    return fit.report(fit.solve())
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A rig, what may change in it, and the points: those used and those held out."""
+
+    rig: Rig
+    given: tuple[Unknown, ...]
+    used: Pairs
+    held_out: Pairs
+
+    @classmethod
+    def of(cls, rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None) -> Fit:
+        """Raises ValueError if nothing is free."""
+        used, held_out = split(frames)
+        names = [name for name in rig.names if any(name in pair for pairs in (used, held_out) for pair in pairs)]
+        given = unknowns(rig, names, free=free, sigma=sigma)
+        if not given:
+            raise ValueError("nothing is free: the first camera keeps its pose; free more with --free, such as centre")
+        return cls(rig, tuple(given), used, held_out)
+
+    def after(self, z: Float[Tensor, " n"]) -> Rig:
+        """The rig after a change of z, in standard deviations."""
+        return changed(self.rig, self.given, z)
+
+    def solve(self) -> Solution:
+        """What the used points tell."""
+        return solve(lambda z: sampson(self.after(z), self.used), sum(len(u.sigma) for u in self.given))
+
+    def report(self, solution: Solution) -> Refined:
+        """What a solution changes, and whether the held-out points accept it."""
+        better = self.after(solution.z)
+        off = [(line_distances(self.rig, pairs), line_distances(better, pairs)) for pairs in (self.used, self.held_out)]
+        fitted, held_out = ((agreement(before), agreement(after)) for before, after in off)
+        accepted = bool(solution.active.any()) and nearer(*off[1])
+        changes = tuple(_changes(self.given, solution)) if accepted else ()
+        alone = tuple(_left_alone(self.given, solution.active))
+        return Refined(better if accepted else self.rig, accepted, changes, alone, fitted, held_out)
+
+
+def polish(fit: Fit, solution: Solution, frames: Sequence[Frame]) -> tuple[Solution, Photometric]:
+    """The solution moved to where the fusion's photometric error is least, with what the points told as its prior.
+
+    Errors are compared with their own deviation and count as one measurement for every `TOGETHER` pixels, because
+    neighbours err alike. Kept if the error falls on held-out pixels too and held-out points do not mind.
+    """
+    rig = with_depths(fit.after(solution.z), fit.used)
+    base = replace(fit, rig=fit.rig.replace(depth=rig.depth))
+    views = [Views.of(frame) for frame in frames]
+    root = torch.linalg.cholesky(solution.covariance)[:, solution.active]
+
+    def errors(z: Tensor, *, held_out: bool) -> Tensor:
+        parts = [photometric_errors(base.after(z), v, names) for v in views for names in fit.used]
+        return torch.cat([error[seen & (_marked(error) == held_out)] for error, seen in parts])
+
+    noise = _noise(errors(solution.z, held_out=False).detach())
+    y = torch.zeros(root.shape[1], dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.LBFGS([y], max_iter=ROUNDS, line_search_fn="strong_wolfe", tolerance_change=1e-4)
+
+    def cost() -> Tensor:
+        optimiser.zero_grad()
+        left = errors(solution.z + root @ y, held_out=False) / noise
+        total = left.square().log1p().sum() / TOGETHER + y.square().sum()
+        total.backward()
+        return total
+
+    optimiser.step(cost)
+    z = (solution.z + root @ y).detach()
+    before, after = (float(errors(v, held_out=True).detach().abs().mean()) for v in (solution.z, z))
+    off = [line_distances(fit.after(v), fit.held_out) for v in (z, solution.z)]
+    return solution._replace(z=z), Photometric(before, after, after < before and not nearer(*off))
+
+
+def _marked(error: Tensor) -> Tensor:
+    """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
+    rows, columns = (torch.arange(n) // 4 for n in error.shape)
+    return (columns + 2 * rows[:, None]) % HELD_OUT == 0
 
 
 class Solution(NamedTuple):
@@ -239,12 +327,12 @@ def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
     return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
 
 
-def _off(rig: Rig, pairs: Pairs) -> Tensor:
-    """Distances in pixels of points from their lines, in beta."""
+def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
+    """Signed distances in pixels of all points from their lines, in beta."""
     return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
 
 
-def _split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:
+def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:
     """Points to use and points to hold out: whole frames if there are several, else squares of alpha's picture."""
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)

@@ -17,7 +17,7 @@ from arraygeom.pixels import HW
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Standard deviations where none are stated: radians, a part of the longest baseline, a part of the focal length,
 pixels of the principal point, and a plain number."""
-ALIASES = {"principal_point": "centre", "focal_length": "focal", "pose": "rotation"}
+ALIASES = {"principal_point": "centre", "focal_length": "focal"}
 AXES = {"rotation": "xyz", "translation": "xyz", "focal": "xy", "centre": "xy"}
 UNITS = {
     "rotation": ("degrees", 180 / math.pi),
@@ -56,7 +56,10 @@ def unknowns(
     over "camera.kind". `sigma` states standard deviations by kind, instead of `SIGMA`'s. A link between two of the
     cameras has its F free. Raises ValueError for a pattern that matches nothing.
     """
-    sigma = {**SIGMA, **{ALIASES.get(k, k): v for k, v in (sigma or {}).items()}}
+    stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
+    if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
+        raise ValueError(f"--sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
+    sigma = {**SIGMA, **stated}
     known = rig.parameters(free=["*"]) if any(isinstance(rig[n], Camera) for n in names) else {}
     wanted = _matching(known, free)
     fixed = {f"{names[0]}.rotation", f"{names[0]}.translation"}
