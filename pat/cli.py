@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -435,13 +436,117 @@ class Convert:
 
 
 @dataclass
+class Doctor:
+    """Find the usual mistakes in a rig, by features matched between one picture of each camera.
+
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, units, cameras swapped, pictures resized, cropped,
+    turned or mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --fix better.yaml
+    """
+
+    rig: Positional[Path]
+    """Rig file of any format known."""
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each of two or more cameras."""
+    fix: Path | None = None
+    """Write the repaired rig there, if a mistake is named."""
+    json: bool = False
+    """Print JSON instead of text."""
+
+    def run(self) -> None:
+        """Do it."""
+        from calib.doctor import diagnose
+
+        rig = Rig.load(self.rig)
+        found = diagnose(rig, named_pictures(rig, self.image))
+        print(found.as_json() if self.json else found.as_text())
+        if self.fix is not None and found.named.kind != "nothing":
+            found.repaired.save(self.fix)
+            console.print(f"written: {self.fix} ({found.named.words}: undone)")
+        elif self.fix is not None:
+            console.print("no rig written: no mistake was named")
+
+
+@dataclass
+class Refine:
+    """Improve a rig by ordinary pictures of its cameras: points matched between them, then the fusion's own error.
+
+    Points that were held out decide: no rig is written unless they come nearer to their lines.
+    Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    """
+
+    rig: Positional[Path]
+    """Rig file of any format known."""
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each camera and frame: the first files of all cameras are one frame, and so on."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Rig file to write."""
+    free: tuple[str, ...] = ("rotation", "centre")
+    """What may change: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation."""
+    sigma: tuple[str, ...] = ()
+    """KIND=NUMBER: what it is known to, one standard deviation: degrees, pixels; for translation and focal, a part."""
+    photometric: bool = True
+    """Let the fusion's own error have its say after the points."""
+
+    def run(self) -> None:
+        """Do it."""
+        from calib.refine import refine
+
+        rig = Rig.load(self.rig)
+        found = refine(
+            rig,
+            frames_of(rig, self.image),
+            free=[kind for text in self.free for kind in text.split(",")],
+            sigma=_deviations(self.sigma),
+            photometric=self.photometric,
+        )
+        print(found.as_text())
+        if found.accepted:
+            found.rig.save(self.out)
+            console.print(f"written: {self.out}")
+        else:
+            console.print("no rig written")
+
+
+@dataclass
+class Start:
+    """Make a rig from pictures alone: fundamental matrices and rough maps, good enough to fuse with.
+
+    Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
+    """
+
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each camera."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Rig file to write."""
+    focal: UseAppendAction[tuple[str, ...]] = ()
+    """NAME=PIXELS: rough focal lengths, if known; used where they help."""
+
+    def run(self) -> None:
+        """Do it."""
+        from calib.start import start
+
+        from .images import read_image
+
+        files = _files_by_name(self.image)
+        images = {name: read_image(path, name=name) for name, path in files.items()}
+        found = start(images, focal=_numbers_by_name("--focal", self.focal))
+        print(found.as_text())
+        found.rig.save(self.out)
+        console.print(f"written: {self.out}")
+
+
+@dataclass
 class RigCommand:
-    """Look at rig files and convert them."""
+    """Look at rig files, convert them, find what is wrong with them and make them better."""
 
     command: OmitSubcommandPrefixes[
         Annotated[Info, tyro.conf.subcommand("info")]
         | Annotated[Convert, tyro.conf.subcommand("convert")]
         | Annotated[Show, tyro.conf.subcommand("show")]
+        | Annotated[Doctor, tyro.conf.subcommand("doctor")]
+        | Annotated[Refine, tyro.conf.subcommand("refine")]
+        | Annotated[Start, tyro.conf.subcommand("start")]
     ]
 
     def run(self) -> None:
@@ -551,6 +656,55 @@ def _spread_out(hw: tuple[int, int]) -> Tensor:
 
     spots = (pixel_grid((3, 4)) + 0.5) / pixel_grid((3, 4)).new_tensor([4, 3])
     return (spots * spots.new_tensor([hw[1], hw[0]])).floor().reshape(-1, 2)
+
+
+def named_pictures(rig: Rig, texts: Iterable[str]) -> dict[str, Tensor]:
+    """The pictures of `--image NAME=FILE`, by camera. Raises ValueError for a camera given twice, or not of the rig."""
+    from .images import read_image
+
+    return {rig.known(name): read_image(path, name=name) for name, path in _files_by_name(texts).items()}
+
+
+def frames_of(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
+    """The pictures of `--image NAME=FILE`, a camera's first in the first frame, its second in the second, and so on.
+
+    Raises ValueError for cameras with unlike numbers of pictures.
+    """
+    from .images import read_image
+
+    files: dict[str, list[Path]] = {}
+    for name, path in map(_name_and_file, texts):
+        files.setdefault(rig.known(name), []).append(path)
+    counts = {name: len(paths) for name, paths in files.items()}
+    if len(set(counts.values())) > 1:
+        spoken = ", ".join(f"'{name}' {count}" for name, count in counts.items())
+        raise ValueError(f"--image: every camera needs a picture of every frame; given are {spoken}")
+    frames = zip(*files.values())
+    return [{n: read_image(path, name=n) for n, path in zip(files, frame)} for frame in frames]
+
+
+def _files_by_name(texts: Iterable[str]) -> dict[str, Path]:
+    pairs = [_name_and_file(text) for text in texts]
+    if len(dict(pairs)) < len(pairs):
+        raise ValueError("--image: a camera is given twice; give each camera one picture")
+    return dict(pairs)
+
+
+def _deviations(texts: Iterable[str]) -> dict[str, float]:
+    """Standard deviations by kind; rotations in degrees are turned into radians."""
+    found = _numbers_by_name("--sigma", texts)
+    return {kind: math.radians(value) if kind == "rotation" else value for kind, value in found.items()}
+
+
+def _numbers_by_name(option: str, texts: Iterable[str]) -> dict[str, float]:
+    found = {}
+    for text in texts:
+        name, _, number = text.partition("=")
+        try:
+            found[name] = float(number)
+        except ValueError:
+            raise ValueError(f"{option}: '{text}' is not NAME=NUMBER") from None
+    return found
 
 
 def _name_and_file(text: str) -> tuple[str, Path]:

@@ -311,7 +311,7 @@ def _camera_entry(camera: View) -> dict[str, Any]:
     entry: dict[str, Any] = {"size": [w, h]}
     if isinstance(camera, Camera):
         K = camera.K
-        plain = not bool(K[0, 1] or K[1, 0])
+        plain = not bool(K[0, 1] or K[1, 0]) and bool((K.diagonal() > 0).all())
         entry |= {"focal": K.diagonal()[:2].tolist(), "centre": K[:2, 2].tolist()} if plain else {"K": K.tolist()}
         entry |= {"rotation": camera.R.tolist(), "translation": camera.t.tolist()}
         if camera.distortion is not None:
