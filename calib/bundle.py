@@ -252,14 +252,20 @@ def _changed(camera: Camera, change: torch.Tensor) -> Camera:
 
 
 def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Derivatives of the pixels of world points by the camera's numbers, in the order of `parameter_names`."""
-    points = torch.from_numpy(X)
+    """Derivatives of the pixels of world points by the camera's numbers, in the order of `parameter_names`.
 
-    def pixels(change: torch.Tensor) -> torch.Tensor:
-        return _changed(camera, change).project(points).x
-
-    start = torch.zeros(len(parameter_names(camera)), dtype=points.dtype)
-    return torch.func.jacfwd(pixels)(start).numpy()
+    Two reverse passes in which every point has a copy of the intrinsics to itself; the pose's follow by the chain rule.
+    """
+    local = camera.cam_from_world.apply(torch.from_numpy(X)).detach().requires_grad_()
+    sizes = {key: size for key, size in parameter_sizes(camera).items() if key not in (".rotation", ".translation")}
+    change = torch.zeros(len(X), sum(sizes.values()), dtype=local.dtype, requires_grad=True)
+    copies = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values()), -1))))[""]
+    assert isinstance(copies, Camera)
+    x = copies.project_local(local[:, None]).x[:, 0]
+    by_point, by_change = zip(*(torch.autograd.grad(v.sum(), (local, change), retain_graph=True) for v in x.unbind(-1)))
+    along = torch.stack(by_point, 1)
+    turning = torch.linalg.cross((local.detach() - camera.t)[:, None].expand_as(along), along)
+    return torch.cat([turning, along, torch.stack(by_change, 1)], -1).numpy()
 
 
 @dataclass(frozen=True)

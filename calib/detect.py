@@ -100,7 +100,7 @@ def _right_handed(grid: np.ndarray) -> np.ndarray:
 def _refined(grey: Grey, x: np.ndarray) -> np.ndarray:
     """Corners where the gradients around them say, in windows that reach less than half way to the next corner."""
     apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(0.4 * np.quantile(apart, 0.1), 2, 11))
+    half = int(np.clip(0.3 * np.quantile(apart, 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
