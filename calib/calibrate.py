@@ -28,7 +28,7 @@ EVERY = 5
 
 @dataclass(frozen=True)
 class Calibration:
-    """A rig and all that is known of how well it is known.
+    """A rig and how well it is known.
 
     fit: scene, noise and covariance of the bundle adjustment, its blocks being `frames` in order.
     alone: each camera's reprojection error (RMS, px) when it is calibrated by itself.

@@ -14,6 +14,11 @@ NATURAL = {
     "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
 }
 """How large the coefficients of lenses usually are, at most."""
+LENS_TERMS = {
+    "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
+    "kannala-brandt": ("k1", "k2", "k3", "k4"),
+}
+"""What the coefficients are called, in their order."""
 NATURAL_FOCAL, NATURAL_CENTRE = 0.1, 0.1
 """The same for the error of a guessed focal length, as a share of it, and of the principal point, of the width."""
 UNTOLD = 0.5
@@ -45,7 +50,7 @@ def gate(scene: Scene, free: Free, sigma: dict[str, float]) -> tuple[Scene, dict
             )
         mine[name][index] = False
         scene = _plain(scene, name, entry)
-        notes.append(f"{name}: {_WORDS.get(entry, entry)} kept at {_plain_value(entry)}: the pictures do not tell it")
+        notes.append(f"{name}: {_described(scene.cameras[name], entry)}: the pictures do not tell it")
     return scene, mine, notes
 
 
@@ -77,12 +82,9 @@ def _plain(scene: Scene, name: str, entry: str) -> Scene:
     return Scene({**scene.cameras, name: camera}, scene.structure, scene.seen)
 
 
-def _plain_value(entry: str) -> str:
-    return "the middle" if entry.startswith("centre") else "0"
-
-
-_WORDS = {
-    "centre.0": "the principal point's x",
-    "centre.1": "the principal point's y",
-    **{f"distortion.{i}": f"the lens's {k}" for i, k in enumerate(("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"))},
-}
+def _described(camera: Camera, entry: str) -> str:
+    kind, index = entry.split(".")
+    if kind == "centre":
+        return f"the principal point's {'xy'[int(index)]} is kept at the picture's middle"
+    assert camera.distortion is not None
+    return f"the lens's {LENS_TERMS[camera.distortion.model][int(index)]} is kept at 0"
