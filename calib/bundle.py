@@ -25,6 +25,11 @@ RAYLEIGH_MEDIAN = 1.17741
 QUIETEST = 1e-3
 """Noise below this, in pixels, is taken to be this: perfect corners must not weigh infinitely."""
 
+SETTLED = 1e-3
+"""A step that lowers the loss by less than this, in squared standard deviations, changes nothing that matters."""
+POOLED = 50
+"""Each camera's noise is estimated as if it had so many more residuals of the average noise of all."""
+
 Array = np.ndarray
 
 
@@ -186,16 +191,18 @@ def noise(scene: Scene, parameters: int) -> dict[str, float]:
     """Each camera's noise along x or y in pixels, whatever a few gross errors are, for so many fitted numbers."""
     residuals = scene.residuals()
     numbers = 2 * sum(len(r) for r in residuals.values())
-    left = np.sqrt(numbers / max(numbers - parameters, 0.1 * numbers))
-    return {name: left * _spread(r) for name, r in residuals.items()}
+    left = numbers / max(numbers - parameters, 0.1 * numbers)
+    squares, counts = np.array([(_square(r), len(r)) for r in residuals.values()]).T
+    average = np.exp(np.average(np.log(squares), weights=counts))
+    pooled = left * (counts * squares + POOLED * average) / (counts + POOLED)
+    return dict(zip(residuals, np.sqrt(pooled).tolist()))
 
 
-def _spread(r: Array) -> float:
-    """The root mean square of each coordinate with gross errors weighed down."""
+def _square(r: Array) -> float:
+    """The mean square of a coordinate with gross errors weighed down."""
     lengths = np.linalg.norm(r, axis=-1)
     typical = max(float(np.median(lengths)) / RAYLEIGH_MEDIAN, QUIETEST)
-    weighted = _weights(lengths / typical) * lengths**2
-    return max(float(np.sqrt(weighted.mean() / 2)), QUIETEST)
+    return max(float((_weights(lengths / typical) * lengths**2).mean() / 2), QUIETEST**2)
 
 
 def _weights(lengths: Array) -> Array:
@@ -227,7 +234,7 @@ def _minimise(scene: Scene, free: Free, sigma: Mapping[str, float], iterations: 
             if damping > 1e6:
                 return scene, iteration, True
         gained, scene, loss, damping = loss - trial_loss, trial, trial_loss, max(damping / 10, 1e-12)
-        if gained < 1e-9 * (1 + loss):
+        if gained < SETTLED:
             return scene, iteration, True
     return scene, iterations, False
 

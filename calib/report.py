@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from arraygeom import Camera, Pose, Rig
@@ -65,15 +66,15 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
 
 def summary(calibration: Calibration) -> str:
     """The calibration in a sentence or two."""
-    points = sum(len(r) for r in calibration.fit.scene.seen.values())
+    points = sum(len(seen.x) for seen in calibration.fit.scene.seen.values())
     text = (
         f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, {points} points: "
         f"reprojection error {calibration.rms:.3f} px (RMS)."
     )
-    for title, errors in (("Epipolar error", calibration.epipolar), ("on held-out frames", calibration.held_out)):
+    for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):
         if errors:
             everything = np.concatenate(list(errors.values()))
-            text += f" {title} {everything.mean():.3f} px on average, 95 % below {np.quantile(everything, 0.95):.3f}."
+            text += f" Epipolar error{where} {everything.mean():.3f} px (mean; 95 % below {np.quantile(everything, 0.95):.3f})."
     return text
 
 
@@ -215,7 +216,7 @@ def draw_scene(calibration: Calibration) -> Figure:
         x, _, z = camera.centre.tolist()
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
-        above.annotate(_plain(name), (x, z), (x - 6 * 0 + 0, z), textcoords="data", fontsize=8, color=colour, va="top")
+        above.annotate(_plain(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center")
         above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
     above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     above.set_title("from above, with the boards", fontsize=9)
@@ -245,8 +246,8 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
     """One camera: where points were seen; the mean residual of each part of the picture, magnified; their scatter."""
     seen, r = calibration.fit.scene.seen[name], calibration.fit.scene.residuals()[name]
     hw = calibration.views[name].hw
-    figure = Figure(figsize=(10.4, 3.1), layout="constrained")
-    left, middle, right = figure.subplots(1, 3, width_ratios=[1.3, 1.3, 1])
+    figure = Figure(figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed")
+    left, middle, right = figure.subplots(1, 3)
     show_picture(left, hw)
     left.imshow(np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal")
     left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
@@ -294,7 +295,7 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
             usable = np.isfinite(pixels).all((1, 2))
             deviation = np.full(len(x), np.nan)
             deviation[usable] = np.sqrt(np.linalg.eigvalsh(pixels[usable])[:, -1])
-            shown = axes.imshow(deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", interpolation="bilinear")
+            shown = axes.imshow(deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm())
             axes.set(xticks=[], yticks=[])
             median = float(np.median(deviation[usable])) if usable.any() else float("nan")
             axes.set_title(f"{_plain(beta)} of {_plain(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
