@@ -168,15 +168,18 @@ def parameter_sizes(camera: Camera) -> dict[str, int]:
 def adjust(scene: Scene, free: Free, *, rounds: int = 4, iterations: int = 50) -> Fit:
     """The scene in which free numbers of cameras and all blocks are such that the pixels fit best.
 
-    `rounds` times: noise estimated for each camera, then all numbers.
+    First by least squares that take every residual seriously, as the start may be far off; then `rounds` times with
+    the noise estimated for each camera from what is left. (Cameras weighed by their noise from the beginning would
+    give up on the one that starts worst.)
     """
-    done, converged = 0, False
-    sigma = noise(scene, _count(free) + len(scene.structure) * scene.structure.width)
+    parameters = _count(free) + len(scene.structure) * scene.structure.width
+    scene, done, converged = _minimise(scene, free, dict.fromkeys(scene.cameras, max(scene.rms(), QUIETEST)), iterations)
+    sigma = dict.fromkeys(scene.cameras, float(np.sqrt(np.mean(np.square(list(noise(scene, parameters).values()))))))
     for _ in range(rounds):
         scene, used, converged = _minimise(scene, free, sigma, iterations)
         done += used
-        before, sigma = sigma, noise(scene, _count(free) + len(scene.structure) * scene.structure.width)
-        if all(abs(np.log(sigma[name] / before[name])) < 1e-3 for name in sigma):
+        before, sigma = sigma, noise(scene, parameters)
+        if all(abs(np.log(sigma[name] / before[name])) < 1e-2 for name in sigma):
             break
     names = tuple(
         f"{name}.{entry}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,13 +16,16 @@ from arraygeom.pixels import map_homogeneous
 
 from .boards import Board
 from .bundle import BoardPoses, Fit, Observations, Scene, adjust, noise, parameter_names
-from .intrinsics import Lens, Start, Views, board_pose, calibrate_camera
+from .intrinsics import Lens, Start, Views, calibrate_camera, check_tilts
 from .observability import gate
 from .photos import FrameKey
 from .poses import Seen, initial_rig
 
+SAME_MOMENT = "taken at the same moments, numbered alike, not mirrored, with a stiff board"
 FEWEST_TO_HOLD_OUT = 8
 """With fewer frames that two cameras share none is held out."""
+DOUBTFUL, HOPELESS = 3.0, 20.0
+"""So many times worse together than alone, a camera is in doubt, or refused."""
 EVERY = 5
 """One in so many frames is held out."""
 
@@ -63,27 +67,82 @@ def calibrate(views: Mapping[str, Views], board: Board, *, lens: Lens | Mapping[
     few pictures or only parallel boards, if cameras are not connected, or if their frames contradict each other.
     """
     models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
-    starts = {name: calibrate_camera(name, v, board, lens=models[name]) for name, v in views.items()}
-    kept = {name: _without_outliers(views[name], start) for name, start in starts.items()}
-    begin = initial_rig([Seen.of(name, start, kept[name]) for name, start in starts.items()], board)
-    cameras = {name: s.camera.replace(cam_from_world=begin.cam_from_world[name]) for name, s in starts.items()}
-    frames = tuple(begin.world_from_board)
-    scene = _scene(cameras, begin.world_from_board, begin.views, board)
-    fit, free, notes = _fitted(scene)
-    notes = [*_pictures_left_out(views, kept, begin.left_out), *notes]
-    rig = Rig(fit.scene.cameras)
-    alone = {name: _camera_rms(start) for name, start in starts.items()}
+    alone = {name: fit_alone(name, v, board, lens=models[name]) for name, v in views.items()}
+    begin = initial_rig([Seen(name, a.camera, a.views, a.cam_from_board) for name, a in alone.items()], board)
+    cameras = {name: a.camera.replace(cam_from_world=begin.cam_from_world[name]) for name, a in alone.items()}
+    together = _together(_scene(cameras, begin.world_from_board, begin.views, board), alone)
+    rig = Rig(together.fit.scene.cameras)
     return Calibration(
         rig=rig,
         board=board,
-        fit=fit,
-        frames=frames,
+        fit=together.fit,
+        frames=tuple(begin.world_from_board),
         views=begin.views,
-        alone=alone,
+        alone={name: a.fit.scene.rms() for name, a in alone.items()},
         epipolar=epipolar_errors(rig, begin.views),
-        held_out=_held_out(cameras, begin.world_from_board, begin.views, board, free),
-        notes=(*notes, *_apart(fit, alone)),
+        held_out=_held_out(cameras, begin.world_from_board, begin.views, board, together.free),
+        notes=(*_pictures_left_out(views, alone, begin.left_out), *together.notes),
     )
+
+
+class Alone(NamedTuple):
+    """One camera calibrated by itself; its world is its own frame, `views` the pictures kept."""
+
+    fit: Fit
+    views: Views
+    frames: tuple[FrameKey, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, at the origin."""
+        return next(iter(self.fit.scene.cameras.values()))
+
+    @property
+    def cam_from_board(self) -> dict[FrameKey, Pose]:
+        """The board's pose in the camera by moment."""
+        structure = self.fit.scene.structure
+        assert isinstance(structure, BoardPoses)
+        boards = structure.world_from_board
+        return {key: Pose(boards.R[i], boards.t[i]) for i, key in enumerate(self.frames)}
+
+
+def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady") -> Alone:
+    """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does."""
+    start = calibrate_camera(name, views, board, lens=lens)
+    kept = _without_outliers(views, start)
+    if len(kept.seen) < len(views.seen):
+        start = calibrate_camera(name, kept, board, lens=lens)
+    scene = _scene({name: start.camera}, start.cam_from_board, {name: kept}, board)
+    fit, _, notes = _fitted(scene)
+    found = Alone(fit, kept, tuple(start.cam_from_board), tuple(notes))
+    check_tilts(name, found.cam_from_board)
+    return found
+
+
+class _Together(NamedTuple):
+    fit: Fit
+    free: dict[str, np.ndarray]
+    notes: list[str]
+
+
+def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
+    """All cameras at once; if they fit far worse so than alone, only their poses.
+
+    Boards that move between the exposures of cameras that are not synchronised would bend the lenses otherwise.
+    """
+    if len(scene.cameras) == 1:
+        (only,) = alone.values()
+        return _Together(only.fit, {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}, list(only.notes))
+    fit, free, notes = _fitted(scene)
+    if not (doubts := _doubts(fit, alone)):
+        return _Together(fit, free, notes)
+    posed = {name: _free(c, index > 0, lens=0) for index, (name, c) in enumerate(scene.cameras.items())}
+    for mask in posed.values():
+        mask[6:] = False
+    fit = adjust(scene, posed)
+    kept = "so each camera's intrinsics are those from its own pictures, and their uncertainty is not in the report's"
+    return _Together(fit, posed, [*(note for a in alone.values() for note in a.notes), f"{doubts}; {kept}"])
 
 
 def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, " n"]]:
@@ -151,11 +210,10 @@ def _observations(views: Views, index: Mapping[FrameKey, int], board: Board) -> 
 
 
 def _fitted(scene: Scene) -> tuple[Fit, dict[str, np.ndarray], list[str]]:
-    """First what every camera has, then all that the pictures tell."""
-    plain = {name: _free(camera, index > 0, lens=2) for index, (name, camera) in enumerate(scene.cameras.items())}
-    first = adjust(scene, plain, rounds=2)
+    """All that the pictures tell: fitted, and what they turn out not to tell given up, until that is nothing."""
+    sigma = noise(scene, 0)
     full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(scene.cameras.items())}
-    scene, free, notes = gate(first.scene, full, first.sigma)
+    scene, free, notes = gate(scene, full, sigma)
     fit = adjust(scene, free)
     while True:
         scene, free, more = gate(fit.scene, free, fit.sigma)
@@ -193,30 +251,26 @@ def _held_out(
     return epipolar_errors(Rig(adjust(scene, free).scene.cameras), kept)
 
 
-def _camera_rms(start: Start) -> float:
-    return float(np.sqrt(np.mean(np.square(list(start.rms.values())))))
-
-
 def _pictures_left_out(
-    views: Mapping[str, Views], kept: Mapping[str, Views], left_out: list[tuple[str, FrameKey]]
+    views: Mapping[str, Views], alone: Mapping[str, Alone], left_out: list[tuple[str, FrameKey]]
 ) -> list[str]:
     notes = []
     for name, v in views.items():
-        if bent := [str(key) for key in v.seen if key not in kept[name].seen]:
+        if bent := [str(key) for key in v.seen if key not in alone[name].views.seen]:
             notes.append(f"{name}: left out {', '.join(bent)}: the board found there does not fit the camera")
         if astray := [str(key) for other, key in left_out if other == name]:
             notes.append(f"{name}: left out {', '.join(astray)}: they contradict the other cameras' pictures")
     return notes
 
 
-def _apart(fit: Fit, alone: Mapping[str, float]) -> list[str]:
-    """Cameras that fit much worse together than each alone."""
-    notes = []
+def _doubts(fit: Fit, alone: Mapping[str, Alone]) -> str:
+    """Which cameras fit much worse together than alone, in words. Raises ValueError if that is hopeless."""
+    doubts = []
     for name, r in fit.scene.residuals().items():
-        together = float(np.sqrt((r**2).sum(-1).mean()))
-        if together > 0.5 and together > 3 * alone[name]:
-            notes.append(
-                f"{name}: fits to {alone[name]:.2f} px alone but {together:.2f} px with the others: were the pictures "
-                "taken at the same moment, and is the board stiff?"
-            )
-    return notes
+        together, by_itself = float(np.sqrt((r**2).sum(-1).mean())), alone[name].fit.scene.rms()
+        fits = f"{name} fits to {by_itself:.2f} px alone but to {together:.2f} px with the others"
+        if together > HOPELESS * max(by_itself, 0.3):
+            raise ValueError(f"{fits}: were the pictures {SAME_MOMENT}?")
+        if together > 0.5 and together > DOUBTFUL * by_itself:
+            doubts.append(fits)
+    return f"{', '.join(doubts)} (were the pictures {SAME_MOMENT}?)" if doubts else ""

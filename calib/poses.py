@@ -14,11 +14,12 @@ from arraygeom import Camera, Pose
 
 from .boards import Board, Charuco
 from .detect import Detection
-from .intrinsics import Start, Views, board_pose
+from .intrinsics import Views, board_pose
 from .photos import FrameKey
 
-TOLERANCE = 0.01
-"""A frame agrees with a pose if it predicts the board to this share of the picture's width (and to 3 px)."""
+TOLERANCE = 0.03
+"""A frame agrees with a pose if it predicts the board to this share of the picture's width: one view of a small board
+gives its tilt, hence the other camera's place, no better."""
 FEWEST_TO_JUDGE = 3
 """Two cameras that share fewer frames than this are taken at their word."""
 MOST_CANDIDATES = 15
@@ -47,15 +48,10 @@ class Seen:
     views: Views
     poses: Mapping[FrameKey, Pose]
 
-    @classmethod
-    def of(cls, name: str, start: Start, views: Views) -> Seen:
-        """From the camera's own calibration."""
-        return cls(name, start.camera, views, start.cam_from_board)
-
     @property
     def tolerance(self) -> float:
         """Pixels to which a prediction must fit."""
-        return max(3.0, TOLERANCE * self.views.hw[1])
+        return TOLERANCE * self.views.hw[1]
 
 
 class RigStart(NamedTuple):
@@ -86,17 +82,42 @@ def pair_pose(a: Seen, b: Seen, board: Board) -> PairPose | None:
     shared = tuple(key for key in a.views.seen if key in b.views.seen)
     if not shared:
         return None
-    best: tuple[int, float] = (-1, 0.0)
-    for key in shared[:: max(1, len(shared) // MOST_CANDIDATES)]:
-        for turn in symmetry_poses(board):
-            pose = a.poses[key] @ turn @ b.poses[key].inverse()
-            errors = _prediction_errors(a, b, pose, shared, board)
-            agree = errors < a.tolerance
-            score = int(agree.sum()), -float(errors[agree].sum())
-            if score > best:
-                best, chosen, agreeing = score, pose, agree
-    frames = tuple(key for key, good in zip(shared, agreeing) if good)
-    return PairPose(chosen, frames, shared, sum(len(a.views.seen[k].ids) + len(b.views.seen[k].ids) for k in frames))
+    turns = symmetry_poses(board)
+    tried = shared[:: max(1, len(shared) // MOST_CANDIDATES)]
+    candidates = [a.poses[key] @ turn @ b.poses[key].inverse() for key in tried for turn in turns]
+    voted = max((_vote(a, b, pose, shared, board) for pose in candidates), key=lambda v: v.score)
+    for _ in range(2):
+        averaged = _average([_nearest(voted.pose, a.poses[k], b.poses[k], turns) for k in voted.agreeing] or [voted.pose])
+        voted = max(voted, _vote(a, b, averaged, shared, board), key=lambda v: v.score)
+    corners = sum(len(a.views.seen[k].ids) + len(b.views.seen[k].ids) for k in voted.agreeing)
+    return PairPose(voted.pose, voted.agreeing, shared, corners)
+
+
+class _Vote(NamedTuple):
+    pose: Pose
+    agreeing: tuple[FrameKey, ...]
+    score: tuple[int, float]
+
+
+def _vote(a: Seen, b: Seen, a_from_b: Pose, keys: Sequence[FrameKey], board: Board) -> _Vote:
+    """Which frames agree with a relative pose; the score is how many, and then how well."""
+    errors = _prediction_errors(a, b, a_from_b, keys, board)
+    agree = errors < a.tolerance
+    frames = tuple(key for key, good in zip(keys, agree) if good)
+    return _Vote(a_from_b, frames, (len(frames), -float(errors[agree].sum())))
+
+
+def _nearest(a_from_b: Pose, a_from_board: Pose, b_from_board: Pose, turns: Sequence[Pose]) -> Pose:
+    """One frame's relative pose, at the numbering that comes closest to a given one."""
+    poses = [a_from_board @ turn @ b_from_board.inverse() for turn in turns]
+    return max(poses, key=lambda pose: float((pose.R * a_from_b.R).sum()))
+
+
+def _average(poses: Sequence[Pose]) -> Pose:
+    """The rotation nearest to the mean of all, and the median translation."""
+    U, _, Vh = torch.linalg.svd(torch.stack([pose.R for pose in poses]).mean(0))
+    flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vh).sign())], dtype=U.dtype))
+    return Pose(U @ flip @ Vh, torch.stack([pose.t for pose in poses]).median(0).values)
 
 
 def symmetry_poses(board: Board) -> list[Pose]:
@@ -153,7 +174,7 @@ def _boards(cameras: Sequence[Seen], poses: dict[str, Pose], board: Board) -> Ri
         boards[key] = poses[anchor.name].inverse() @ anchor.poses[key]
         for camera in views:
             error, numbered = _numbered(camera, key, poses[camera.name] @ boards[key], board)
-            if camera is anchor or error < 2 * camera.tolerance:
+            if camera is anchor or error < 3 * camera.tolerance:
                 seen[camera.name][key] = numbered
             else:
                 left_out.append((camera.name, key))
@@ -202,7 +223,7 @@ def _why_unconnected(
 
 def _contradiction(a: Seen, b: Seen, board: Board) -> str:
     """What would make two cameras' frames agree: one mirrored, or one a few frames late."""
-    for mirrored, other in ((b, a), (a, b)):
+    for mirrored, other in () if isinstance(board, Charuco) else ((b, a), (a, b)):
         if (found := pair_pose(other, _mirrored(mirrored, board), board)) and found.trusted:
             return f"they agree once {mirrored.name} is mirrored: save its pictures as the camera sees, not mirrored"
     for shift in (1, -1, 2, -2, 3, -3):
@@ -214,8 +235,6 @@ def _contradiction(a: Seen, b: Seen, board: Board) -> str:
 
 def _mirrored(seen: Seen, board: Board) -> Seen:
     """The camera as if its pictures were mirrored."""
-    if isinstance(board, Charuco):
-        return seen
     width, columns = seen.views.hw[1], board.columns
     K = seen.camera.K.clone()
     K[0, 2] = width - 1 - K[0, 2]
