@@ -379,6 +379,64 @@ class Train:
 
 
 @dataclass
+class Calibrate:
+    """Photographs of a board in, a rig out, with a report of how good it is.
+
+    A folder for each camera, or file names like left01.jpg, right01.jpg; pictures of one moment have the same number.
+    Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
+    """
+
+    photos: Positional[Path]
+    """Folder with the pictures (or videos) of all cameras."""
+    board: str
+    """charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm or acircles:4x11:20mm."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("rig.yaml")
+    """The rig file; its report (.html) and covariance (.covariance.json) go beside it."""
+    camera: UseAppendAction[tuple[str, ...]] = ()
+    """NAME=PATTERN, once for each camera, such as left='left*.jpg', where folders and names do not tell."""
+    lens: Literal["brown-conrady", "kannala-brandt", "none"] = "brown-conrady"
+    """Model of the lenses; kannala-brandt for fisheyes."""
+    depth: tuple[float, float] | None = None
+    """Near and far bounds in metres of what the rig will look at, written into the rig."""
+
+    def run(self) -> None:
+        """Do it."""
+        from calib.run import calibrate_photos
+
+        def bar(items: Iterable[Any], total: int) -> Iterable[Any]:
+            return track(items, "looking for the board", total=total, console=console)
+
+        patterns = dict(_name_and_file(text, "--camera") for text in self.camera)
+        said = calibrate_photos(
+            self.photos,
+            self.board,
+            self.out,
+            patterns={name: str(pattern) for name, pattern in patterns.items()},
+            lens=self.lens,
+            depth=self.depth,
+            progress=bar,
+        )
+        print("\n".join(said.lines))
+        console.print(f"written: {', '.join(map(str, said.written))}")
+
+
+@dataclass
+class Board:
+    """Make a calibration board to print, at its true size. Example: pat board charuco:8x6:30mm -o board.pdf"""
+
+    board: Positional[str]
+    """charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm or acircles:4x11:20mm."""
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("board.pdf")
+    """File to write, ending in .pdf or .svg."""
+
+    def run(self) -> None:
+        """Do it."""
+        from calib.run import write_board
+
+        console.print(f"written: {write_board(self.board, self.out)}")
+
+
+@dataclass
 class Info:
     """Fields of view, baselines, pixel footprints, and how long segments are for every pair."""
 
@@ -628,6 +686,8 @@ Command = (
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Systems, tyro.conf.subcommand("systems")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
+    | Annotated[Board, tyro.conf.subcommand("board")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
 
@@ -707,10 +767,10 @@ def _numbers_by_name(option: str, texts: Iterable[str]) -> dict[str, float]:
     return found
 
 
-def _name_and_file(text: str) -> tuple[str, Path]:
+def _name_and_file(text: str, option: str = "--image") -> tuple[str, Path]:
     name, separator, path = text.partition("=")
     if not (name and separator and path):
-        raise ValueError(f"--image: '{text}' is not NAME=FILE, such as mono=a.png")
+        raise ValueError(f"{option}: '{text}' is not NAME=FILE, such as mono=a.png")
     return name, Path(path)
 
 

@@ -304,7 +304,8 @@ PROBE = 192
 def expected_seconds(network: FusionNetwork, own: Tensor, betas: list[Beta], tiles: list[Tile]) -> float:
     """About how long the tiles will take here, by fusing a small piece from the middle of alpha twice."""
     h, w = own.shape[-2:]
-    top, left = max((h - PROBE) // 2, 0), max((w - PROBE) // 2, 0)
+    m = network.multiple
+    top, left = (max((side - PROBE) // 2, 0) // m * m for side in (h, w))
     box = (top, min(top + PROBE, h), left, min(left + PROBE, w))
     piece = Tile(box, box)
     _fuse_tile(network, own, betas, piece)
