@@ -65,10 +65,10 @@ class Texture:
     """How paints are laid on a surface.
 
     Patterns live in the object's own coordinates in metres and have about `scale` features a metre; `offset`
-    shifts them, `distortion` (0 to some) makes them irregular. They run through the `paints` in order. A
-    "picture" is a file (sRGB) laid `scale` times along the longer side of each face and multiplied by the first
-    paint's colour; its near infrared is the picture's red plus 1.5 times by how much green exceeds red and blue
-    (leaves), times the paint's.
+    shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They run
+    through the `paints` in order. A "picture" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
+    and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is its red plus
+    1.5 times by how much green exceeds red and blue (leaves), times the paint's. A "board" fills its plane.
     """
 
     kind: TextureKind = "plain"
@@ -76,6 +76,7 @@ class Texture:
     scale: float = 1.0
     offset: Vec3 = (0.0, 0.0, 0.0)
     distortion: float = 0.0
+    grain: float = 0.0
     picture: str = ""
     board: Board | None = None
 
@@ -157,19 +158,27 @@ class Motion:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Object:
-    """A shape with a material. `displacement` metres of relief are real geometry (and need `subdivisions`).
+class Relief:
+    """Bumps and dents in the surface itself, `height` metres to both sides and about `size` metres across."""
 
-    A "room" is a cube seen from inside. Object `i` of a scene has the index i + 1 in rendered index pictures.
+    height: float
+    size: float
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Object:
+    """A shape with a material, and perhaps a relief.
+
+    A "room" is a cube seen from inside; it casts no shadow. Object `i` of a scene has the index i + 1 in rendered
+    index pictures.
     """
 
     name: str
     shape: Shape
     motion: Motion
     material: Material = field(default_factory=Material)
-    displacement: float = 0.0
-    displacement_size: float = 0.5
-    subdivisions: int = 0
+    relief: Relief | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
