@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from pat.config import build, near
+from pat.synthesis.document import from_document, near
 
 from .cases import Case
 from .chain import Step
@@ -69,7 +69,7 @@ def _case(entry: Any, where: str) -> Case:
         raise ValueError(f"{where}: wanted a mapping with name, alpha and beta")
     for key in entry:
         if key not in ("name", "alpha", "beta"):
-            raise ValueError(f"{where}.{key}: unknown key; {near(str(key), ('name', 'alpha', 'beta'))}")
+            raise ValueError(f"{where}.{key}: unknown key{near(key, ('name', 'alpha', 'beta'))}")
     alpha, beta = (read_chain(entry.get(side, []), f"{where}.{side}") for side in ("alpha", "beta"))
     return Case(str(entry["name"]), alpha, beta)
 
@@ -79,14 +79,14 @@ def _step(entry: Any, where: str) -> Step:
     if not isinstance(name, str):
         raise ValueError(f"{where}: is {entry!r}; wanted a step's name, or one name with its options")
     if name not in STEPS:
-        raise ValueError(f"{where}: no step is called '{name}'; {near(name, STEPS)}")
+        raise ValueError(f"{where}: no step is called '{name}'{near(name, STEPS)}")
     kind = STEPS[name]
     if isinstance(options, Mapping) and not _is_band(kind, options):
-        return build(kind, options, f"{where}.{name}")
+        return from_document(kind, dict(options), f"{where}.{name}")
     first = next((f.name for f in fields(kind)), None)  # type: ignore[arg-type]
     if first is None:
         raise ValueError(f"{where}.{name}: takes no options, got {options!r}")
-    return build(kind, {first: options}, f"{where}.{name}")
+    return from_document(kind, {first: options}, f"{where}.{name}")
 
 
 def _is_band(kind: type[Step], options: Mapping[str, Any]) -> bool:

@@ -7,13 +7,17 @@ import difflib
 import math
 import types
 import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any, TypeVar
+
+import yaml
 
 T = TypeVar("T")
 
 
 def to_document(value: Any) -> Any:
-    """Dataclasses as mappings without what is at its default, tuples as lists, everything else as it is."""
+    """Dataclasses as mappings without what is at its default, tuples as lists, paths as text, the rest as it is."""
     if dataclasses.is_dataclass(value):
         return {
             f.name: to_document(v) for f in dataclasses.fields(value) if not _default(f, v := getattr(value, f.name))
@@ -22,7 +26,7 @@ def to_document(value: Any) -> Any:
         return [to_document(v) for v in value]
     if isinstance(value, dict):
         return {k: to_document(v) for k, v in value.items()}
-    return value
+    return str(value) if isinstance(value, Path) else value
 
 
 def from_document(kind: type[T], document: Any, entry: str = "") -> T:
@@ -31,6 +35,28 @@ def from_document(kind: type[T], document: Any, entry: str = "") -> T:
     Raises ValueError naming the entry for unknown keys, missing ones, and values of another type.
     """
     return typing.cast(T, _read(kind, document, entry))
+
+
+def read_yaml(path: str | Path) -> Any:
+    """What a YAML file holds. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" at line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{path}: not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}") from None
+
+
+def near(name: object, known: Iterable[str]) -> str:
+    """What to say after an unknown name: the nearest known one, or all of them.
+
+    >>> near("nois", ["noise", "clip"])
+    "; did you mean 'noise'?"
+    """
+    return _hint(name, tuple(known))
 
 
 def _default(field: dataclasses.Field[Any], value: Any) -> bool:
@@ -49,10 +75,10 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
         return value
     if origin is tuple:
         return _read_tuple(arguments, value, entry)
-    if origin is dict:
+    if origin in (dict, Mapping):
         return _read_mapping(arguments, value, entry)
     if origin in (typing.Union, types.UnionType):
-        return _read_optional(arguments, value, entry)
+        return _read_union(arguments, value, entry)
     return _read_plain(kind, value, entry)
 
 
@@ -68,7 +94,11 @@ def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
         if required and name not in value:
             raise ValueError(f"{_below(entry, name)}: missing")
     types_ = typing.get_type_hints(kind)
-    return kind(**{k: _read(types_[k], v, _below(entry, k)) for k, v in value.items()})
+    made = {k: _read(types_[k], v, _below(entry, k)) for k, v in value.items()}
+    try:
+        return kind(**made)
+    except ValueError as error:
+        raise ValueError(f"{entry}: {error}" if entry else str(error)) from None
 
 
 def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any, ...]:
@@ -86,17 +116,17 @@ def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[An
     return {k: _read(arguments[1], v, _below(entry, k)) for k, v in value.items()}
 
 
-def _read_optional(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
-    """The first of several types that fits; what the last says if none does."""
+def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
+    """The first of several types that fits; if none does, what one that is about as wanted says."""
     if value is None and type(None) in arguments:
         return None
-    kinds = [k for k in arguments if k is not type(None)]
-    for kind in kinds[:-1]:
+    said = []
+    for kind in (k for k in arguments if k is not type(None)):
         try:
             return _read(kind, value, entry)
-        except ValueError:
-            continue
-    return _read(kinds[-1], value, entry)
+        except ValueError as error:
+            said.append((isinstance(value, dict) == dataclasses.is_dataclass(kind), str(error)))
+    raise ValueError(max(said, key=lambda s: s[0])[1])
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
@@ -104,12 +134,24 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
         if math.isnan(value):
             raise ValueError(f"{entry}: is NaN; wanted a number")
         return float(value)
+    if kind is float and isinstance(value, str) and _is_number(value):
+        return float(value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ValueError(f"{entry}: is {value!r}; wanted {_PLAIN.get(kind, kind.__name__)}")
     return value
 
 
-_PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false"}
+_PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Path: "a path"}
+
+
+def _is_number(text: str) -> bool:
+    """YAML takes 1e-3 for text, because it has no point."""
+    try:
+        return not math.isnan(float(text))
+    except ValueError:
+        return False
 
 
 def _below(entry: str, key: object) -> str:

@@ -81,7 +81,7 @@ def test_a_chain_from_a_file_runs():
     [
         ("[{nois: {full_well: 3}}]", r"chain\[0\]: no step is called 'nois'; did you mean 'noise'"),
         ("[linear, {noise: {fullwell: 3}}]", r"chain\[1\].noise.fullwell: unknown key; did you mean 'full_well'"),
-        ("[{noise: {read: 3}}]", r"has no 'full_well'"),
+        ("[{noise: {read: 3}}]", r"full_well: missing"),
         ("[{noise: {full_well: many}}]", r"noise.full_well: is 'many'; wanted a number"),
         ("[{noise: {full_well: -3}}]", r"full_well > 0"),
         ("[{resample: {to: 0.5, method: cubic}}]", r"method: is 'cubic'; did you mean 'bicubic'"),

@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from pat.config import build, read_yaml
+from pat.synthesis.document import from_document, read_yaml, to_document
 
 
 @dataclass(frozen=True)
@@ -29,15 +29,18 @@ class Outer:
 
 
 def test_plain_data_becomes_dataclasses():
-    made = build(Outer, {"rate": "1e-3", "folders": ["a"], "inner": {"size": [1, 2]}, "names": {"x": 3}}, "file")
+    made = from_document(
+        Outer, {"rate": "1e-3", "folders": ["a"], "inner": {"size": [1, 2]}, "names": {"x": 3}}, "file"
+    )
     assert made == Outer(1e-3, (Path("a"),), Inner((1, 2)), None, {"x": 3})
-    assert build(Outer, {"rate": 1, "other": {"mode": "slow"}}, "file").other == Inner(mode="slow")
+    assert from_document(Outer, to_document(made), "file") == made
+    assert from_document(Outer, {"rate": 1, "other": {"mode": "slow"}}, "file").other == Inner(mode="slow")
 
 
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        ({}, "file: has no 'rate'"),
+        ({}, "file.rate: missing"),
         ({"rate": -1}, "file: rate must not be negative"),
         ({"rate": 1, "fodlers": []}, "file.fodlers: unknown key; did you mean 'folders'"),
         ({"rate": 1, "folders": "a"}, "file.folders: is 'a'; wanted a list"),
@@ -53,7 +56,7 @@ def test_plain_data_becomes_dataclasses():
 )
 def test_what_does_not_fit_is_named_with_its_place(data, words):
     with pytest.raises(ValueError, match=words):
-        build(Outer, data, "file")
+        from_document(Outer, data, "file")
 
 
 def test_a_file_that_is_not_yaml(tmp_path):
