@@ -31,10 +31,10 @@ class Frame:
     """One picture and its truth, at the pixels' centres.
 
     `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of the near
-    infrared, `alpha` how much of a pixel objects cover. `depth` is z in metres (float32), infinite where nothing is. `index` is 0 where nothing is, else the
-    object's place in the scene plus one. `normals` are unit vectors in the camera's frame; `flow` is how far each
-    pixel's point moves in the picture until the camera's next frame (for one frame: 1/30 s). What a lens does not
-    see has `depth` NaN and index 0.
+    infrared, `alpha` how much of a pixel objects cover. `depth` is z in metres (float32), infinite where nothing
+    is. `index` is 0 where nothing is, else the object's place in the scene plus one. `normals` are unit vectors in
+    the camera's frame; `flow` is how far each pixel's point moves in the picture until the camera's next frame (for
+    one frame: 1/30 s). What a lens does not see has `depth` NaN and index 0.
     """
 
     time: float

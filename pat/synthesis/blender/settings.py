@@ -36,9 +36,9 @@ class RenderSettings:
     """What is rendered, and how well.
 
     `width` resizes the rig so that its widest picture has that many pixels; None leaves it as it is. `passes` are
-    made beside colour, depth and index ("alpha" leaves the world's light out of the pictures). `duration` seconds are rendered at each camera's own frame rate and time
-    offset; 0 renders one frame a camera. `optics` is by camera name. `threads` of 0 uses all cores. `device`
-    "auto" takes a GPU where one is usable.
+    made beside colour, depth and index ("alpha" leaves the world's light out of the pictures). `duration` seconds
+    are rendered at each camera's own frame rate and time offset; 0 renders one frame a camera. `optics` is by
+    camera name. `threads` of 0 uses all cores. `device` "auto" takes a GPU where one is usable.
     """
 
     width: int | None = None
