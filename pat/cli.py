@@ -241,6 +241,45 @@ class Train(TrainConfig):
 
 
 @dataclass
+class Render:
+    """Render many scenes of a rig for training: workers, retries, resuming, clusters.
+
+    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again makes what is
+    missing. The file has at least `rig: rig.yaml`; see `pat.farm.job.RenderConfig`.
+    """
+
+    config: Positional[Path]
+    """What to render (YAML): rig, seed, backend and its settings."""
+    scenes: int
+    """How many scenes there should be in the end."""
+    out: Path
+    """Folder of the scenes."""
+    workers: int = 1
+    """Processes on this machine; with --scheduler local, of that cluster."""
+    shard: str = "1/1"
+    """i/n: only every n-th scene from the i-th on, for batch systems."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler (tcp://...), or "local"."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .farm.folders import Shard
+        from .farm.job import RenderConfig
+        from .farm.run import render
+        from .farm.workshop import Stopped
+
+        config, shard = RenderConfig.load(self.config), Shard.parse(self.shard)
+        options: dict[str, Any] = {"workers": self.workers, "shard": shard, "scheduler": self.scheduler}
+        try:
+            summary = render(config, scenes=self.scenes, out=self.out, console=console, **options)
+        except Stopped as error:
+            raise ValueError(str(error)) from None
+        console.print(f"{self.out}: {summary}", soft_wrap=True)
+        if not summary.complete:
+            sys.exit(1)
+
+
+@dataclass
 class Info:
     """Fields of view, baselines, pixel footprints, and how long segments are for every pair."""
 
@@ -319,6 +358,7 @@ Command = (
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
 

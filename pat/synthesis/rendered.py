@@ -6,7 +6,10 @@ one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `
 
 from __future__ import annotations
 
+import dataclasses
 import json
+import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -16,10 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom.rig import Rig
 
+from ..images import write_text
 from .scene import Scene
 
 RENDER_FILE = "render.json"
@@ -87,6 +92,38 @@ class Rendered:
     def first_frames(self) -> Mapping[str, Frame]:
         """The first frame of every camera."""
         return {name: self.frame(name) for name in self.rig.names}
+
+
+_STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals": np.float16, "index": np.uint16}
+_MOST = 6e4
+
+
+def save_frame(path: Path, frame: Frame) -> None:
+    """Write the arrays of a frame, on disk when this returns."""
+    arrays: dict[str, NDArray] = {}
+    for field in dataclasses.fields(frame):
+        value = getattr(frame, field.name)
+        if isinstance(value, Tensor):
+            kind = _STORED.get(field.name, np.float32)
+            array = value.numpy()
+            arrays[field.name] = (np.minimum(array, _MOST) if kind == np.float16 else array).astype(kind)
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def frame_file(rig: Rig, camera: str, number: int = 0) -> str:
+    """The name of a frame's file; the camera's number is in front where its name has odd characters."""
+    plain = re.sub(r"[^A-Za-z0-9_.+]", "_", camera)
+    same = plain == camera and not camera.startswith(".")
+    return f"{plain if same else f'{rig.names.index(camera):02d}_{plain}'}-{number:04d}.npz"
+
+
+def add_check(folder: Path, report: Mapping[str, Any]) -> None:
+    """Put what the self-check said into `render.json`."""
+    about = json.loads((folder / RENDER_FILE).read_text(encoding="utf-8"))
+    write_text(folder / RENDER_FILE, json.dumps({**about, "check": report}, indent=1))
 
 
 def is_rendered(folder: str | Path) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import os
-import re
 import shutil
 import tempfile
 import time
@@ -19,7 +18,6 @@ from uuid import uuid4
 import numpy as np
 import torch
 from jaxtyping import Float
-from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom.camera import Camera, View
@@ -27,7 +25,7 @@ from arraygeom.rig import Rig
 
 from ..document import to_document
 from ..flow import flow
-from ..rendered import RENDER_FILE, Frame, Rendered
+from ..rendered import RENDER_FILE, Frame, Rendered, frame_file, save_frame
 from ..scene import Scene
 from ..shapes import inside
 from . import compat
@@ -62,8 +60,8 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
         for shot in planned:
             frame = take(studio, rig[shot.camera], lenses[shot.camera], shot)
-            file = f"{_slug(shot.camera, rig)}-{shot.number:04d}.npz"
-            _save_frame(folder / file, frame)
+            file = frame_file(rig, shot.camera, shot.number)
+            save_frame(folder / file, frame)
             files[shot.camera].append({"file": file, "time": shot.time})
         rig.save(folder / "rig.yaml")
         scene.save(folder / "scene.yaml")
@@ -172,23 +170,6 @@ def _stack(channels: dict[str, Tensor], name: str, letters: str) -> Tensor:
     return torch.stack([channels[f"{name}.{letter}"] for letter in letters])
 
 
-_STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals": np.float16, "index": np.uint16}
-
-
-def _save_frame(path: Path, frame: Frame) -> None:
-    arrays: dict[str, NDArray] = {}
-    for field in dataclasses.fields(frame):
-        value = getattr(frame, field.name)
-        if isinstance(value, Tensor):
-            kind = _STORED.get(field.name, np.float32)
-            array = value.numpy()
-            arrays[field.name] = (np.minimum(array, 6e4) if kind == np.float16 else array).astype(kind)
-    with path.open("wb") as file:
-        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
-        file.flush()
-        os.fsync(file.fileno())
-
-
 @contextmanager
 def _staged(out: Path) -> Iterator[Path]:
     """A folder beside `out` that takes its name when all is written."""
@@ -208,9 +189,3 @@ def _scratch() -> Iterator[Path]:
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=where, prefix="pat-") as folder:
         yield Path(folder)
-
-
-def _slug(name: str, rig: Rig) -> str:
-    """A camera's name as part of a file's name, its number in front where the name has odd characters."""
-    plain = re.sub(r"[^A-Za-z0-9_.+]", "_", name)
-    return plain if plain == name and not name.startswith(".") else f"{rig.names.index(name):02d}_{plain}"
