@@ -37,21 +37,26 @@ class Mesh(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """A patch and how many cells it needs along s and t to look right."""
+    """A patch, how many cells it needs along s and t to look right, and whether corners that coincide are one.
+
+    They are not at the tip of a cone, where each has the normal of its own part of the side.
+    """
 
     patch: Patch
     cells: tuple[int, int]
+    weld: bool = True
 
 
 def mesh(thing: Object) -> Mesh:
-    """The object's surface, relief included."""
+    """The object's surface, relief included.
+
+    Patches of a plain shape do not share corners, so that edges between them are sharp; those of a relief do.
+    """
     extent = np.asarray(thing.motion.keys[0].extent)
     parts = [_part(s, extent, thing.relief) for s in SURFACES[thing.shape]]
-    starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
-    points = np.concatenate([p.vertices for p in parts])
-    faces = np.concatenate([p.faces + start for p, start in zip(parts, starts)])
-    welded = _welded(Mesh(points, faces, np.concatenate([p.uv for p in parts])), extent)
-    return welded if thing.relief is None else _with_relief(welded, thing.relief)
+    if thing.relief is None:
+        return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, SURFACES[thing.shape])])
+    return _with_relief(_welded(_joined(parts), extent), thing.relief)
 
 
 def inside(thing: Object, point: Float[NDArray, "3"], time: float, *, margin: float = 0.0) -> bool:
@@ -71,6 +76,12 @@ def _part(surface: _Surface, extent: NDArray, relief: Relief | None) -> Mesh:
     corner = np.arange((m + 1) * (n + 1)).reshape(m + 1, n + 1)
     faces = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], -1).reshape(-1, 4)
     return Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2)[faces])
+
+
+def _joined(parts: list[Mesh]) -> Mesh:
+    starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
+    faces = np.concatenate([p.faces + start for p, start in zip(parts, starts)])
+    return Mesh(np.concatenate([p.vertices for p in parts]), faces, np.concatenate([p.uv for p in parts]))
 
 
 def _cells(surface: _Surface, extent: NDArray, relief: Relief | None) -> tuple[int, int]:
@@ -185,7 +196,7 @@ SURFACES: dict[Shape, tuple[_Surface, ...]] = {
         _Surface(_disc(-0.5, 1), (_ROUND, _FLAT)),
         _Surface(_disc(0.5, -1), (_ROUND, _FLAT)),
     ),
-    "cone": (_Surface(_side(0), (_ROUND, _FLAT)), _Surface(_disc(0.5, -1), (_ROUND, _FLAT))),
+    "cone": (_Surface(_side(0), (_ROUND, _FLAT), weld=False), _Surface(_disc(0.5, -1), (_ROUND, _FLAT))),
     "torus": (_Surface(_torus, (_ROUND, _ROUND // 2)),),
 }
 

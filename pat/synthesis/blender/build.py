@@ -17,7 +17,6 @@ from . import compat
 
 Spectrum = Literal["rgb", "nir"]
 
-_SHARP = 0.6
 _STEPS = {"voronoi", "brick", "checker"}
 _MIRRORED = "MIRROR"
 
@@ -62,7 +61,6 @@ def _object(bpy: Any, thing: Object) -> Any:
     uv = np.concatenate([c[: len(f)] for f, c in zip(faces, surface.uv)])
     data.uv_layers.new(name="UVMap").data.foreach_set("uv", uv.astype(np.float32).ravel())
     data.polygons.foreach_set("use_smooth", np.ones(len(faces), dtype=bool))
-    data.set_sharp_from_angle(angle=_SHARP)
     item = bpy.data.objects.new(thing.name, data)
     item.rotation_mode = "QUATERNION"
     item.visible_shadow = thing.shape != "room"

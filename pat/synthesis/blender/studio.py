@@ -27,6 +27,7 @@ NOTHING = 1e9
 """Depths beyond this are where Blender hit nothing."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
+_SENSOR = 36.0
 _EXPOSURE = (0, 1, 2)
 
 
@@ -134,21 +135,21 @@ class Studio:
         self.blender.frame_set(1)
 
     def _aim(self, camera: Camera, optics: Optics) -> None:
-        """Blender's camera as ours: focal length and pixel pitch in true millimetres, so that apertures are true."""
+        """Blender's camera as ours, 36 units wide whatever the true sensor: Blender refuses less than 1 mm."""
         data, render = self.camera.data, self.blender.render
         (h, w), K = camera.hw, camera.K
         fx, fy = float(K[0, 0]), float(K[1, 1])
-        millimetre = 1e3 * optics.pixel_pitch
         render.resolution_x, render.resolution_y, render.resolution_percentage = w, h, 100
         render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
-        data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", w * millimetre, fx * millimetre
+        data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", _SENSOR, fx * _SENSOR / w
         aspect = render.pixel_aspect_y / render.pixel_aspect_x
         data.shift_x = (w / 2 - 0.5 - float(K[0, 2])) / w
         data.shift_y = (float(K[1, 2]) + 0.5 - h / 2) * aspect / w
         data.clip_start, data.clip_end = 1e-3, 1e5
         data.dof.use_dof = optics.f_number is not None
         if optics.f_number is not None and optics.focus is not None:
-            data.dof.focus_distance, data.dof.aperture_fstop = optics.focus, optics.f_number
+            aperture = 1e3 * fx * optics.pixel_pitch / optics.f_number
+            data.dof.focus_distance, data.dof.aperture_fstop = optics.focus, data.lens / aperture
         self.camera.matrix_world = _blender_pose(camera).T.tolist()
 
     def _shoot(self) -> dict[str, Tensor]:
