@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ FARTHEST = 50.0
 """Layered scenes of rigs that see to infinity end at this many times the near bound."""
 
 
+@runtime_checkable
 class Renderer(Protocol):
     """Renders scenes of one job."""
 

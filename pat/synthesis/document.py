@@ -130,6 +130,8 @@ def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
+    if kind is Any:
+        return value
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if math.isnan(value):
             raise ValueError(f"{entry}: is NaN; wanted a number")
