@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from ..check import Limits
+
 Pass = Literal["normals", "flow", "nir", "alpha"]
 
 
@@ -38,7 +40,8 @@ class RenderSettings:
     `width` resizes the rig so that its widest picture has that many pixels; None leaves it as it is. `passes` are
     made beside colour, depth and index ("alpha" leaves the world's light out of the pictures). `duration` seconds
     are rendered at each camera's own frame rate and time offset; 0 renders one frame a camera. `optics` is by
-    camera name. `threads` of 0 uses all cores. `device` "auto" takes a GPU where one is usable.
+    camera name. `threads` of 0 uses all cores. `limits` are what the self-check holds the first frames to. `device`
+    "auto" takes a GPU where one is usable.
     """
 
     width: int | None = None
@@ -52,6 +55,7 @@ class RenderSettings:
     passes: tuple[Pass, ...] = ()
     duration: float = 0.0
     optics: dict[str, Optics] = field(default_factory=dict)
+    limits: Limits = field(default_factory=Limits)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> RenderSettings:

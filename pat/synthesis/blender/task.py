@@ -23,6 +23,7 @@ from torch import Tensor
 from arraygeom.camera import Camera, View
 from arraygeom.rig import Rig
 
+from ..check import check_views
 from ..document import to_document
 from ..flow import flow
 from ..rendered import RENDER_FILE, Frame, Rendered, frame_file, save_frame
@@ -58,11 +59,13 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     with _staged(out) as folder, _scratch() as scratch:
         studio = Studio(scene, settings, scratch)
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
+        first: dict[str, Frame] = {}
         for shot in planned:
             frame = take(studio, rig[shot.camera], lenses[shot.camera], shot)
             file = frame_file(rig, shot.camera, shot.number)
             save_frame(folder / file, frame)
             files[shot.camera].append({"file": file, "time": shot.time})
+            first.setdefault(shot.camera, frame)
         rig.save(folder / "rig.yaml")
         scene.save(folder / "scene.yaml")
         about = {
@@ -70,6 +73,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
             "versions": {"blender": studio.bpy.app.version_string, "pat": version("arraygeom-pat")},
             "seconds": round(time.monotonic() - started, 3),
             "frames": files,
+            "check": check_views(rig, first, settings.limits).to_document(),
         }
         (folder / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
     return Rendered(out)
