@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -15,16 +15,20 @@ import torch
 from torch import Tensor
 
 from arraygeom.camera import Camera
+from arraygeom.pixels import HW
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from pat.sensors import Linear, record
+from pat.synthesis.blender.lens import lens_for
 from pat.synthesis.blender.settings import RenderSettings
+from pat.synthesis.blender.task import fitted, render_here, shots
 from pat.synthesis.check import Limits, Report, check_views
 from pat.synthesis.document import from_document
+from pat.synthesis.generators import GENERATORS
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rendered import RENDER_FILE, Frame, add_check, frame_file, save_frame
+from pat.synthesis.rendered import RENDER_FILE, Frame, frame_file, save_frame
 from pat.synthesis.rigs import RigBatch, RigDistribution
 
 FARTHEST = 50.0
@@ -53,6 +57,14 @@ class LayeredSettings:
     layers: tuple[int, int] = (5, 12)
     oversampling: int = 2
 
+    def check_rig(self, rig: Rig) -> None:
+        """Raises ValueError for a rig that cannot be rendered."""
+        rig_from_alpha(rig)
+
+    def pictures(self, rig: Rig) -> list[HW]:
+        """The sizes of the pictures of a scene."""
+        return [camera.hw for camera in rig.cameras.values()]
+
     def renderer(self, rig: Rig, limits: Limits) -> Renderer:
         """A renderer that is ready."""
         return LayeredRenderer(rig, self, limits)
@@ -80,6 +92,17 @@ class BlenderSettings:
         given = from_document(RenderSettings, dict(self.settings), "settings")
         changes = {name: getattr(given, name) for name in self.settings}
         return RenderSettings.preset(self.preset, **{"threads": 1, **changes})
+
+    def check_rig(self, rig: Rig) -> None:
+        """Raises ValueError for a rig that cannot be rendered."""
+        for name, camera in rig.cameras.items():
+            lens_for(camera, name)
+
+    def pictures(self, rig: Rig) -> list[HW]:
+        """The sizes of the pictures of a scene, as often as they are taken."""
+        settings = self.render_settings()
+        rig = fitted(rig, settings)
+        return [rig[shot.camera].hw for shot in shots(rig, settings)]
 
     def renderer(self, rig: Rig, limits: Limits) -> Renderer:
         """A renderer that is ready. Raises ValueError without Blender."""
@@ -169,17 +192,14 @@ class BlenderRenderer:
         from pat.synthesis.blender import compat
 
         compat.load()
-        self.rig, self.settings, self.limits = rig, settings, limits
-        self.render_settings = settings.render_settings()
+        self.rig, self.settings = rig, settings
+        self.render_settings = replace(settings.render_settings(), limits=limits)
 
     def render(self, seed: int, out: Path) -> Report:
         """Render, write and check."""
-        from pat.synthesis.blender import render_here
-        from pat.synthesis.generators import GENERATORS
-
         further = {} if self.settings.photos is None else {"folder": self.settings.photos}
-        scene = GENERATORS[self.settings.generator](seed, self.rig, **further)
+        moving = self.render_settings.duration
+        scene = GENERATORS[self.settings.generator](seed, self.rig, moving=moving, **further)
         rendered = render_here(scene, self.rig, out, settings=self.render_settings)
-        report = check_views(rendered.rig, rendered.first_frames(), self.limits)
-        add_check(out, report.to_document())
-        return report
+        said = dict(rendered.about["check"])
+        return Report(views=said["views"], pairs=said["pairs"], reasons=tuple(said["reasons"]))

@@ -78,8 +78,10 @@ class RenderConfig:
         return self.layered if self.backend == "layered" else self.blender
 
     def load_rig(self) -> Rig:
-        """The cameras. Raises ValueError."""
-        return Rig.load(self.rig)
+        """The cameras. Raises ValueError, also if the backend cannot render them."""
+        rig = Rig.load(self.rig)
+        self.settings.check_rig(rig)
+        return rig
 
     def renderer(self) -> Renderer:
         """A renderer that is ready. Raises ValueError for a rig that it cannot serve, or if a library is missing."""
@@ -87,12 +89,7 @@ class RenderConfig:
 
     def scene_bytes(self) -> float:
         """About how much disk a scene takes: 2 bytes a colour, 4 for depth, and what compression leaves of it."""
-        rig = self.load_rig()
-        if self.backend == "blender":
-            from pat.synthesis.blender.task import fitted
-
-            rig = fitted(rig, self.blender.render_settings())
-        return sum(10.0 * camera.hw[0] * camera.hw[1] for camera in rig.cameras.values()) + 20_000
+        return sum(10.0 * h * w for h, w in self.settings.pictures(self.load_rig())) + 20_000
 
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""

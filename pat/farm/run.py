@@ -79,6 +79,7 @@ def render(
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
+    config.load_rig()
     job = Job(config=config, root=Path(out).absolute(), tag=shard.tag)
     folder, wanted = job.folder, shard.of(scenes)
     job.root.mkdir(parents=True, exist_ok=True)
@@ -86,8 +87,8 @@ def render(
         folder.clean(shard.tag)
         job.write_manifest()
         job.save()
-        given_up = set(folder.given_up())
-        missing = [i for i in wanted if not folder.is_done(i) and i not in given_up]
+        done, given_up = set(folder.done()), set(folder.given_up())
+        missing = [i for i in wanted if i not in done | given_up]
         size = folder.bytes_per_scene() or config.scene_bytes()
         check_space(folder, len(missing), size)
         order = Order(
@@ -100,7 +101,7 @@ def render(
         outcomes = (
             local_pool(order, missing, workers) if scheduler is None else dask_pool(order, missing, scheduler, workers)
         )
-        summary = Summary(there=sum(map(folder.is_done, wanted)), given_up=[i for i in wanted if i in given_up])
+        summary = Summary(there=len(done & set(wanted)), given_up=sorted(given_up & set(wanted)))
         try:
             for _ in _shown(outcomes, summary, len(wanted), console or Console(stderr=True)):
                 pass

@@ -24,7 +24,6 @@ from torch import Tensor
 
 from arraygeom.rig import Rig
 
-from ..images import write_text
 from .scene import Scene
 
 RENDER_FILE = "render.json"
@@ -118,12 +117,6 @@ def frame_file(rig: Rig, camera: str, number: int = 0) -> str:
     plain = re.sub(r"[^A-Za-z0-9_.+]", "_", camera)
     same = plain == camera and not camera.startswith(".")
     return f"{plain if same else f'{rig.names.index(camera):02d}_{plain}'}-{number:04d}.npz"
-
-
-def add_check(folder: Path, report: Mapping[str, Any]) -> None:
-    """Put what the self-check said into `render.json`."""
-    about = json.loads((folder / RENDER_FILE).read_text(encoding="utf-8"))
-    write_text(folder / RENDER_FILE, json.dumps({**about, "check": report}, indent=1))
 
 
 def is_rendered(folder: str | Path) -> bool:

@@ -1,5 +1,6 @@
 """Whole jobs with the layered backend: `pat render`."""
 
+import errno
 import json
 import os
 import signal
@@ -20,7 +21,8 @@ from pat.farm.backends import rig_from_alpha
 from pat.farm.folders import JobFolder, Shard
 from pat.farm.job import Job, RenderConfig
 from pat.farm.run import Summary, check_space, render
-from pat.farm.workshop import Stopped, worker_command
+from pat.farm.worker import _Server
+from pat.farm.workshop import Stopped
 from pat.synthesis.rendered import Rendered
 from tests.pat.farm.journals import events, started_after_done
 from tests.pat.farm.test_workshop import ROOT, children, wait_for_the_end_of
@@ -199,15 +201,36 @@ def test_a_disk_that_fills_stops_the_job_cleanly(config, tmp_path, monkeypatch):
     assert (tmp_path / "data" / "scenes.jsonl").read_text() == ""
 
 
-def test_a_worker_says_what_is_missing(config, tmp_path, monkeypatch):
+def test_a_worker_reads_its_job_and_tells_what_goes_wrong(config, tmp_path, monkeypatch):
+    write(config, check={"texture": 1.1})
     job = Job(config=RenderConfig.load(config), root=tmp_path / "data", tag="1of1")
     job.root.mkdir()
     job.save()
     assert Job.load(job.file) == job
-    (tmp_path / "rig.yaml").unlink()
-    done = subprocess.run(worker_command(job.file), input="", capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout)["answer"] == "stop"
-    assert "rig.yaml: no such rig file" in done.stdout
+    server = _Server(job.file)
+    answer = server.answer(0, 0)
+    assert answer["answer"] == "refused"
+    assert "mono: " in answer["reason"]
+    assert "has texture (at least 110%)" in answer["reason"]
+    for error, wanted in (
+        (
+            OSError(errno.ENOSPC, "No space left on device"),
+            {"answer": "stop", "reason": "[Errno 28] No space left on device"},
+        ),
+        (OSError(errno.EIO, "broken"), {"answer": "crashed", "reason": "[Errno 5] broken"}),
+        (RuntimeError("two\nlines"), {"answer": "crashed", "reason": "RuntimeError: two lines"}),
+        (ValueError("inside an object"), {"answer": "refused", "reason": "inside an object"}),
+    ):
+        monkeypatch.setattr(server, "_make", raising(error))
+        assert server.answer(0, 0) == wanted
+    assert not list((tmp_path / "data/.work").glob("1of1-*"))
+
+
+def raising(error: Exception):
+    def fail(*_):
+        raise error
+
+    return fail
 
 
 def test_seeds_are_of_the_scene_and_the_attempt_alone(config, tmp_path):
