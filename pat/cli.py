@@ -280,6 +280,67 @@ class Render:
 
 
 @dataclass
+class DataShow:
+    """Draw samples of rendered scenes: recorded pictures, where some pixels look, truth and depth."""
+
+    folder: Positional[Path]
+    """Folder that `pat render` made."""
+    out: Path = Path("out/data.png")
+    """Picture to write."""
+    samples: int = 6
+    """How many patches."""
+    alpha: str | None = None
+    """The camera that is fused for; by default the first."""
+    sensors: Path | None = None
+    """File (YAML) with a list of steps for each camera, instead of what their responses say."""
+    seed: int = 0
+    """Of the choice of patches, and of noise."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .data import ScenePatches, SceneShuffle
+        from .data.show import draw_patches
+        from .results import save_figure
+        from .sensors import read_chains
+        from .synthesis.document import read_yaml
+
+        if self.samples < 1:
+            raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
+        chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
+        data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
+        chosen = list(SceneShuffle(data, seed=self.seed))[: self.samples]
+        save_figure(draw_patches([data[i] for i in chosen]), self.out)
+        console.print(f"written: {self.out} ({len(data)} patches of {len(data.scenes)} scenes in {self.folder})")
+
+
+@dataclass
+class DataInfo:
+    """What a folder of rendered scenes holds: sizes, seeds refused, scenes given up and why."""
+
+    folder: Positional[Path]
+    """Folder that `pat render` made."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .farm.summary import summarise
+
+        Console().print(summarise(self.folder), highlight=False, soft_wrap=True)
+
+
+@dataclass
+class DataCommand:
+    """Look at rendered scenes."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[DataShow, tyro.conf.subcommand("show")] | Annotated[DataInfo, tyro.conf.subcommand("info")]
+    ]
+
+    def run(self) -> None:
+        """Do it."""
+        self.command.run()
+
+
+@dataclass
 class Info:
     """Fields of view, baselines, pixel footprints, and how long segments are for every pair."""
 
@@ -359,6 +420,7 @@ Command = (
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Render, tyro.conf.subcommand("render")]
+    | Annotated[DataCommand, tyro.conf.subcommand("data")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
 
