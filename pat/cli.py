@@ -298,18 +298,20 @@ class DataShow:
 
     def run(self) -> None:
         """Do it."""
-        from .data import ScenePatches, SceneShuffle
+        import torch
+
+        from .data import ScenePatches
         from .data.show import draw_patches
         from .results import save_figure
-        from .sensors import read_chains
+        from .sensors import generator_for, read_chains
         from .synthesis.document import read_yaml
 
         if self.samples < 1:
             raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
         chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
         data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
-        chosen = list(SceneShuffle(data, seed=self.seed))[: self.samples]
-        save_figure(draw_patches([data[i] for i in chosen]), self.out)
+        chosen = torch.randperm(len(data), generator=generator_for(self.seed, "show"))[: self.samples]
+        save_figure(draw_patches([data[i] for i in chosen.tolist()]), self.out)
         console.print(f"written: {self.out} ({len(data)} patches of {len(data.scenes)} scenes in {self.folder})")
 
 

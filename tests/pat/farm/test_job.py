@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -67,15 +68,11 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     """The first run loses a worker and then its parent; the second makes the rest."""
     out = tmp_path / "data"
     command = [sys.executable, "-c", "from pat.cli import main; main()", "render", str(config), "--out", str(out)]
-    parent = subprocess.Popen([*command, "--scenes", "40"], stderr=subprocess.DEVNULL)
-    wait_until(lambda: len(JobFolder(out).done()) >= 2)
-    os.kill(children(parent.pid)[0], signal.SIGKILL)
-    known = len(JobFolder(out).done())
-    wait_until(lambda: len(JobFolder(out).done()) > known)
-    workers = children(parent.pid)
-    parent.kill()
-    parent.wait()
-    wait_for_the_end_of(workers)
+    with killed_in_the_end([*command, "--scenes", "40"]) as parent:
+        wait_until(lambda: len(JobFolder(out).done()) >= 2)
+        os.kill(children(parent.pid)[0], signal.SIGKILL)
+        known = len(JobFolder(out).done())
+        wait_until(lambda: len(JobFolder(out).done()) > known)
     had = len(JobFolder(out).done())
     main(["render", str(config), "--scenes", str(had + 2), "--out", str(out)])
     said = " ".join(capfd.readouterr().err.split())
@@ -94,29 +91,39 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     assert (frame.index > 0).all()
 
 
+@contextmanager
+def killed_in_the_end(command: list[str]):
+    """A run of `pat render` that is killed (kill -9) when the block ends; its workers go with it."""
+    parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    try:
+        yield parent
+    finally:
+        workers = children(parent.pid)
+        parent.kill()
+        parent.wait()
+        wait_for_the_end_of(workers)
+
+
 def wait_until(condition) -> None:
-    end = time.monotonic() + 200
+    end = time.monotonic() + 500
     while not condition():
         assert time.monotonic() < end
         time.sleep(0.02)
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_thirty_scenes_survive_ten_kills_and_dask_makes_the_same(config, tmp_path):
     out = tmp_path / "data"
     command = [sys.executable, "-c", "from pat.cli import main; main()", "render", str(config), "--out", str(out)]
     rng = np.random.default_rng(0)
     for turn in range(5):
-        parent = subprocess.Popen([*command, "--scenes", "30", "--workers", "2"], stderr=subprocess.DEVNULL)
         known = len(JobFolder(out).done())
-        wait_until(lambda p=parent, k=known: len(JobFolder(out).done()) >= min(k + 2, 30) or p.poll() is not None)
-        for pid in children(parent.pid)[:1]:
-            os.kill(pid, signal.SIGKILL)
-        time.sleep(rng.uniform(0, 8) if turn % 2 else rng.uniform(0, 1))
-        workers = children(parent.pid)
-        parent.kill()
-        parent.wait()
-        wait_for_the_end_of(workers)
+        with killed_in_the_end([*command, "--scenes", "30", "--workers", "2"]) as parent:
+            wait_until(lambda p=parent, k=known: len(JobFolder(out).done()) >= min(k + 2, 30) or p.poll() is not None)
+            for pid in children(parent.pid)[:1]:
+                os.kill(pid, signal.SIGKILL)
+            time.sleep(rng.uniform(0, 8) if turn % 2 else rng.uniform(0, 1))
     subprocess.run([*command, "--scenes", "30", "--workers", "2"], check=True)
     assert JobFolder(out).done() == list(range(30))
     assert started_after_done(out) == []
