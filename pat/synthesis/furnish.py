@@ -134,9 +134,8 @@ def _room(setting: Setting) -> _Room:
 def _rays(camera: Camera) -> NDArray:
     """Directions in the world, per metre of depth, of pixels all over the picture."""
     grid = coarse_grid(camera.hw, max(camera.hw) // 8 or 1).reshape(-1, 2)
-    X = camera.unproject(grid, grid.new_ones(len(grid))) - camera.centre
-    X = X.double().numpy()
-    return np.asarray(X[np.isfinite(X).all(1)])
+    directions = (camera.unproject(grid, grid.new_ones(len(grid))) - camera.centre).double().numpy()
+    return np.asarray(directions[np.isfinite(directions).all(1)])
 
 
 def _half_view(cameras: Sequence[Camera]) -> NDArray:

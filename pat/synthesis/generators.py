@@ -83,7 +83,7 @@ GENERATORS: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photograph
 def random_board_poses(rig: Rig, spec: Board, count: int, *, seed: int = 0) -> list[Pose]:
     """Poses (world_from_board) in front of all cameras at once: near and far, to all sides, tilted up to 40 degrees.
 
-    The board takes from a quarter to over half of the view of the camera that sees most of it.
+    The board is from 0.6 to 1.1 times as long as the narrowest view is wide, and its middle is in every picture.
     """
     setting = Setting(rig, seeded("poses", seed))
     return [_board_pose(setting, spec) for _ in range(count)]
@@ -154,17 +154,13 @@ def _board_key(pose: Pose, middle: NDArray, extent: Vec3, time: float) -> Key:
 def _board_pose(setting: Setting, spec: Board) -> Pose:
     """The board faces the cameras' middle, turned and tilted; its middle is where every camera can see."""
     rng = setting.rng
+    narrow = max(float((c.K[:2, :2].abs().amax(1) / torch.tensor([c.hw[1], c.hw[0]])).max()) for c in setting.cameras)
     for _ in range(200):
         camera = setting.camera()
-        h, w = camera.hw
-        fx, fy = (float(f) for f in camera.K[:2, :2].abs().amax(1))
-        depth = max(spec.wh[0] * fx / w, spec.wh[1] * fy / h) / float(rng.uniform(0.3, 0.75))
+        depth = max(spec.wh) * narrow / float(rng.uniform(0.6, 1.1))
         middle = setting.ahead(camera, rng.uniform(-0.6, 0.6, 2), depth)
-        if all(
-            bool(c.contains(p.x)) and bool(p.valid)
-            for c in setting.cameras
-            for p in [c.project(torch.from_numpy(middle))]
-        ):
+        seen = [(c, c.project(torch.from_numpy(middle))) for c in setting.cameras]
+        if all(bool(p.valid) and bool(c.contains(p.x)) for c, p in seen):
             break
     tilt = Rotation.from_rotvec([*np.radians(rng.uniform(-40, 40, 2)), math.radians(rng.uniform(-25, 25))])
     R = camera.R.double().numpy().T @ tilt.as_matrix()

@@ -31,6 +31,7 @@ from ..scene import Scene
 from ..shapes import inside
 from . import compat
 from .lens import Lens, lens_for
+from .probe import refuse_eevee
 from .settings import Optics, RenderSettings
 from .studio import NOTHING, Studio
 
@@ -52,6 +53,8 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     out = Path(out)
     if out.exists():
         raise ValueError(f"{out} exists: give a new folder, or remove it first")
+    if settings.engine == "eevee":
+        refuse_eevee()
     rig, started = fitted(rig, settings), time.monotonic()
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
@@ -132,7 +135,8 @@ def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> Frame:
         depth=lens.depth(depth, index),
         index=lens.nearest(index[None].float())[0].int(),
     )
-    return dataclasses.replace(frame, **_further(studio, camera, lens, shot, optics, frame, colours, exact))
+    further: dict[str, Any] = _further(studio, camera, lens, shot, optics, frame, colours, exact)
+    return dataclasses.replace(frame, **further)
 
 
 def _further(
