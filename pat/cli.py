@@ -437,6 +437,108 @@ class Board:
 
 
 @dataclass
+class Render:
+    """Render many scenes of a rig for training: workers, retries, resuming, clusters.
+
+    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again makes what is
+    missing. The file has at least `rig: rig.yaml`; see `pat.farm.job.RenderConfig`.
+    """
+
+    config: Positional[Path]
+    """What to render (YAML): rig, seed, backend and its settings."""
+    scenes: int
+    """How many scenes there should be in the end."""
+    out: Path
+    """Folder of the scenes."""
+    workers: int = 1
+    """Processes on this machine; with --scheduler local, of that cluster."""
+    shard: str = "1/1"
+    """i/n: only every n-th scene from the i-th on, for batch systems."""
+    scheduler: str | None = None
+    """Address of a Dask scheduler (tcp://...), or "local"."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .farm.folders import Shard
+        from .farm.job import RenderConfig
+        from .farm.run import render
+        from .farm.workshop import Stopped
+
+        config, shard = RenderConfig.load(self.config), Shard.parse(self.shard)
+        options: dict[str, Any] = {"workers": self.workers, "shard": shard, "scheduler": self.scheduler}
+        try:
+            summary = render(config, scenes=self.scenes, out=self.out, console=console, **options)
+        except Stopped as error:
+            raise ValueError(str(error)) from None
+        console.print(f"{self.out}: {summary}", soft_wrap=True)
+        if not summary.complete:
+            sys.exit(1)
+
+
+@dataclass
+class DataShow:
+    """Draw samples of rendered scenes: recorded pictures, where some pixels look, truth and depth."""
+
+    folder: Positional[Path]
+    """Folder that `pat render` made."""
+    out: Path = Path("out/data.png")
+    """Picture to write."""
+    samples: int = 6
+    """How many patches."""
+    alpha: str | None = None
+    """The camera that is fused for; by default the first."""
+    sensors: Path | None = None
+    """File (YAML) with a list of steps for each camera, instead of what their responses say."""
+    seed: int = 0
+    """Of the choice of patches, and of noise."""
+
+    def run(self) -> None:
+        """Do it."""
+        import torch
+
+        from .data import ScenePatches
+        from .data.show import draw_patches
+        from .results import save_figure
+        from .sensors import generator_for, read_chains
+        from .synthesis.document import read_yaml
+
+        if self.samples < 1:
+            raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
+        chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
+        data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
+        chosen = torch.randperm(len(data), generator=generator_for(self.seed, "show"))[: self.samples]
+        save_figure(draw_patches([data[i] for i in chosen.tolist()]), self.out)
+        console.print(f"written: {self.out} ({len(data)} patches of {len(data.scenes)} scenes in {self.folder})")
+
+
+@dataclass
+class DataInfo:
+    """What a folder of rendered scenes holds: sizes, seeds refused, scenes given up and why."""
+
+    folder: Positional[Path]
+    """Folder that `pat render` made."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .farm.summary import summarise
+
+        Console().print(summarise(self.folder), highlight=False, soft_wrap=True)
+
+
+@dataclass
+class DataCommand:
+    """Look at rendered scenes."""
+
+    command: OmitSubcommandPrefixes[
+        Annotated[DataShow, tyro.conf.subcommand("show")] | Annotated[DataInfo, tyro.conf.subcommand("info")]
+    ]
+
+    def run(self) -> None:
+        """Do it."""
+        self.command.run()
+
+
+@dataclass
 class Info:
     """Fields of view, baselines, pixel footprints, and how long segments are for every pair."""
 
@@ -686,8 +788,10 @@ Command = (
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Systems, tyro.conf.subcommand("systems")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Board, tyro.conf.subcommand("board")]
+    | Annotated[DataCommand, tyro.conf.subcommand("data")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
 
