@@ -53,12 +53,32 @@ class Lens(NamedTuple):
         )
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
-        """Depth along the very rays, exact on planes; beside edges the nearest pixel's. NaN where nothing is seen."""
+        """Depth along the very rays, exact on planes: beside edges the nearest pixel's surface is continued to them.
+
+        NaN where nothing is seen.
+        """
         if self.x is None or self.valid is None:
             return depth
         between, clean = depth_between(depth.double(), index, self.x, uneven=_STEP)
-        nearest = sample(depth[None, None], self.x[None].to(depth), interpolation="nearest").values[0, 0]
-        return torch.where(self.valid, torch.where(clean, between.to(depth), nearest), torch.nan)
+        continued = 1 / _continued(1 / depth.double(), self.x)
+        return torch.where(self.valid, torch.where(clean, between, continued), torch.nan).to(depth)
+
+
+def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
+    """Inverse depth at positions by that of the nearest pixel and its slopes to the more even sides."""
+    layers = torch.stack([inverse, _gentlest(inverse, 1), _gentlest(inverse, 0)])
+    q, across, down = sample(layers[None], x[None], interpolation="nearest").values[0]
+    dx, dy = (x - (x + 0.5).floor()).unbind(-1)
+    return (q + across * dx + down * dy).clamp(min=0)
+
+
+def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
+    """Of the differences to the two neighbours along an axis, the smaller."""
+    steps = inverse.diff(dim=dim)
+    edge = steps.narrow(dim, 0, 1) * torch.inf
+    edge = torch.where(edge.isnan(), torch.inf, edge)
+    before, after = torch.cat([edge, steps], dim), torch.cat([steps, edge], dim)
+    return torch.where(before.abs() < after.abs(), before, after)
 
 
 def lens_for(camera: View, name: str) -> Lens:
