@@ -75,8 +75,7 @@ def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> 
 def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
     """Of the differences to the two neighbours along an axis, the smaller."""
     steps = inverse.diff(dim=dim)
-    edge = steps.narrow(dim, 0, 1) * torch.inf
-    edge = torch.where(edge.isnan(), torch.inf, edge)
+    edge = torch.full_like(steps.narrow(dim, 0, 1), torch.inf)
     before, after = torch.cat([edge, steps], dim), torch.cat([steps, edge], dim)
     return torch.where(before.abs() < after.abs(), before, after)
 
