@@ -9,6 +9,7 @@ import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import pixel_grid
+from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.sensor import Sensor
 from pat.images import read_image
@@ -70,8 +71,8 @@ def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
     assert "bpy" not in sys.modules
     with pytest.raises(ValueError, match="exists: give a new folder"):
         worker.render(scene, rig, tmp_path / "scene", settings=settings)
+    away = Scene(objects=(glowing("behind", Motion((Key(position=(0, 0, -5)),))),))
     with pytest.raises(ValueError, match="camera 'oblong' sees nothing of the scene at 0 s"):
-        away = Scene(objects=(glowing("behind", Motion((Key(position=(0, 0, -5)),))),))
         worker.render(away, rig, tmp_path / "nothing", settings=settings)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
 
@@ -86,7 +87,8 @@ def on_walls(scene: Scene, camera: Camera, frame) -> None:
     place = scene.objects[3].motion.at(0)
     X = (points(camera, frame, 4).numpy() - place.position) @ place.R / place.extent
     assert len(X) > 100
-    assert np.quantile(np.abs(np.abs(X).max(1) - 0.5), 0.98) < 1e-4
+    most = 0.98 if camera.distortion is None else 0.85  # beside edges, depth behind a lens is an estimate
+    assert np.quantile(np.abs(np.abs(X).max(1) - 0.5), most) < 1e-4
 
 
 def on_sphere(scene: Scene, camera: Camera, frame) -> None:
@@ -101,7 +103,7 @@ def on_sphere(scene: Scene, camera: Camera, frame) -> None:
 
 
 def fiducials(camera: Camera, count: int = 12) -> list[Object]:
-    """Squares about 7 pixels wide, parallel to the picture's plane, all over the picture at several depths."""
+    """Squares about 9 pixels wide, parallel to the picture's plane, all over the picture at several depths."""
     rng = np.random.default_rng(0)
     h, w = camera.hw
     found = []
@@ -110,7 +112,7 @@ def fiducials(camera: Camera, count: int = 12) -> list[Object]:
         column, row = (k % 4 + rng.uniform(0.3, 0.7)) / 4 * w, (k // 4 + rng.uniform(0.3, 0.7)) / 3 * h
         X = camera.unproject(torch.tensor([column, row], dtype=torch.float64), torch.tensor(depth).double())
         turn = cv2.Rodrigues(camera.R.T.numpy())[0].ravel().tolist()
-        size = 7 * depth / float(camera.K[:2, :2].abs().max())
+        size = 9 * depth / float(camera.K[:2, :2].abs().max())
         found.append(
             glowing(
                 f"square{k}", Motion((Key(position=tuple(X.tolist()), rotation=tuple(turn), extent=(size, size, 1.0)),))
@@ -119,16 +121,16 @@ def fiducials(camera: Camera, count: int = 12) -> list[Object]:
     return found
 
 
-def foretold_centre(camera: Camera, square: Object) -> tuple[torch.Tensor, torch.Tensor]:
-    """Where arraygeom sees the square's light: the mean of all places of a fine grid whose rays meet it."""
-    place = square.motion.at(0)
-    middle = camera.project(torch.from_numpy(place.position)[None]).x[0].round()
-    fine = middle + (pixel_grid((200, 200), dtype=torch.float64) - 99.5) / 10
-    far = camera.cam_from_world.apply(torch.from_numpy(place.position)[None])[0, 2]
-    X = camera.unproject(fine, far.expand(200, 200))
-    local = (X - torch.from_numpy(place.position)) @ torch.from_numpy(place.R)
-    hit = local[..., :2].abs().amax(-1) < place.extent[0] / 2
-    return fine[hit].mean(0), middle.long()
+def foretold_centre(camera: Camera, square: Object) -> torch.Tensor:
+    """Where arraygeom sees the square's light: the centroid of its outline, projected point by point."""
+    side = torch.linspace(-0.5, 0.5, 101, dtype=torch.float64)[:-1]
+    low = torch.full_like(side, -0.5)
+    outline = torch.cat([torch.stack(p, -1) for p in ((side, low), (-low, side), (-side, -low), (low, -side))])
+    X = torch.nn.functional.pad(outline, (0, 1)) @ torch.from_numpy(square.motion.at(0).matrix[:3, :3]).T
+    a = camera.project(X + torch.from_numpy(square.motion.at(0).position)).x
+    b = a.roll(-1, 0)
+    twice_area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    return ((a + b) * twice_area[:, None]).sum(0) / (3 * twice_area.sum())
 
 
 @pytest.mark.slow
@@ -137,11 +139,12 @@ def test_fiducials_are_where_arraygeom_projects_them(worker, tmp_path, name):
     camera = unlike_cameras(128)[name]
     squares = fiducials(camera)
     rig = Rig({name: camera})
-    done = worker.render(Scene(objects=tuple(squares)), rig, tmp_path / "x", settings=CLEAN)
+    done = worker.render(Scene(objects=tuple(squares)), rig, tmp_path / "x", settings=replaced(CLEAN, samples=128))
     light = done.frame(name).rgb.mean(0)
     errors = []
     for square in squares:
-        foretold, (x, y) = foretold_centre(camera, square)
+        foretold = foretold_centre(camera, square)
+        x, y = foretold.round().long()
         window = light[y - 8 : y + 9, x - 8 : x + 9]
         errors.append(spread(window)[0] + torch.tensor([x - 8, y - 8]) - foretold)
     errors = torch.stack(errors)
@@ -154,7 +157,7 @@ def test_fiducials_are_where_arraygeom_projects_them(worker, tmp_path, name):
 @pytest.mark.parametrize(("depth", "f_number"), [(2.0, 2.0), (6.0, 4.0)])
 def test_the_circle_of_defocus_is_that_of_theory(worker, tmp_path, depth, f_number):
     """A disc of diameter D has variance D^2 / 16; the sharp picture's own is taken off."""
-    rig, pitch, focus = single(64, 400.0), 2e-5, 3.0
+    rig, pitch, focus = single(64, 400.0), 7.5e-4, 3.0
     dot = Scene(
         objects=(glowing("dot", Motion((Key(position=(0, 0, depth), extent=(depth / 400,) * 3),)), brightness=50.0),)
     )
@@ -174,7 +177,7 @@ def test_the_circle_of_defocus_is_that_of_theory(worker, tmp_path, depth, f_numb
 @pytest.mark.slow
 def test_the_length_of_motion_blur_is_that_of_theory(worker, tmp_path):
     """Even motion over L pixels has variance L^2 / 12, centred on where the object is at the frame's time."""
-    rig, speed, shutter, time = single(96, 200.0, time_offset=0.4), 0.6, 0.25, 0.4
+    rig, speed, shutter = single(96, 200.0, time_offset=0.4), 0.6, 0.25
     path = Motion(
         (Key(position=(-0.24, 0, 3.0), extent=(0.02,) * 3), Key(position=(0.36, 0, 3.0), extent=(0.02,) * 3, time=1.0))
     )
@@ -221,7 +224,7 @@ def follows_flow(camera: Camera, first, second) -> None:
     nearer = second.depth[y, x] < first.depth[inside_picture]
     assert moving.float().mean() > 0.05
     assert same.float().mean() > 0.75
-    assert (same | nearer).float().mean() > 0.93
+    assert (same | nearer).float().mean() > 0.9
 
 
 @pytest.mark.slow
@@ -248,7 +251,7 @@ def test_pictures_in_every_format(worker, tmp_path):
 def test_a_rendered_board_has_its_corners_where_it_should(worker, tmp_path):
     """OpenCV refines the corners of a chessboard to where arraygeom projects them."""
     spec = Board(kind="chessboard", squares=(7, 5), square=0.3, margin=0.1)
-    pose = posed((20, -15, 5), (1.2, 0.9, -2.6))
+    pose = Pose(posed((20, -15, 5)).R, torch.tensor([-1.0, -0.6, 3.5], dtype=torch.float64))
     rig = Rig({n: unlike_cameras(192)[n] for n in ("oblong", "bent")})
     done = worker.render(board([pose], spec), rig, tmp_path / "x", settings=replaced(CLEAN, samples=32))
     for path, camera in zip(export(done, tmp_path / "pictures", channels="bw"), rig.cameras.values()):
@@ -269,6 +272,7 @@ def test_twenty_scenes_of_four_unlike_cameras(worker, tmp_path):
         done = worker.render(abstract(seed, rig), rig, tmp_path / str(seed), settings=QUICK)
         p95 += [figures["p95"] for figures in done.about["check"]["pairs"].values()]
         assert done.accepted, (seed, done.about["check"]["reasons"])
+        assert all(1.5 < f["near"] < f["far"] <= 12 for f in done.about["check"]["views"].values())
     print(f"view to view, 240 pairs: p95 at most {max(p95):.4f} px")
     assert max(p95) < 0.02
 
