@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -106,7 +107,8 @@ def render(
             for _ in _shown(outcomes, summary, len(wanted), console or Console(stderr=True)):
                 pass
         finally:
-            job.write_table(FACTS)
+            with suppress(OSError):
+                job.write_table(FACTS)
     return summary
 
 
