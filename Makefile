@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env demo showcase readme test test-long check format bench train
+.PHONY: help env synthesis demo showcase readme test test-long check format bench train
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -20,6 +20,7 @@ help:
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention"
 	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
+	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make env        only the environment, in $(VENV)"
 
 env: $(READY)
@@ -56,6 +57,10 @@ check: $(READY)
 format: $(READY)
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
+
+synthesis: $(READY)
+	@echo "== installing Blender"
+	@$(PIP) --editable '.[dev,synthesis]'
 
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention

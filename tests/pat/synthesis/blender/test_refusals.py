@@ -88,14 +88,14 @@ def test_a_hanging_process_is_ended(monkeypatch, tmp_path):
 
 def test_errors_of_the_process_come_back_as_they_are(monkeypatch, tmp_path):
     served_by(monkeypatch, """import sys; sys.stdin.readline(); print('{"error": "no light", "kind": "ValueError"}')""")
-    with pytest.raises(ValueError, match="^no light$"):
+    with pytest.raises(ValueError, match=r"^no light$"):
         render(room_scene(), RIG, tmp_path / "x", settings=SETTINGS)
 
 
 @pytest.mark.parametrize(
     ("make", "said"),
     [
-        (lambda: RenderSettings.preset("quick"), "unknown preset 'quick' .known: fast, paper"),
+        (lambda: RenderSettings.preset("quick"), r"unknown preset 'quick' \(known: fast, paper"),
         (lambda: Optics(f_number=2.0), "needs both f_number and focus"),
         (lambda: Optics(shutter=-1.0), "shutter must be above 0, got -1"),
         (lambda: task.fitted(RIG, RenderSettings(optics={"shiftd": Optics()})), "did you mean 'shifted'"),
