@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -81,33 +82,35 @@ def render(
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
     config.load_rig()
     job = Job(config=config, root=Path(out).absolute(), tag=shard.tag)
-    folder, wanted = job.folder, shard.of(scenes)
     job.root.mkdir(parents=True, exist_ok=True)
-    with folder.locked(shard.tag):
-        folder.clean(shard.tag)
-        job.write_manifest()
-        job.save()
-        done, given_up = set(folder.done()), set(folder.given_up())
-        missing = [i for i in wanted if i not in done | given_up]
-        size = folder.bytes_per_scene() or config.scene_bytes()
-        check_space(folder, len(missing), size)
-        order = Order(
-            root=job.root,
-            tag=shard.tag,
-            command=worker_command(job.file),
-            limits=config.limits,
-            scene_bytes=size,
-        )
-        outcomes = (
+    with job.folder.locked(shard.tag):
+        wanted = shard.of(scenes)
+        summary, missing, order = _prepared(job, wanted)
+        pool = (
             local_pool(order, missing, workers) if scheduler is None else dask_pool(order, missing, scheduler, workers)
         )
-        summary = Summary(there=len(done & set(wanted)), given_up=sorted(given_up & set(wanted)))
         try:
-            for _ in _shown(outcomes, summary, len(wanted), console or Console(stderr=True)):
+            for _ in _shown(pool, summary, len(wanted), console or Console(stderr=True)):
                 pass
         finally:
-            job.write_table(FACTS)
+            with suppress(OSError):
+                job.write_table(FACTS)
     return summary
+
+
+def _prepared(job: Job, wanted: list[int]) -> tuple[Summary, list[int], Order]:
+    """What there is, the scenes that are missing, and what workers are told. Raises ValueError."""
+    folder, config = job.folder, job.config
+    folder.clean(job.tag)
+    job.write_manifest()
+    job.save()
+    done, given_up = set(folder.done()), set(folder.given_up())
+    missing = [i for i in wanted if i not in done | given_up]
+    size = folder.bytes_per_scene() or config.scene_bytes()
+    check_space(folder, len(missing), size)
+    command = worker_command(job.file)
+    order = Order(root=job.root, tag=job.tag, command=command, limits=config.limits, scene_bytes=size)
+    return Summary(there=len(done & set(wanted)), given_up=sorted(given_up & set(wanted))), missing, order
 
 
 def check_space(folder: JobFolder, scenes: int, scene_bytes: float) -> None:
