@@ -127,7 +127,7 @@ class Charuco(Board):
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
         white = set()
         for corners, number in zip(self.opencv.getObjPoints(), self.opencv.getIds().reshape(-1)):
-            left, top = 1e3 * corners[:, :2].min(0)
+            left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
             self._draw_marker(axes, int(number), left, top, marker)
         for column, row in np.ndindex(self.columns + 1, self.rows + 1):
@@ -142,7 +142,7 @@ class Charuco(Board):
         step = side / bits
         for row, line in enumerate(black):
             edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-            for begin, end in edges.reshape(-1, 2):
+            for begin, end in edges.reshape(-1, 2).tolist():
                 axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
 
@@ -177,7 +177,7 @@ class Circles(Board):
 
     def _draw(self, axes: Any) -> None:
         radius = 1e3 * self.radius
-        for x, y in 1e3 * self.points[:, :2] + radius:
+        for x, y in (1e3 * self.points[:, :2] + radius).tolist():
             axes.add_patch(Circle((x, y), radius, facecolor="black", edgecolor="none"))
 
 

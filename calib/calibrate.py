@@ -67,7 +67,7 @@ def calibrate(views: Mapping[str, Views], board: Board, *, lens: Lens | Mapping[
     few pictures or only parallel boards, if cameras are not connected, or if their frames contradict each other.
     """
     models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
-    alone = {name: fit_alone(name, v, board, lens=models[name]) for name, v in views.items()}
+    alone = {name: fit_alone(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()}
     begin = initial_rig([Seen(name, a.camera, a.views, a.cam_from_board) for name, a in alone.items()], board)
     cameras = {name: a.camera.replace(cam_from_world=begin.cam_from_world[name]) for name, a in alone.items()}
     together = _together(_scene(cameras, begin.world_from_board, begin.views, board), alone)
@@ -107,14 +107,19 @@ class Alone(NamedTuple):
         return {key: Pose(boards.R[i], boards.t[i]) for i, key in enumerate(self.frames)}
 
 
-def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady") -> Alone:
-    """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does."""
+def fit_alone(
+    name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
+) -> Alone:
+    """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does.
+
+    Where this is not `final`, as other cameras will add what they know, a focal length that is told badly is let pass.
+    """
     start = calibrate_camera(name, views, board, lens=lens)
     kept = _without_outliers(views, start)
     if len(kept.seen) < len(views.seen):
         start = calibrate_camera(name, kept, board, lens=lens)
     scene = _scene({name: start.camera}, start.cam_from_board, {name: kept}, board)
-    fit, _, notes = _fitted(scene)
+    fit, _, notes = _fitted(scene, final=final)
     found = Alone(fit, kept, tuple(start.cam_from_board), tuple(notes))
     check_tilts(name, found.cam_from_board)
     return found
@@ -209,14 +214,14 @@ def _observations(views: Views, index: Mapping[FrameKey, int], board: Board) -> 
     return Observations(*(np.concatenate(part) for part in zip(*parts)))
 
 
-def _fitted(scene: Scene) -> tuple[Fit, dict[str, np.ndarray], list[str]]:
+def _fitted(scene: Scene, *, final: bool = True) -> tuple[Fit, dict[str, np.ndarray], list[str]]:
     """All that the pictures tell: fitted, and what they turn out not to tell given up, until that is nothing."""
     sigma = noise(scene, 0)
     full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(scene.cameras.items())}
-    scene, free, notes = gate(scene, full, sigma)
+    scene, free, notes = gate(scene, full, sigma, final=False)
     fit = adjust(scene, free)
     while True:
-        scene, free, more = gate(fit.scene, free, fit.sigma)
+        scene, free, more = gate(fit.scene, free, fit.sigma, final=final)
         if not more:
             return fit, free, notes
         notes, fit = notes + more, adjust(scene, free)

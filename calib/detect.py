@@ -132,7 +132,7 @@ _FINDERS = {Chessboard: _chessboard, Charuco: _charuco, Circles: _circles}
 def _spans_a_plane(found: Detection, board: Board) -> bool:
     """Whether the points do not all lie on one line of the board."""
     p = board.points[found.ids, :2]
-    return np.linalg.svd(p - p.mean(0), compute_uv=False)[1] > 0.5 * board.spacing
+    return bool(np.linalg.svd(p - p.mean(0), compute_uv=False)[1] > 0.5 * board.spacing)
 
 
 def _smooth(found: Detection, board: Board) -> bool:
