@@ -248,7 +248,9 @@ def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[s
         raise ValueError(f"board '{text}': '{rest[0]}' is not understood; write it like charuco:8x6:30mm:22mm:4x4_50")
     marker = _length(text, lengths[0]) if lengths else 0.75 * spacing
     if not marker < spacing:
-        raise ValueError(f"board '{text}': markers of {_millimetres(marker)} do not fit into squares that are no larger")
+        raise ValueError(
+            f"board '{text}': markers of {_millimetres(marker)} do not fit into squares that are no larger"
+        )
     name = _dictionary_name(text, names[0] if names else "4x4", (columns * rows + 1) // 2)
     return Charuco(columns - 1, rows - 1, spacing, marker=marker, dictionary=name, legacy="legacy" in options)
 

@@ -2,8 +2,8 @@
 
 What is looked at comes in blocks that only cameras tie together: a board in one pose (6 numbers), or a free point
 (3). Gauss-Newton with Levenberg's damping on the Schur complement of the blocks (Triggs et al. 2000, section 6); the
-derivatives by the cameras' numbers are autodiff's through `arraygeom`. Pixels are weighed by each camera's own noise, and
-a residual r beyond k = 3 standard deviations by (k / r)^2, so that a gross error has next to no say.
+derivatives by the cameras' numbers are autodiff's through `arraygeom`. Pixels are weighed by each camera's own noise,
+and a residual r beyond k = 3 standard deviations by (k / r)^2, so that a gross error has next to no say.
 """
 
 from __future__ import annotations
@@ -173,7 +173,9 @@ def adjust(scene: Scene, free: Free, *, rounds: int = 4, iterations: int = 50) -
     give up on the one that starts worst.)
     """
     parameters = _count(free) + len(scene.structure) * scene.structure.width
-    scene, done, converged = _minimise(scene, free, dict.fromkeys(scene.cameras, max(scene.rms(), QUIETEST)), iterations)
+    scene, done, converged = _minimise(
+        scene, free, dict.fromkeys(scene.cameras, max(scene.rms(), QUIETEST)), iterations
+    )
     sigma = dict.fromkeys(scene.cameras, float(np.sqrt(np.mean(np.square(list(noise(scene, parameters).values()))))))
     for _ in range(rounds):
         scene, used, converged = _minimise(scene, free, sigma, iterations)
@@ -292,7 +294,12 @@ class NormalEquations:
         """The step of cameras (c,) and blocks (b, d), diagonals raised by the factor 1 + damping."""
         S, Y, inverse = self._reduced(damping)
         scale = 1 / np.sqrt(np.maximum(S.diagonal(), 1e-300))
-        change = scale * np.linalg.lstsq(S * scale[:, None] * scale, scale * (self.g - np.einsum("bcd,bd->c", Y, self.h)), rcond=1e-14)[0]
+        change = (
+            scale
+            * np.linalg.lstsq(
+                S * scale[:, None] * scale, scale * (self.g - np.einsum("bcd,bd->c", Y, self.h)), rcond=1e-14
+            )[0]
+        )
         blocks = np.einsum("bde,be->bd", inverse, self.h - np.einsum("bcd,c->bd", self.W, change))
         return change, blocks
 
@@ -314,7 +321,7 @@ def normal_equations(scene: Scene, free: Free, sigma: Mapping[str, float]) -> No
     d, b, c = scene.structure.width, len(scene.structure), _count(free)
     H, W, B, g, h = np.zeros((c, c)), np.zeros((b, c, d)), np.zeros((b, d, d)), np.zeros(c), np.zeros((b, d))
     at = 0
-    for name, camera in scene.cameras.items():
+    for name in scene.cameras:
         mine = slice(at, at := at + int(free[name].sum()))
         r, by_camera, by_block = _linearised(scene, name, sigma[name])
         by_camera = by_camera[..., free[name]]

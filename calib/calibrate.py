@@ -60,7 +60,9 @@ class Calibration:
         return dict(zip(self.fit.names, np.sqrt(self.fit.covariance.diagonal()).tolist()))
 
 
-def calibrate(views: Mapping[str, Views], board: Board, *, lens: Lens | Mapping[str, Lens] = "brown-conrady") -> Calibration:
+def calibrate(
+    views: Mapping[str, Views], board: Board, *, lens: Lens | Mapping[str, Lens] = "brown-conrady"
+) -> Calibration:
     """The rig that explains what its cameras saw of a board. Its world is the first camera.
 
     `lens` is the model for all cameras, or for each by name. Raises ValueError, saying what to do, if a camera has too
@@ -107,9 +109,7 @@ class Alone(NamedTuple):
         return {key: Pose(boards.R[i], boards.t[i]) for i, key in enumerate(self.frames)}
 
 
-def fit_alone(
-    name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
-) -> Alone:
+def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady", final: bool = True) -> Alone:
     """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does.
 
     Where this is not `final`, as other cameras will add what they know, a focal length that is told badly is let pass.
@@ -138,7 +138,9 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     """
     if len(scene.cameras) == 1:
         (only,) = alone.values()
-        return _Together(only.fit, {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}, list(only.notes))
+        return _Together(
+            only.fit, {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}, list(only.notes)
+        )
     fit, free, notes = _fitted(scene)
     if not (doubts := _doubts(fit, alone)):
         return _Together(fit, free, notes)

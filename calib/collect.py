@@ -72,7 +72,9 @@ def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[Fr
     if len(counts) == 1:
         return
     shown = [f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts]
-    raise ValueError(f"{name}: its pictures differ in size: {'; '.join(shown)}; keep those of one camera at one setting")
+    raise ValueError(
+        f"{name}: its pictures differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
+    )
 
 
 def _check_board(
@@ -97,7 +99,9 @@ def _missing(
     if not missing:
         return []
     labels = _named([p.label for p in missing], NAMED)
-    return [f"{name}: no board in {len(missing)} of {len(moments)} pictures ({labels}): {explain(_greys(missing), board)}"]
+    return [
+        f"{name}: no board in {len(missing)} of {len(moments)} pictures ({labels}): {explain(_greys(missing), board)}"
+    ]
 
 
 def _greys(photos: list[Photo]) -> Iterable[Grey]:

@@ -47,7 +47,10 @@ def coverage(views: Views, cam_from_board: Mapping[FrameKey, Pose], board: Board
     rows, columns = CELLS
     cells, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=(rows, columns), range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
     depths = np.concatenate(
-        [(board.points[d.ids] @ p.R[2].numpy()) + float(p.t[2]) for d, p in ((d, cam_from_board[k]) for k, d in views.seen.items())]
+        [
+            (board.points[d.ids] @ p.R[2].numpy()) + float(p.t[2])
+            for d, p in ((d, cam_from_board[k]) for k, d in views.seen.items())
+        ]
     )
     tilts = np.degrees([np.arccos(min(1.0, abs(float(cam_from_board[k].R[2, 2])))) for k in views.seen])
     found = Coverage(
@@ -71,7 +74,9 @@ def _missing(found: Coverage) -> list[str]:
         missing.append(f"points in only {found.share:.0%} of the picture: fill it, corners too")
     if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
         near, far = found.depths
-        missing.append(f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in others")
+        missing.append(
+            f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in others"
+        )
     if found.tilts[1] < TILTED_ENOUGH:
         missing.append(f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40")
     return missing

@@ -68,7 +68,7 @@ def other_size(pictures: Iterable[Grey], board: Board) -> str | None:
         return None
     size, votes = sizes.most_common(1)[0]
     same = set(size) == {board.columns, board.rows}
-    return None if same or votes < 2 and sizes.total() > 1 else f"{max(size)}x{min(size)}"
+    return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
 
 
 def _versions(grey: Grey) -> Iterator[Grey]:
@@ -196,5 +196,7 @@ def _grid_size(grey: Grey) -> tuple[int, int] | None:
     """The (columns, rows) of inner corners of the largest chessboard in a picture."""
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    done, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE)
+    done, _, meta = cv2.findChessboardCornersSBWithMeta(
+        small, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
     return (meta.shape[1], meta.shape[0]) if done else None

@@ -56,7 +56,9 @@ def calibrate_camera(name: str, views: Views, board: Board, *, lens: Lens = "bro
     try:
         K, coefficients, rotations, translations = _fisheye(views, board) if fisheye else _pinhole(views, board, lens)
     except cv2.error as error:
-        raise ValueError(f"{name}: OpenCV finds no camera that fits these boards ({error.err}): are they all alike?") from None
+        raise ValueError(
+            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): are they all alike?"
+        ) from None
     distortion = None if lens == "none" else Distortion(lens, torch.tensor(coefficients))
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     poses = {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}

@@ -104,7 +104,9 @@ def _usable(path: Path) -> bool:
 def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
-        raise ValueError(f"{name}: has {len(videos)} videos and {len(files) - len(videos)} pictures: keep one video, or pictures")
+        raise ValueError(
+            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} pictures: keep one video, or pictures"
+        )
     if videos:
         return dict(_video_frames(videos[0]))
     keys = frame_keys([f.stem for f in files])

@@ -87,7 +87,9 @@ def pair_pose(a: Seen, b: Seen, board: Board) -> PairPose | None:
     candidates = [a.poses[key] @ turn @ b.poses[key].inverse() for key in tried for turn in turns]
     voted = max((_vote(a, b, pose, shared, board) for pose in candidates), key=lambda v: v.score)
     for _ in range(2):
-        averaged = _average([_nearest(voted.pose, a.poses[k], b.poses[k], turns) for k in voted.agreeing] or [voted.pose])
+        averaged = _average(
+            [_nearest(voted.pose, a.poses[k], b.poses[k], turns) for k in voted.agreeing] or [voted.pose]
+        )
         voted = max(voted, _vote(a, b, averaged, shared, board), key=lambda v: v.score)
     corners = sum(len(a.views.seen[k].ids) + len(b.views.seen[k].ids) for k in voted.agreeing)
     return PairPose(voted.pose, voted.agreeing, shared, corners)
@@ -125,7 +127,10 @@ def symmetry_poses(board: Board) -> list[Pose]:
     found = []
     for image in board.symmetries:
         before, after = board.points - board.points.mean(0), board.points[image] - board.points.mean(0)
-        cosine, sine = (before[:, :2] * after[:, :2]).sum(), (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).sum()
+        cosine, sine = (
+            (before[:, :2] * after[:, :2]).sum(),
+            (before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]).sum(),
+        )
         angle = np.arctan2(sine, cosine)
         R = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
         found.append(Pose(torch.from_numpy(R), torch.from_numpy(board.points.mean(0) - R @ board.points.mean(0))))
@@ -227,7 +232,11 @@ def _contradiction(a: Seen, b: Seen, board: Board) -> str:
         if (found := pair_pose(other, _mirrored(mirrored, board), board)) and found.trusted:
             return f"they agree once {mirrored.name} is mirrored: save its pictures as the camera sees, not mirrored"
     for shift in (1, -1, 2, -2, 3, -3):
-        if (found := pair_pose(a, _shifted(a, b, shift), board)) and found.trusted and len(found.shared) >= FEWEST_TO_JUDGE:
+        if (
+            (found := pair_pose(a, _shifted(a, b, shift), board))
+            and found.trusted
+            and len(found.shared) >= FEWEST_TO_JUDGE
+        ):
             late = "late" if shift > 0 else "early"
             return f"they agree once {b.name} is taken to be {abs(shift)} frame{'s' * (abs(shift) > 1)} {late}: renumber its pictures"
     return "were the pictures taken at the same moments, numbered alike, and the cameras not moved in between?"

@@ -16,12 +16,11 @@ from matplotlib.figure import Figure
 from arraygeom import Camera, Pose, Rig
 from arraygeom.viz import COLOURS, draw_rig, show_picture
 
-from .bundle import BoardPoses, parameter_names
+from .bundle import BoardPoses
 from .calibrate import Calibration
-from .coverage import CELLS, Coverage, coverage
 from .covariance import RigCovariance, baseline_deviation, beta_covariance
+from .coverage import CELLS, Coverage, coverage
 from .observability import LENS_TERMS
-from .photos import FrameKey
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -216,7 +215,9 @@ def draw_scene(calibration: Calibration) -> Figure:
         x, _, z = camera.centre.tolist()
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
-        above.annotate(_plain(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center")
+        above.annotate(
+            _plain(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
+        )
         above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
     above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
     above.set_title("from above, with the boards", fontsize=9)
@@ -231,7 +232,9 @@ def draw_by_picture(calibration: Calibration) -> Figure:
     axes = figure.subplots()
     for colour, (name, r) in zip(_colours(), calibration.fit.scene.residuals().items()):
         block = calibration.fit.scene.seen[name].block
-        squared = np.bincount(block, (r**2).sum(-1), len(frames)) / np.maximum(np.bincount(block, minlength=len(frames)), 1)
+        squared = np.bincount(block, (r**2).sum(-1), len(frames)) / np.maximum(
+            np.bincount(block, minlength=len(frames)), 1
+        )
         present = np.bincount(block, minlength=len(frames)) > 0
         axes.plot(np.flatnonzero(present), np.sqrt(squared[present]), "o", ms=4, color=colour, label=_plain(name))
     step = max(1, len(frames) // 30)
@@ -295,7 +298,9 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
             usable = np.isfinite(pixels).all((1, 2))
             deviation = np.full(len(x), np.nan)
             deviation[usable] = np.sqrt(np.linalg.eigvalsh(pixels[usable])[:, -1])
-            shown = axes.imshow(deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm())
+            shown = axes.imshow(
+                deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm()
+            )
             axes.set(xticks=[], yticks=[])
             median = float(np.median(deviation[usable])) if usable.any() else float("nan")
             axes.set_title(f"{_plain(beta)} of {_plain(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
@@ -313,7 +318,12 @@ def image(figure: Figure) -> str:
 
 def _outline(calibration: Calibration) -> np.ndarray:
     low, high = calibration.board.points.min(0), calibration.board.points.max(0)
-    return np.array([[x, y, 0.0] for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1]))])
+    return np.array(
+        [
+            [x, y, 0.0]
+            for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1]))
+        ]
+    )
 
 
 def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:

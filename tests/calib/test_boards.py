@@ -13,7 +13,13 @@ from tests.calib.scenes import printed
 
 @pytest.mark.parametrize(
     "text",
-    ["chessboard:9x6:25mm", "charuco:8x6:30mm:22.5mm:4x4_50", "charuco:8x6:30mm:20mm:5x5_50:legacy", "circles:7x5:20mm", "acircles:4x11:20mm"],
+    [
+        "chessboard:9x6:25mm",
+        "charuco:8x6:30mm:22.5mm:4x4_50",
+        "charuco:8x6:30mm:20mm:5x5_50:legacy",
+        "circles:7x5:20mm",
+        "acircles:4x11:20mm",
+    ],
 )
 def test_names_read_back(text):
     assert str(parse_board(text)) == text
@@ -57,7 +63,13 @@ def test_wrong_names_say_what_is_wrong(text, message):
 
 @pytest.mark.parametrize(
     ("text", "count"),
-    [("chessboard:9x6:25mm", 2), ("chessboard:6x6:25mm", 4), ("charuco:8x6:30mm", 1), ("circles:7x5:20mm", 2), ("acircles:4x11:20mm", 1)],
+    [
+        ("chessboard:9x6:25mm", 2),
+        ("chessboard:6x6:25mm", 4),
+        ("charuco:8x6:30mm", 1),
+        ("circles:7x5:20mm", 2),
+        ("acircles:4x11:20mm", 1),
+    ],
 )
 def test_symmetries_are_turns_of_the_points(text, count):
     board = parse_board(text)
@@ -71,7 +83,14 @@ def test_symmetries_are_turns_of_the_points(text, count):
 
 @pytest.mark.parametrize(
     "text",
-    ["chessboard:9x6:25mm", "charuco:8x6:30mm", "charuco:7x6:30mm:20mm:5x5", "charuco:8x6:30mm:legacy", "circles:7x5:20mm", "acircles:4x11:15mm"],
+    [
+        "chessboard:9x6:25mm",
+        "charuco:8x6:30mm",
+        "charuco:7x6:30mm:20mm:5x5",
+        "charuco:8x6:30mm:legacy",
+        "circles:7x5:20mm",
+        "acircles:4x11:15mm",
+    ],
 )
 def test_prints_are_found_where_they_say(text):
     """Millimetres on paper, through the detector, to a fiftieth of a millimetre."""
@@ -91,7 +110,9 @@ def test_files_have_the_true_size(tmp_path):
     box = re.search(rb"/MediaBox \[ ?0 0 ([\d.]+) ([\d.]+)", pdf)
     assert [float(v) for v in box.groups()] == pytest.approx([width, height], abs=0.01)
     svg = write_board("charuco:8x6:30mm", tmp_path / "b.svg").read_text()
-    size = re.search(r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"|height="([\d.]+)pt"[^>]*width="([\d.]+)pt"', svg)
+    size = re.search(
+        r'<svg [^>]*?width="([\d.]+)pt" height="([\d.]+)pt"|height="([\d.]+)pt"[^>]*width="([\d.]+)pt"', svg
+    )
     assert sorted(float(v) for v in size.groups() if v) == pytest.approx(sorted([width, height]), abs=0.01)
 
 

@@ -171,7 +171,10 @@ def errors_of(fit, rig):
         truth = rig[name]
         R = (camera_found.R @ truth.R.T).numpy()
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        K, lens = (camera_found.K - truth.K).numpy(), camera_found.distortion.coefficients - truth.distortion.coefficients
+        K, lens = (
+            (camera_found.K - truth.K).numpy(),
+            camera_found.distortion.coefficients - truth.distortion.coefficients,
+        )
         values = [*turn, *(camera_found.t - truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
         entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
         found += [v for v, entry in zip(values, entries) if entry in fit.names]
@@ -202,7 +205,9 @@ def test_the_covariance_is_true():
         worst.append(pose_errors(fit, rig))
     count = len(error)
     low, high = chi2.ppf([0.001, 0.999], 30 * count)
-    print("chi-square", np.sum(squares), "of", 30 * count, "worst", np.abs(relative).max(), "poses", np.max(worst, axis=0))
+    print(
+        "chi-square", np.sum(squares), "of", 30 * count, "worst", np.abs(relative).max(), "poses", np.max(worst, axis=0)
+    )
     assert low < np.sum(squares) < high
     assert 0.9 < np.sqrt(np.mean(np.square(relative))) < 1.1
     assert np.abs(np.mean(relative, axis=0)).max() < 4 / np.sqrt(30)
@@ -220,7 +225,10 @@ def test_fifteen_cameras_fit_better_than_published(shared_data):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         rig = read_rig(folder / "output.json", hw=(2988, 5312))
-    rows = np.array([line.split() for line in bz2.decompress((folder / "kp.txt.bz2").read_bytes()).decode().splitlines()[1:6561]], float)
+    rows = np.array(
+        [line.split() for line in bz2.decompress((folder / "kp.txt.bz2").read_bytes()).decode().splitlines()[1:6561]],
+        float,
+    )
     x, seen = np.zeros((15, 1404, 2)), np.zeros((15, 1404), dtype=bool)
     index = rows[:, :2].astype(int).T
     x[tuple(index)], seen[tuple(index)] = rows[:, 2:], True

@@ -9,8 +9,8 @@ import torch
 from arraygeom import Pose, Rig
 from calib.boards import parse_board
 from calib.calibrate import calibrate, fit_alone
-from calib.coverage import coverage
 from calib.covariance import RigCovariance, beta_covariance
+from calib.coverage import coverage
 from calib.detect import Detection
 from calib.intrinsics import Views
 from calib.poses import symmetry_poses
@@ -38,7 +38,9 @@ def found(pair):
 
 
 def kept(views, **keys):
-    return {name: Views(v.hw, {k: d for k, d in v.seen.items() if k in keys.get(name, v.seen)}) for name, v in views.items()}
+    return {
+        name: Views(v.hw, {k: d for k, d in v.seen.items() if k in keys.get(name, v.seen)}) for name, v in views.items()
+    }
 
 
 def test_a_pair_is_found_within_its_uncertainty(pair, found):
@@ -61,7 +63,9 @@ def test_the_covariance_says_how_far_predictions_are_off(pair, found):
     both = []
     for r in (rig, found.rig):
         a, b = r.pair("mono", "colour").cameras
-        both.append(b.project(a.unproject(torch.from_numpy(x), torch.full((len(x),), 2.0, dtype=torch.float64))).x.numpy())
+        both.append(
+            b.project(a.unproject(torch.from_numpy(x), torch.full((len(x),), 2.0, dtype=torch.float64))).x.numpy()
+        )
     difference = both[1] - both[0]
     spread = beta_covariance(found.rig, covariance, "mono", "colour", x, 2.0)
     squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
@@ -98,8 +102,15 @@ def test_chessboards_that_are_numbered_from_either_end(pair):
     rig, boards, _ = pair
     turn = CHESS.symmetries[1]
     views = see(rig, boards, CHESS, noise=0.1)
-    whole = {n: Views(v.hw, {k: d for k, d in v.seen.items() if len(d.ids) == len(CHESS.points)}) for n, v in views.items()}
-    views = {n: Views(v.hw, {k: Detection(turn[d.ids], d.x) if n == "colour" and k % 3 == 1 else d for k, d in v.seen.items()}) for n, v in whole.items()}
+    whole = {
+        n: Views(v.hw, {k: d for k, d in v.seen.items() if len(d.ids) == len(CHESS.points)}) for n, v in views.items()
+    }
+    views = {
+        n: Views(
+            v.hw, {k: Detection(turn[d.ids], d.x) if n == "colour" and k % 3 == 1 else d for k, d in v.seen.items()}
+        )
+        for n, v in whole.items()
+    }
     result = calibrate(views, CHESS)
     assert result.rms < 0.2
     assert float((result.rig["colour"].centre - rig["colour"].centre).norm()) < 2e-3
@@ -127,7 +138,9 @@ def test_cameras_that_share_no_frame_are_refused(pair):
 
 def test_sets_a_frame_late_are_refused(pair):
     late = {name: Views(v.hw, {k + (name == "colour"): d for k, d in v.seen.items()}) for name, v in pair[2].items()}
-    with pytest.raises(ValueError, match=r"mono and colour contradict each other: .*once colour is taken to be 1 frame late"):
+    with pytest.raises(
+        ValueError, match=r"mono and colour contradict each other: .*once colour is taken to be 1 frame late"
+    ):
         calibrate(late, BOARD)
 
 

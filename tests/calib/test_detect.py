@@ -25,7 +25,12 @@ def picture(text, **changes):
 
 @pytest.mark.parametrize(
     ("text", "pixels"),
-    [("chessboard:9x6:25mm", 0.06), ("charuco:8x6:30mm", 0.06), ("circles:7x5:25mm", 0.15), ("acircles:4x11:16mm", 0.15)],
+    [
+        ("chessboard:9x6:25mm", 0.06),
+        ("charuco:8x6:30mm", 0.06),
+        ("circles:7x5:25mm", 0.15),
+        ("acircles:4x11:16mm", 0.15),
+    ],
 )
 def test_points_are_where_the_lens_puts_them(text, pixels):
     grey, board = picture(text)
@@ -42,7 +47,12 @@ def test_points_are_where_the_lens_puts_them(text, pixels):
     ("name", "change"),
     [
         ("inverted", lambda g: 255 - g),
-        ("dim and noisy", lambda g: (g * 0.06 + np.random.default_rng(0).normal(8, 0.7, g.shape)).round().clip(0, 255).astype(np.uint8)),
+        (
+            "dim and noisy",
+            lambda g: (
+                (g * 0.06 + np.random.default_rng(0).normal(8, 0.7, g.shape)).round().clip(0, 255).astype(np.uint8)
+            ),
+        ),
         ("12 of 16 bits", lambda g: g.astype(np.uint16) * 16),
         ("colour", lambda g: np.stack([g, g // 2, g // 3], -1)),
     ],

@@ -20,7 +20,10 @@ BOARD = "charuco:9x7:60mm"
 def photos(tmp_path_factory):
     """Six photographs of a board by two small cameras, in a folder for each."""
     folder = tmp_path_factory.mktemp("photos")
-    cameras = {"a": camera(330.0, (240, 320), lens=(-0.2, 0.05, 0, 0, 0)), "b": camera(280.0, (220, 300), (0.15, 0, 0), (0, -6, 1))}
+    cameras = {
+        "a": camera(330.0, (240, 320), lens=(-0.2, 0.05, 0, 0, 0)),
+        "b": camera(280.0, (220, 300), (0.15, 0, 0), (0, -6, 1)),
+    }
     boards = board_poses(6, depth=(0.8, 1.2), spread=0.1)
     for name, c in cameras.items():
         (folder / name).mkdir()
@@ -104,7 +107,9 @@ def test_one_picture(mine, capsys):
 def test_a_few_bad_pictures_are_named_and_left_out(mine, capsys):
     cv2.imwrite(str(mine / "a" / "shot_02.png"), np.full((240, 320), 90, np.uint8))
     run(mine)
-    assert "a: no board in 1 of 6 pictures (shot_02.png): the pictures have hardly any contrast" in capsys.readouterr().out
+    assert (
+        "a: no board in 1 of 6 pictures (shot_02.png): the pictures have hardly any contrast" in capsys.readouterr().out
+    )
 
 
 def test_other_mistakes(mine, capsys):
@@ -130,7 +135,16 @@ def test_videos(mine):
 @pytest.mark.slow
 def test_opencvs_pairs(shared_data, tmp_path, capsys):
     """RMS 0.195 px left and 0.217 px together, f 535.9 and baseline 83.2 mm are published."""
-    main(["calibrate", str(shared_data / "calibration/opencv_stereo"), "--board", "chessboard:9x6:25mm", "-o", str(tmp_path / "rig.yaml")])
+    main(
+        [
+            "calibrate",
+            str(shared_data / "calibration/opencv_stereo"),
+            "--board",
+            "chessboard:9x6:25mm",
+            "-o",
+            str(tmp_path / "rig.yaml"),
+        ]
+    )
     rig = Rig.load(tmp_path / "rig.yaml")
     assert float(rig["left"].K[0, 0]) == pytest.approx(535.9, rel=0.01)
     assert 1e3 * float(rig["right"].centre.norm()) == pytest.approx(83.2, rel=0.005)
@@ -153,7 +167,15 @@ def test_bumblebees_pairs(shared_data, tmp_path, capsys):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("camera_name", "focal"), [("int_cam01_img", 107599.7 / 64), ("int_cam02_img", 107118.7 / 64), ("int_cam03_img", 107622.3 / 64), ("int_cam04_img", 107215.0 / 64)])
+@pytest.mark.parametrize(
+    ("camera_name", "focal"),
+    [
+        ("int_cam01_img", 107599.7 / 64),
+        ("int_cam02_img", 107118.7 / 64),
+        ("int_cam03_img", 107622.3 / 64),
+        ("int_cam04_img", 107215.0 / 64),
+    ],
+)
 def test_action_cameras(camera_name, focal, shared_data):
     folder = shared_data / "calibration/pose2sim_4cam/intrinsics"
     board = parse_board("chessboard:4x7:60mm")
