@@ -138,9 +138,8 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     """
     if len(scene.cameras) == 1:
         (only,) = alone.values()
-        return _Together(
-            only.fit, {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}, list(only.notes)
-        )
+        fixed = {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}
+        return _Together(only.fit, fixed, list(only.notes))
     fit, free, notes = _fitted(scene)
     if not (doubts := _doubts(fit, alone)):
         return _Together(fit, free, notes)

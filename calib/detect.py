@@ -44,7 +44,7 @@ def detect(grey: Grey, board: Board) -> Detection | None:
 
 
 def to_grey(picture: np.ndarray) -> Grey:
-    """A picture (H, W) or (H, W, 3), of 8 or 16 bits, in grey, stretched to 0..255 from its 0.5th percentile to its 99.5th."""
+    """A picture (H, W) or (H, W, 3) in grey, 8 bits: stretched between percentiles 0.5 and 99.5 if dim or of 16 bits."""
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:

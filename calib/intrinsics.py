@@ -73,8 +73,8 @@ def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
     widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if widest < FEWEST_TILT:
         raise ValueError(
-            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be told "
-            "apart: tilt the board by 20 to 40 degrees, to different sides, in most of the pictures"
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be "
+            "told apart: tilt the board by 20 to 40 degrees, to different sides, in most of the pictures"
         )
 
 

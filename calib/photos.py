@@ -7,7 +7,6 @@ one moment have the same number (or the same name, apart from what all names of 
 from __future__ import annotations
 
 import math
-import os
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -69,10 +68,15 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
     if len(stems) == 1:
         numbers = pieces[0][1::2]
         return [int(numbers[-1]) if numbers else stems[0]]
-    head = len(os.path.commonprefix(pieces))  # type: ignore[type-var]
-    tail = len(os.path.commonprefix([p[head:][::-1] for p in pieces]))  # type: ignore[type-var]
+    head = _alike(pieces)
+    tail = _alike([p[head:][::-1] for p in pieces])
     middles = ["".join(p[head : len(p) - tail]) for p in pieces]
     return [int(m) if m.isdecimal() else m for m in middles]
+
+
+def _alike(lists: list[list[str]]) -> int:
+    """How many first items all lists share."""
+    return next((i for i, items in enumerate(zip(*lists)) if len(set(items)) > 1), min(map(len, lists)))
 
 
 def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Path]]:

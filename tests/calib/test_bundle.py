@@ -102,7 +102,7 @@ def test_perfect_corners_give_back_the_truth():
 
 def test_the_least_squares_are_scipys(small):
     """The same minimum and the same covariance as a general solver finds without Schur complement or autodiff."""
-    rig, _, scene = small
+    _, _, scene = small
     free = free_of(scene)
     fit = adjust(scene, free)
     counts = [int(mask.sum()) for mask in free.values()]
@@ -125,7 +125,7 @@ def test_the_least_squares_are_scipys(small):
 
 
 def test_gross_errors_have_no_say(small):
-    rig, boards, scene = small
+    _, _, scene = small
     clean = adjust(scene, free_of(scene))
     x = scene.seen["mono"].x.copy()
     x[::40] += np.random.default_rng(1).uniform(20, 60, x[::40].shape)

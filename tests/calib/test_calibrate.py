@@ -1,4 +1,4 @@
-"""From what cameras saw to a rig: the truth with its uncertainty, and a word for every set that cannot be calibrated."""
+"""From what cameras saw to a rig: the truth with its uncertainty, and a word for every set that cannot be used."""
 
 import re
 
