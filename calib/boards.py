@@ -138,10 +138,10 @@ class Charuco(Board):
         """Rows of neighbouring black bits as one rectangle each: no hairlines between bits."""
         dictionary = marker_dictionary(self.dictionary)
         bits = dictionary.markerSize + 2
-        black = cv2.aruco.generateImageMarker(dictionary, number, bits) == 0
+        black = np.asarray(cv2.aruco.generateImageMarker(dictionary, number, bits) == 0)
         step = side / bits
         for row, line in enumerate(black):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+            edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
             for begin, end in edges.reshape(-1, 2).tolist():
                 axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
@@ -231,7 +231,7 @@ def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
 
 
 def _black(x: float, y: float, width: float, height: float) -> Rectangle:
-    return Rectangle((x, y), width, height, facecolor="black", edgecolor="none")
+    return Rectangle((x, y), width, height, facecolor="black", edgecolor="none", snap=False)
 
 
 def _grid(columns: int, rows: int) -> np.ndarray:

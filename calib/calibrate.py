@@ -45,8 +45,8 @@ class Calibration:
     frames: tuple[FrameKey, ...]
     views: Mapping[str, Views]
     alone: Mapping[str, float]
-    epipolar: Mapping[tuple[str, str], Float[np.ndarray, " n"]]
-    held_out: Mapping[tuple[str, str], Float[np.ndarray, " n"]]
+    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
+    held_out: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -151,7 +151,7 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     return _Together(fit, posed, [*(note for a in alone.values() for note in a.notes), f"{doubts}; {kept}"])
 
 
-def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, " n"]]:
+def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
     """By pair: distances in undistorted pixels from beta's points to the lines of alpha's and the reverse, all frames."""
     found = {}
     for a, b in combinations(views, 2):

@@ -7,8 +7,8 @@ equalised and inverted in turn until the board is found.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ def detect(grey: Grey, board: Board) -> Detection | None:
 
 
 def to_grey(picture: np.ndarray) -> Grey:
-    """A picture (H, W) or (H, W, 3) in grey, 8 bits: stretched between percentiles 0.5 and 99.5 if dim or of 16 bits."""
+    """A picture (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:
@@ -126,7 +126,11 @@ def _circles(grey: Grey, board: Circles) -> Detection | None:
     return None
 
 
-_FINDERS = {Chessboard: _chessboard, Charuco: _charuco, Circles: _circles}
+_FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
+    Chessboard: _chessboard,
+    Charuco: _charuco,
+    Circles: _circles,
+}
 
 
 def _spans_a_plane(found: Detection, board: Board) -> bool:
@@ -157,8 +161,8 @@ def _reason(grey: Grey, board: Board) -> str:
         return "the pictures have hardly any contrast: expose them longer, or light the board"
     if isinstance(board, Charuco) and (reason := _charuco_reason(grey, board)):
         return reason
-    if isinstance(board, Chessboard) and (size := _grid_size(grey)) not in (None, (board.columns, board.rows)):
-        return f"a chessboard with {size[0]}x{size[1]} inner corners is seen: is the board's size right?"
+    if other := other_size([grey], board):
+        return f"a chessboard with {other} inner corners is seen: is the board's size right?"
     if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
         return "it is found once the picture is mirrored: save the pictures as the camera sees, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:

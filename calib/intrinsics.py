@@ -80,12 +80,14 @@ def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
 
 def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     """`cam_from_board` of one picture, for a camera whose intrinsics are known."""
-    rays, valid = camera.rays(torch.from_numpy(found.x))
-    rays = rays.numpy()
+    directions, valid = camera.rays(torch.from_numpy(found.x))
+    rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     flat = rays[usable, :2] / rays[usable, 2:]
-    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), None, r, t, True, cv2.SOLVEPNP_ITERATIVE)
+    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    _, r, t = cv2.solvePnP(
+        board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), r, t, True, cv2.SOLVEPNP_ITERATIVE
+    )
     return _pose(r, t)
 
 
@@ -97,7 +99,7 @@ def _pinhole(views: Views, board: Board, lens: Lens) -> Solved:
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if lens == "none":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
-    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), None, None, flags=flags)
+    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), np.eye(3), np.zeros(5), flags=flags)
     return K, c.reshape(-1)[:5], list(rotations), list(translations)
 
 

@@ -215,14 +215,14 @@ def _why_unconnected(
     if not crossing:
         see = "see" if len(rest) > 1 else "sees"
         return (
-            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take pictures with the board "
-            "where both see it, and check that pictures of one moment have the same number"
+            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take pictures with the "
+            "board where both see it, and check that pictures of one moment have the same number"
         )
     (a, b), pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
     by_name = {c.name: c for c in cameras}
     return (
-        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both see fit one "
-        f"relative pose; {_contradiction(by_name[a], by_name[b], board)}"
+        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both see fit "
+        f"one relative pose; {_contradiction(by_name[a], by_name[b], board)}"
     )
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
-from calib.boards import Board, draw_board, parse_board
+from calib.boards import Board, Circles, draw_board, parse_board
 from calib.bundle import BoardPoses, Observations, Scene
 from calib.detect import Detection
 from calib.intrinsics import Views
@@ -104,7 +104,7 @@ def printed(board: Board, dpi: int) -> tuple[np.ndarray, float, np.ndarray]:
     canvas.draw()
     grey = np.asarray(canvas.buffer_rgba())[..., 0]
     per_metre = dpi / 0.0254
-    from calib.boards import Circles
-
     first = board.radius if isinstance(board, Circles) else board.spacing
-    return np.ascontiguousarray(grey), per_metre, np.full(2, (0.012 + first) * per_metre - 0.5)
+    origin = np.full(2, (0.012 + first) * per_metre - 0.5)
+    origin[1] += len(grey) - figure.get_size_inches()[1] * dpi  # the canvas is cut to whole pixels at its top
+    return np.ascontiguousarray(grey), per_metre, origin

@@ -28,7 +28,7 @@ def pair_rig():
 
 @pytest.fixture(scope="module")
 def pair():
-    rig, boards = pair_rig(), board_poses(10)
+    rig, boards = pair_rig(), board_poses(10, spread=0.2)
     return rig, boards, see(rig, boards, noise=0.1)
 
 

