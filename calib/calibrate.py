@@ -152,7 +152,7 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
 
 
 def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's and the reverse, all frames."""
+    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the reverse."""
     found = {}
     for a, b in combinations(views, 2):
         xa, xb = _common(views[a], views[b])

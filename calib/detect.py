@@ -97,10 +97,10 @@ def _right_handed(grid: np.ndarray) -> np.ndarray:
     return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
 
 
-def _refined(grey: Grey, x: np.ndarray) -> np.ndarray:
-    """Corners where the gradients around them say, in windows that reach less than half way to the next corner."""
+def _refined(grey: Grey, x: np.ndarray, reach: float = 0.3) -> np.ndarray:
+    """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
     apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(0.3 * np.quantile(apart, 0.1), 2, 11))
+    half = int(np.clip(reach * np.quantile(apart, 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
@@ -113,7 +113,8 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
     corners, ids, _, _ = detector.detectBoard(grey)
     if ids is None or len(ids) < FEWEST:
         return None
-    return Detection(ids.reshape(-1).astype(np.int64), _refined(grey, corners.reshape(-1, 2)))
+    gap = (1 - board.marker / board.spacing) / 2  # nothing but the crossing may be in the window
+    return Detection(ids.reshape(-1).astype(np.int64), _refined(grey, corners.reshape(-1, 2), 0.9 * gap))
 
 
 def _circles(grey: Grey, board: Circles) -> Detection | None:

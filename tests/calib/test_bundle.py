@@ -52,7 +52,7 @@ def small():
     """Two cameras, eight boards, noise of 0.1 px; the truth."""
     rig = four_cameras()
     rig = Rig({name: rig[name] for name in ("mono", "colour")})
-    boards = board_poses(8)
+    boards = board_poses(8, spread=0.2)
     return rig, boards, scene_of(rig, boards, see(rig, boards, noise=0.1))
 
 

@@ -74,7 +74,7 @@ def test_the_covariance_says_how_far_predictions_are_off(pair, found):
 
 
 def test_held_out_frames_are_no_worse(found):
-    assert found.held_out["mono", "colour"].mean() < 1.6 * found.epipolar["mono", "colour"].mean() < 0.2
+    assert found.held_out["mono", "colour"].mean() < 1.6 * found.epipolar["mono", "colour"].mean() < 0.25
 
 
 def test_the_covariance_is_kept_in_a_file(found, tmp_path):
