@@ -127,7 +127,7 @@ class Charuco(Board):
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
         white = set()
         for corners, number in zip(self.opencv.getObjPoints(), self.opencv.getIds().reshape(-1)):
-            left, top = 1e3 * corners[:, :2].min(0)
+            left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
             self._draw_marker(axes, int(number), left, top, marker)
         for column, row in np.ndindex(self.columns + 1, self.rows + 1):
@@ -138,11 +138,11 @@ class Charuco(Board):
         """Rows of neighbouring black bits as one rectangle each: no hairlines between bits."""
         dictionary = marker_dictionary(self.dictionary)
         bits = dictionary.markerSize + 2
-        black = cv2.aruco.generateImageMarker(dictionary, number, bits) == 0
+        black = np.asarray(cv2.aruco.generateImageMarker(dictionary, number, bits) == 0)
         step = side / bits
         for row, line in enumerate(black):
-            edges = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-            for begin, end in edges.reshape(-1, 2):
+            edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+            for begin, end in edges.reshape(-1, 2).tolist():
                 axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
 
@@ -177,7 +177,7 @@ class Circles(Board):
 
     def _draw(self, axes: Any) -> None:
         radius = 1e3 * self.radius
-        for x, y in 1e3 * self.points[:, :2] + radius:
+        for x, y in (1e3 * self.points[:, :2] + radius).tolist():
             axes.add_patch(Circle((x, y), radius, facecolor="black", edgecolor="none"))
 
 
@@ -231,7 +231,7 @@ def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
 
 
 def _black(x: float, y: float, width: float, height: float) -> Rectangle:
-    return Rectangle((x, y), width, height, facecolor="black", edgecolor="none")
+    return Rectangle((x, y), width, height, facecolor="black", edgecolor="none", snap=False)
 
 
 def _grid(columns: int, rows: int) -> np.ndarray:

@@ -2,14 +2,14 @@
 
 What is looked at comes in blocks that only cameras tie together: a board in one pose (6 numbers), or a free point
 (3). Gauss-Newton with Levenberg's damping on the Schur complement of the blocks (Triggs et al. 2000, section 6); the
-derivatives by the cameras' numbers are autodiff's through `arraygeom`. Pixels are weighed by each camera's own noise, and
-a residual r beyond k = 3 standard deviations by (k / r)^2, so that a gross error has next to no say.
+derivatives by the cameras' numbers are autodiff's through `arraygeom`. Pixels are weighed by each camera's own noise,
+and a residual r beyond k = 3 standard deviations by (k / r)^2, so that a gross error has next to no say.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -45,8 +45,9 @@ class Observations(NamedTuple):
 class Structure(Protocol):
     """The blocks of what is looked at."""
 
-    width: int
-    """Numbers in a block."""
+    @property
+    def width(self) -> int:
+        """Numbers in a block."""
 
     def __len__(self) -> int: ...
 
@@ -65,7 +66,11 @@ class BoardPoses:
     """A rigid board in many poses, `world_from_board` batched over them."""
 
     world_from_board: Pose
-    width: int = field(default=6, init=False)
+
+    @property
+    def width(self) -> int:
+        """Six: a rotation vector and a translation."""
+        return 6
 
     def __len__(self) -> int:
         return len(self.world_from_board.t)
@@ -95,7 +100,11 @@ class FreePoints:
     """Points each on its own, metres."""
 
     X: Float[np.ndarray, "b 3"]
-    width: int = field(default=3, init=False)
+
+    @property
+    def width(self) -> int:
+        """Three."""
+        return 3
 
     def __len__(self) -> int:
         return len(self.X)
@@ -113,7 +122,7 @@ class FreePoints:
         return FreePoints(self.X + change)
 
 
-Free = Mapping[str, Bool[np.ndarray, " p"]]
+Free = Mapping[str, Bool[np.ndarray, "_"]]
 """By camera, which of its numbers may change, in the order of `parameter_names`."""
 
 
@@ -125,7 +134,7 @@ class Scene:
     structure: Structure
     seen: Mapping[str, Observations]
 
-    def residuals(self) -> dict[str, Float[np.ndarray, "n 2"]]:
+    def residuals(self) -> dict[str, Float[np.ndarray, "_ 2"]]:
         """By camera: measured minus projected, pixels."""
         found = {}
         for name, seen in self.seen.items():
@@ -321,7 +330,7 @@ def normal_equations(scene: Scene, free: Free, sigma: Mapping[str, float]) -> No
     d, b, c = scene.structure.width, len(scene.structure), _count(free)
     H, W, B, g, h = np.zeros((c, c)), np.zeros((b, c, d)), np.zeros((b, d, d)), np.zeros(c), np.zeros((b, d))
     at = 0
-    for name, camera in scene.cameras.items():
+    for name in scene.cameras:
         mine = slice(at, at := at + int(free[name].sum()))
         r, by_camera, by_block = _linearised(scene, name, sigma[name])
         by_camera = by_camera[..., free[name]]

@@ -45,8 +45,8 @@ class Calibration:
     frames: tuple[FrameKey, ...]
     views: Mapping[str, Views]
     alone: Mapping[str, float]
-    epipolar: Mapping[tuple[str, str], Float[np.ndarray, " n"]]
-    held_out: Mapping[tuple[str, str], Float[np.ndarray, " n"]]
+    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
+    held_out: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
     notes: tuple[str, ...] = field(default=())
 
     @property
@@ -69,7 +69,7 @@ def calibrate(
     few pictures or only parallel boards, if cameras are not connected, or if their frames contradict each other.
     """
     models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
-    alone = {name: fit_alone(name, v, board, lens=models[name]) for name, v in views.items()}
+    alone = {name: fit_alone(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()}
     begin = initial_rig([Seen(name, a.camera, a.views, a.cam_from_board) for name, a in alone.items()], board)
     cameras = {name: a.camera.replace(cam_from_world=begin.cam_from_world[name]) for name, a in alone.items()}
     together = _together(_scene(cameras, begin.world_from_board, begin.views, board), alone)
@@ -109,14 +109,17 @@ class Alone(NamedTuple):
         return {key: Pose(boards.R[i], boards.t[i]) for i, key in enumerate(self.frames)}
 
 
-def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady") -> Alone:
-    """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does."""
+def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady", final: bool = True) -> Alone:
+    """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does.
+
+    Where this is not `final`, as other cameras will add what they know, a focal length that is told badly is let pass.
+    """
     start = calibrate_camera(name, views, board, lens=lens)
     kept = _without_outliers(views, start)
     if len(kept.seen) < len(views.seen):
         start = calibrate_camera(name, kept, board, lens=lens)
     scene = _scene({name: start.camera}, start.cam_from_board, {name: kept}, board)
-    fit, _, notes = _fitted(scene)
+    fit, _, notes = _fitted(scene, final=final)
     found = Alone(fit, kept, tuple(start.cam_from_board), tuple(notes))
     check_tilts(name, found.cam_from_board)
     return found
@@ -135,9 +138,8 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     """
     if len(scene.cameras) == 1:
         (only,) = alone.values()
-        return _Together(
-            only.fit, {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}, list(only.notes)
-        )
+        fixed = {name: _free(c, False, lens=0) for name, c in scene.cameras.items()}
+        return _Together(only.fit, fixed, list(only.notes))
     fit, free, notes = _fitted(scene)
     if not (doubts := _doubts(fit, alone)):
         return _Together(fit, free, notes)
@@ -149,8 +151,8 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     return _Together(fit, posed, [*(note for a in alone.values() for note in a.notes), f"{doubts}; {kept}"])
 
 
-def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, " n"]]:
-    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's and the reverse, all frames."""
+def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the reverse."""
     found = {}
     for a, b in combinations(views, 2):
         xa, xb = _common(views[a], views[b])
@@ -213,14 +215,14 @@ def _observations(views: Views, index: Mapping[FrameKey, int], board: Board) -> 
     return Observations(*(np.concatenate(part) for part in zip(*parts)))
 
 
-def _fitted(scene: Scene) -> tuple[Fit, dict[str, np.ndarray], list[str]]:
+def _fitted(scene: Scene, *, final: bool = True) -> tuple[Fit, dict[str, np.ndarray], list[str]]:
     """All that the pictures tell: fitted, and what they turn out not to tell given up, until that is nothing."""
     sigma = noise(scene, 0)
     full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(scene.cameras.items())}
-    scene, free, notes = gate(scene, full, sigma)
+    scene, free, notes = gate(scene, full, sigma, final=False)
     fit = adjust(scene, free)
     while True:
-        scene, free, more = gate(fit.scene, free, fit.sigma)
+        scene, free, more = gate(fit.scene, free, fit.sigma, final=final)
         if not more:
             return fit, free, notes
         notes, fit = notes + more, adjust(scene, free)

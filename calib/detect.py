@@ -7,8 +7,8 @@ equalised and inverted in turn until the board is found.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -44,7 +44,7 @@ def detect(grey: Grey, board: Board) -> Detection | None:
 
 
 def to_grey(picture: np.ndarray) -> Grey:
-    """A picture (H, W) or (H, W, 3), of 8 or 16 bits, in grey, stretched to 0..255 from its 0.5th percentile to its 99.5th."""
+    """A picture (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
     grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:
@@ -68,7 +68,7 @@ def other_size(pictures: Iterable[Grey], board: Board) -> str | None:
         return None
     size, votes = sizes.most_common(1)[0]
     same = set(size) == {board.columns, board.rows}
-    return None if same or votes < 2 and sizes.total() > 1 else f"{max(size)}x{min(size)}"
+    return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
 
 
 def _versions(grey: Grey) -> Iterator[Grey]:
@@ -97,10 +97,10 @@ def _right_handed(grid: np.ndarray) -> np.ndarray:
     return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
 
 
-def _refined(grey: Grey, x: np.ndarray) -> np.ndarray:
-    """Corners where the gradients around them say, in windows that reach less than half way to the next corner."""
+def _refined(grey: Grey, x: np.ndarray, reach: float = 0.3) -> np.ndarray:
+    """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
     apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(0.3 * np.quantile(apart, 0.1), 2, 11))
+    half = int(np.clip(reach * np.quantile(apart, 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
@@ -113,7 +113,8 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
     corners, ids, _, _ = detector.detectBoard(grey)
     if ids is None or len(ids) < FEWEST:
         return None
-    return Detection(ids.reshape(-1).astype(np.int64), _refined(grey, corners.reshape(-1, 2)))
+    gap = (1 - board.marker / board.spacing) / 2  # nothing but the crossing may be in the window
+    return Detection(ids.reshape(-1).astype(np.int64), _refined(grey, corners.reshape(-1, 2), 0.9 * gap))
 
 
 def _circles(grey: Grey, board: Circles) -> Detection | None:
@@ -126,13 +127,17 @@ def _circles(grey: Grey, board: Circles) -> Detection | None:
     return None
 
 
-_FINDERS = {Chessboard: _chessboard, Charuco: _charuco, Circles: _circles}
+_FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
+    Chessboard: _chessboard,
+    Charuco: _charuco,
+    Circles: _circles,
+}
 
 
 def _spans_a_plane(found: Detection, board: Board) -> bool:
     """Whether the points do not all lie on one line of the board."""
     p = board.points[found.ids, :2]
-    return np.linalg.svd(p - p.mean(0), compute_uv=False)[1] > 0.5 * board.spacing
+    return bool(np.linalg.svd(p - p.mean(0), compute_uv=False)[1] > 0.5 * board.spacing)
 
 
 def _smooth(found: Detection, board: Board) -> bool:
@@ -157,8 +162,8 @@ def _reason(grey: Grey, board: Board) -> str:
         return "the pictures have hardly any contrast: expose them longer, or light the board"
     if isinstance(board, Charuco) and (reason := _charuco_reason(grey, board)):
         return reason
-    if isinstance(board, Chessboard) and (size := _grid_size(grey)) not in (None, (board.columns, board.rows)):
-        return f"a chessboard with {size[0]}x{size[1]} inner corners is seen: is the board's size right?"
+    if other := other_size([grey], board):
+        return f"a chessboard with {other} inner corners is seen: is the board's size right?"
     if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
         return "it is found once the picture is mirrored: save the pictures as the camera sees, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:

@@ -73,19 +73,21 @@ def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
     widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if widest < FEWEST_TILT:
         raise ValueError(
-            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be told "
-            "apart: tilt the board by 20 to 40 degrees, to different sides, in most of the pictures"
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be "
+            "told apart: tilt the board by 20 to 40 degrees, to different sides, in most of the pictures"
         )
 
 
 def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     """`cam_from_board` of one picture, for a camera whose intrinsics are known."""
-    rays, valid = camera.rays(torch.from_numpy(found.x))
-    rays = rays.numpy()
+    directions, valid = camera.rays(torch.from_numpy(found.x))
+    rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     flat = rays[usable, :2] / rays[usable, 2:]
-    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
-    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), None, r, t, True, cv2.SOLVEPNP_ITERATIVE)
+    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    _, r, t = cv2.solvePnP(
+        board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), r, t, True, cv2.SOLVEPNP_ITERATIVE
+    )
     return _pose(r, t)
 
 
@@ -97,7 +99,7 @@ def _pinhole(views: Views, board: Board, lens: Lens) -> Solved:
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if lens == "none":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
-    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), None, None, flags=flags)
+    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), np.eye(3), np.zeros(5), flags=flags)
     return K, c.reshape(-1)[:5], list(rotations), list(translations)
 
 

@@ -33,38 +33,48 @@ def natural_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [NATURAL_CENTRE * camera.hw[1]] * 2 + [*coefficients])
 
 
-def gate(scene: Scene, free: Free, sigma: dict[str, float]) -> tuple[Scene, dict[str, np.ndarray], list[str]]:
+def gate(
+    scene: Scene, free: Free, sigma: dict[str, float], *, final: bool = True
+) -> tuple[Scene, dict[str, np.ndarray], list[str]]:
     """Keep fixed, at what a plain camera has, every number of a lens that the pictures do not tell, worst first.
 
-    Returns the scene with those numbers set, what is still free, and sentences that say so. Raises ValueError where
-    a focal length is not told.
+    Returns the scene with those numbers set, what is still free, and sentences that say so. Once the fit is `final`,
+    raises ValueError where a focal length is not told.
     """
     mine, notes = {name: mask.copy() for name, mask in free.items()}, []
-    while (worst := _worst(scene, mine, sigma)) is not None:
-        name, index, share = worst
+    places = [(name, int(i)) for name in scene.cameras for i in np.flatnonzero(free[name])]
+    information = _relative_information(scene, free, sigma)
+    while (worst := _worst(places, information)) is not None:
+        name, index = places[worst]
         entry = parameter_names(scene.cameras[name])[index]
         if entry.startswith("focal"):
+            if not final:
+                break
             raise ValueError(
-                f"{name}: the pictures do not tell the focal length (to {100 * share * NATURAL_FOCAL:.0f} % at best): "
-                "tilt the board by 20 to 40 degrees, to different sides, and bring it close"
+                f"{name}: the pictures do not tell the focal length: tilt the board by 20 to 40 degrees, to different "
+                "sides, and bring it close in some of them"
             )
         mine[name][index] = False
+        places.pop(worst)
+        information = np.delete(np.delete(information, worst, 0), worst, 1)
         scene = _plain(scene, name, entry)
         notes.append(f"{name}: {_described(scene.cameras[name], entry)}: the pictures do not tell it")
     return scene, mine, notes
 
 
-def _worst(scene: Scene, free: Free, sigma: dict[str, float]) -> tuple[str, int, float] | None:
-    """The free number whose deviation is the largest share of its natural size, if that is too large."""
-    natural = {name: natural_sizes(camera)[free[name]] for name, camera in scene.cameras.items()}
-    sizes = np.concatenate(list(natural.values()))
-    information = normal_equations(scene, free, sigma).information()
-    covariance = np.linalg.inv(information * sizes[:, None] * sizes + np.eye(len(sizes)))
+def _relative_information(scene: Scene, free: Free, sigma: dict[str, float]) -> np.ndarray:
+    """The inverse covariance of the free numbers in units of their natural sizes."""
+    sizes = np.concatenate([natural_sizes(camera)[free[name]] for name, camera in scene.cameras.items()])
+    return normal_equations(scene, free, sigma).information() * sizes[:, None] * sizes
+
+
+def _worst(places: list[tuple[str, int]], information: np.ndarray) -> int | None:
+    """The number whose deviation is the largest share of its natural size, if too large; focal lengths last."""
+    covariance = np.linalg.inv(information + np.eye(len(places)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
-    places = [(name, int(i)) for name in scene.cameras for i in np.flatnonzero(free[name])]
-    lens = np.array([i >= 6 for _, i in places])
-    worst = int(np.argmax(np.where(lens, shares, 0.0)))
-    return (*places[worst], float(shares[worst])) if lens[worst] and shares[worst] > UNTOLD else None
+    order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in places]) * (shares > UNTOLD)
+    worst = int(np.lexsort((shares, order))[-1])
+    return worst if order[worst] else None
 
 
 def _plain(scene: Scene, name: str, entry: str) -> Scene:

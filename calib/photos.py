@@ -6,7 +6,7 @@ one moment have the same number (or the same name, apart from what all names of 
 
 from __future__ import annotations
 
-import os
+import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
@@ -20,17 +20,22 @@ from .detect import Grey, to_grey
 PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
-"""Of a video, at most this many frames are looked at, evenly spread."""
+"""Of a video, at most this many frames are looked at: every first, second, fourth, eighth ..., so that videos of
+somewhat different lengths share them."""
 
 FrameKey = int | str
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One picture of one camera; reading it is put off until it is needed. `label` is what to call it in words."""
+    """One picture of one camera; decoding it is put off until it is needed. `label` is what to call it in words."""
 
     label: str
-    read: Callable[[], Grey]
+    decode: Callable[[], np.ndarray]
+
+    def read(self) -> Grey:
+        """The picture in grey. Raises ValueError if it cannot be read."""
+        return to_grey(self.decode())
 
 
 Photos = Mapping[str, Mapping[FrameKey, Photo]]
@@ -63,10 +68,15 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
     if len(stems) == 1:
         numbers = pieces[0][1::2]
         return [int(numbers[-1]) if numbers else stems[0]]
-    head = len(os.path.commonprefix(pieces))  # type: ignore[type-var]
-    tail = len(os.path.commonprefix([p[head:][::-1] for p in pieces]))  # type: ignore[type-var]
+    head = _alike(pieces)
+    tail = _alike([p[head:][::-1] for p in pieces])
     middles = ["".join(p[head : len(p) - tail]) for p in pieces]
     return [int(m) if m.isdecimal() else m for m in middles]
+
+
+def _alike(lists: list[list[str]]) -> int:
+    """How many first items all lists share."""
+    return next((i for i, items in enumerate(zip(*lists)) if len(set(items)) > 1), min(map(len, lists)))
 
 
 def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Path]]:
@@ -109,17 +119,15 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     return {key: Photo(file.name, _reader(file)) for key, file in zip(keys, files)}
 
 
-def _reader(path: Path) -> Callable[[], Grey]:
-    def read() -> Grey:
-        picture = cv2.imdecode(
-            np.frombuffer(path.read_bytes(), np.uint8),
-            cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION,
-        )
+def _reader(path: Path) -> Callable[[], np.ndarray]:
+    def decode() -> np.ndarray:
+        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+        picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
         if picture is None:
             raise ValueError(f"{path}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
-        return to_grey(picture)
+        return picture
 
-    return read
+    return decode
 
 
 def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
@@ -128,18 +136,19 @@ def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
     video.release()
     if count < 1:
         raise ValueError(f"{path}: not a video that can be read: save pictures from it, or convert it to .mp4")
-    for index in range(0, count, max(1, -(-count // MOST_FRAMES))):
+    step = 1 << max(0, math.ceil(math.log2(count / MOST_FRAMES)))
+    for index in range(0, count, step):
         yield index, Photo(f"{path.name} frame {index}", _frame_reader(path, index))
 
 
-def _frame_reader(path: Path, index: int) -> Callable[[], Grey]:
-    def read() -> Grey:
+def _frame_reader(path: Path, index: int) -> Callable[[], np.ndarray]:
+    def decode() -> np.ndarray:
         video = cv2.VideoCapture(str(path))
         video.set(cv2.CAP_PROP_POS_FRAMES, index)
         done, picture = video.read()
         video.release()
         if not done:
             raise ValueError(f"{path}: frame {index} cannot be read: is the video whole?")
-        return to_grey(picture)
+        return picture
 
-    return read
+    return decode

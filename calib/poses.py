@@ -213,16 +213,16 @@ def _why_unconnected(
     rest = [c.name for c in cameras if c.name not in joined]
     crossing = {names: pair for names, pair in pairs.items() if (names[0] in joined) != (names[1] in joined)}
     if not crossing:
+        see = "see" if len(rest) > 1 else "sees"
         return (
-            f"{_listed(rest)} never {'see' if len(rest) > 1 else 'sees'} the board in the same frame as {_listed(joined)}: "
-            "take pictures with the board where both see it, and check that pictures of one moment have the same number"
+            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take pictures with the "
+            "board where both see it, and check that pictures of one moment have the same number"
         )
-    names, pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
+    (a, b), pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
     by_name = {c.name: c for c in cameras}
-    why = _contradiction(by_name[names[0]], by_name[names[1]], board)
     return (
-        f"{names[0]} and {names[1]} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both "
-        f"see fit one relative pose; {why}"
+        f"{a} and {b} contradict each other: only {len(pair.agreeing)} of the {len(pair.shared)} frames both see fit "
+        f"one relative pose; {_contradiction(by_name[a], by_name[b], board)}"
     )
 
 
@@ -232,13 +232,10 @@ def _contradiction(a: Seen, b: Seen, board: Board) -> str:
         if (found := pair_pose(other, _mirrored(mirrored, board), board)) and found.trusted:
             return f"they agree once {mirrored.name} is mirrored: save its pictures as the camera sees, not mirrored"
     for shift in (1, -1, 2, -2, 3, -3):
-        if (
-            (found := pair_pose(a, _shifted(a, b, shift), board))
-            and found.trusted
-            and len(found.shared) >= FEWEST_TO_JUDGE
-        ):
-            late = "late" if shift > 0 else "early"
-            return f"they agree once {b.name} is taken to be {abs(shift)} frame{'s' * (abs(shift) > 1)} {late}: renumber its pictures"
+        found = pair_pose(a, _shifted(a, b, shift), board)
+        if found and found.trusted and len(found.shared) >= FEWEST_TO_JUDGE:
+            frames, late = ("frame", "frames")[abs(shift) > 1], "late" if shift > 0 else "early"
+            return f"they agree once {b.name} is taken to be {abs(shift)} {frames} {late}: renumber its pictures"
     return "were the pictures taken at the same moments, numbered alike, and the cameras not moved in between?"
 
 

@@ -16,12 +16,11 @@ from matplotlib.figure import Figure
 from arraygeom import Camera, Pose, Rig
 from arraygeom.viz import COLOURS, draw_rig, show_picture
 
-from .bundle import BoardPoses, parameter_names
+from .bundle import BoardPoses
 from .calibrate import Calibration
-from .coverage import CELLS, Coverage, coverage
 from .covariance import RigCovariance, baseline_deviation, beta_covariance
+from .coverage import CELLS, Coverage, coverage
 from .observability import LENS_TERMS
-from .photos import FrameKey
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -56,12 +55,13 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
         near, far = depths(covers.values())
         parts += [
             "<h2>Uncertainty of what is predicted</h2>",
-            f"<p>How far, in pixels (one standard deviation, worst direction), the point that the first camera sees may be "
-            f"from where the rig says the others see it: at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
+            "<p>How far, in pixels (one standard deviation, worst direction), what the first camera sees may be from where "
+            f"the rig says that the others see it: at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
             image(draw_uncertainty(calibration, (near, far))),
         ]
     body = "\n".join(parts)
-    return f'<!DOCTYPE html>\n<html lang="en"><meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>\n{body}\n</html>\n'
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
+    return f'<!DOCTYPE html>\n<html lang="en">{head}\n{body}\n</html>\n'
 
 
 def summary(calibration: Calibration) -> str:
@@ -74,7 +74,8 @@ def summary(calibration: Calibration) -> str:
     for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):
         if errors:
             everything = np.concatenate(list(errors.values()))
-            text += f" Epipolar error{where} {everything.mean():.3f} px (mean; 95 % below {np.quantile(everything, 0.95):.3f})."
+            most = np.quantile(everything, 0.95)
+            text += f" Epipolar error{where} {everything.mean():.3f} px (mean; 95 % below {most:.3f})."
     return text
 
 
@@ -110,7 +111,7 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
     head = "camera|pictures, points|error px, together (alone)|noise px|focal length px|principal point px|lens|covered"
     rows = []
     for name, camera in calibration.fit.scene.cameras.items():
-        views, r = calibration.views[name], residuals[name]
+        views, r, covered = calibration.views[name], residuals[name], covers[name]
         rms = np.sqrt((r**2).sum(-1).mean())
         rows.append(
             (
@@ -121,8 +122,8 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
                 _with_deviations(calibration, name, camera, "focal"),
                 _with_deviations(calibration, name, camera, "centre"),
                 _with_deviations(calibration, name, camera, "distortion"),
-                f"{covers[name].share:.0%} of the picture, {covers[name].depths[0]:.3g} to {covers[name].depths[1]:.3g} m, "
-                f"tilts {covers[name].tilts[0]:.0f} to {covers[name].tilts[1]:.0f} deg",
+                f"{covered.share:.0%} of the picture, {covered.depths[0]:.3g} to {covered.depths[1]:.3g} m, "
+                f"tilts {covered.tilts[0]:.0f} to {covered.tilts[1]:.0f} deg",
             )
         )
     return _table(head.split("|"), rows)
