@@ -154,12 +154,12 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     pairs = {names: _some(matches) for names, matches in pairs.items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
     figures = _examine(rig, tried, pairs)
-    order = sorted(range(len(tried)), key=lambda i: figures[i].badness)
-    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
-    best = next(i for i in range(len(tried)) if figures[i].badness <= least)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].badness)
+    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
+    best = min(i for i in order if figures[i].badness <= least)
     healthy = fits and figures[0].badness < UNSEEN
-    if healthy or figures[best].badness > BETTER * figures[0].badness:
+    if healthy or (fits and figures[best].badness > BETTER * figures[0].badness):
         best = 0
     equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].badness <= least and best}
     equal.pop(tried[best].kind, None)
