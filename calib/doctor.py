@@ -19,7 +19,7 @@ from arraygeom.rig import Depths
 
 from .matches import Matches, match_cameras
 from .mistakes import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
-from .residuals import lines_basis, nature, residuals_and_depths, stacked
+from .residuals import lines_basis, nature, related, residuals_and_depths, stacked
 
 MOST = 250
 """Matches of a pair that are used."""
@@ -151,7 +151,7 @@ def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosi
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """The same of points matched already, of pictures of these sizes."""
-    pairs = {names: _some(matches) for names, matches in pairs.items()}
+    pairs = {names: _some(matches) for names, matches in related(rig, pairs).items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
     figures = _examine(rig, tried, pairs)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
