@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
+from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
 from arraygeom import Camera, Pair, Rig
@@ -18,7 +19,7 @@ from arraygeom.rig import Depths
 
 from .matches import Matches, match_cameras
 from .mistakes import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
-from .residuals import lines_basis, nature, residuals_and_depths, stacked
+from .residuals import lines_basis, nature, related, residuals_and_depths, stacked
 
 MOST = 250
 """Matches of a pair that are used."""
@@ -32,13 +33,13 @@ EQUAL = (1.4, 0.03)
 """Explanations cannot be told apart whose misfit is less than 1.4 times the best one's and 0.03 px."""
 WRONG_WAY = 100.0
 """Pixels of misfit that points behind the cameras, or outside the depth range, count for."""
-BETTER = 0.4
+BETTER = 0.33
 """A mistake is named if undoing it leaves no more than this part of the misfit: a drifted rig is made somewhat better
 by many wrong remedies."""
 FEW = 10
 """Shares of fewer points than this say nothing."""
-STRONGEST_BARREL, STRONGEST_PINCUSHION = -0.145, 0.4
-"""k1 times the squared radius of the farthest corner, at z = 1; beyond -4/27 that corner has no ray."""
+BARREL, PINCUSHION = -0.6, 0.4
+"""Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
 
 Pairs = Mapping[tuple[str, str], Matches]
 
@@ -50,17 +51,21 @@ class Figures(NamedTuple):
     misfit: the part of it (root mean square, pixels) that is the rig's and not the matches' own.
     front: share of the points that lie in front of both cameras, of those whose depth can be told.
     inside: share of those in front that lie in the rig's depth range; NaN without one.
+    handed: share of the triangles of neighbouring points that are turned over from one picture to the other, or not,
+    as they should be: mirrored pictures turn them over.
     """
 
     off: float
     misfit: float
     front: float
     inside: float
+    handed: float
 
     @property
     def badness(self) -> float:
         """All of it in one number, pixels."""
-        return self.misfit + WRONG_WAY * ((self.front < 0.5) + (self.inside < 0.5))
+        wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
+        return self.misfit + WRONG_WAY * wrong
 
     def __str__(self) -> str:
         parts = [f"{self.off:.2f} px off the lines, {self.misfit:.2f} px of it the rig's"]
@@ -68,6 +73,8 @@ class Figures(NamedTuple):
             parts.append(f"{self.front:.0%} in front")
         if not math.isnan(self.inside):
             parts.append(f"{self.inside:.0%} within the depth range")
+        if self.handed < 0.5:
+            parts.append("one picture mirrored against the other")
         return ", ".join(parts)
 
 
@@ -144,15 +151,15 @@ def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosi
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """The same of points matched already, of pictures of these sizes."""
-    pairs = {names: _some(matches) for names, matches in pairs.items()}
+    pairs = {names: _some(matches) for names, matches in related(rig, pairs).items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
     figures = _examine(rig, tried, pairs)
-    order = sorted(range(len(tried)), key=lambda i: figures[i].badness)
-    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
-    best = next(i for i in range(len(tried)) if figures[i].badness <= least)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].badness)
+    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
+    best = min(i for i in order if figures[i].badness <= least)
     healthy = fits and figures[0].badness < UNSEEN
-    if healthy or figures[best].badness > BETTER * figures[0].badness:
+    if healthy or (fits and figures[best].badness > BETTER * figures[0].badness):
         best = 0
     equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].badness <= least and best}
     equal.pop(tried[best].kind, None)
@@ -170,9 +177,46 @@ def _some(matches: Matches) -> Matches:
 
 def _examine(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[Figures]:
     """The figures of every explanation, from the same points: those that agree under the best of them."""
-    seen = _observe([remedy.repair(rig) for remedy in tried], pairs)
+    rigs = [remedy.repair(rig) for remedy in tried]
+    seen = _observe(rigs, pairs)
     inliers, floor = _agreement(rig, tried, seen.off, pairs)
-    return [_figures(rig.depth, *(part[i] for part in seen), inliers, floor) for i in range(len(tried))]
+    kept = [handedness(matches) for matches in pairs.values()]
+    return [
+        _figures(
+            *(part[i] for part in seen),
+            inliers=inliers,
+            floor=floor,
+            bounds=rig.depth,
+            handed=_mean(abs(share - _mirrors(repaired, names)) for share, names in zip(kept, pairs)),
+        )
+        for i, repaired in enumerate(rigs)
+    ]
+
+
+def handedness(matches: Matches) -> float:
+    """The share of triangles of neighbouring points (Delaunay's, in alpha) that keep their handedness in beta."""
+    try:
+        corners = Delaunay(matches.alpha.numpy()).simplices
+    except QhullError:
+        return 1.0
+    areas = [_area(points[torch.from_numpy(corners).long()]) for points in matches]
+    return float((areas[0] * areas[1] > 0).double().mean())
+
+
+def _area(triangles: Tensor) -> Tensor:
+    first, second = (triangles[:, i] - triangles[:, 0] for i in (1, 2))
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+
+def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
+    """Whether one of two cameras is that of a mirrored picture."""
+    views = [rig[name] for name in names]
+    return sum(isinstance(v, Camera) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
+
+
+def _mean(shares: Iterable[float]) -> float:
+    found = list(shares)
+    return sum(found) / len(found)
 
 
 class Observed(NamedTuple):
@@ -246,13 +290,20 @@ def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
 
 
 def _figures(
-    bounds: Depths | None, off: Tensor, depth: Tensor, front: Tensor, inliers: Tensor, floor: float
+    off: Tensor,
+    depth: Tensor,
+    front: Tensor,
+    *,
+    inliers: Tensor,
+    floor: float,
+    bounds: Depths | None,
+    handed: float,
 ) -> Figures:
     off = off[inliers]
     misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
     told = ~depth.isnan()
     share = float(front[told].double().mean()) if int(told.sum()) >= FEW else math.nan
-    return Figures(float(off.abs().median()), misfit, share, _inside(bounds, depth[told & front]))
+    return Figures(float(off.abs().median()), misfit, share, _inside(bounds, depth[told & front]), handed)
 
 
 def _inside(bounds: Depths | None, depth: Tensor) -> float:
@@ -270,14 +321,14 @@ def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remed
         return []
     squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
 
-    lowest, highest = STRONGEST_BARREL / squared, STRONGEST_PINCUSHION / squared
-    k1 = lowest
+    lowest, highest = BARREL / squared, PINCUSHION / squared
+    k1 = 0.0
     for _ in range(3):
         candidates = torch.linspace(lowest, highest, 13, dtype=torch.float64).tolist()
         off = _observe([lens_remedy(rig, bare, k).repair(rig) for k in candidates], pairs).off
         best = int(off.abs().median(1).values.argmin())
         k1, step = candidates[best], candidates[1] - candidates[0]
-        lowest, highest = max(k1 - step, STRONGEST_BARREL / squared), k1 + step
+        lowest, highest = k1 - step, k1 + step
     return [lens_remedy(rig, bare, k1)]
 
 

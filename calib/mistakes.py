@@ -74,10 +74,14 @@ def bare_cameras(rig: Rig, names: Iterable[str]) -> dict[str, Camera]:
 
 
 def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
-    """Distortion was ignored, and is about `k1` in all cameras that have none."""
+    """Distortion was ignored, and is about `k1` in all cameras that have none.
+
+    With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3): one
+    number, and one to one at any radius.
+    """
     bare = bare_cameras(rig, names)
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
-    lens = Distortion("brown-conrady", torch.tensor([k1, 0, 0, 0], dtype=torch.float64))
+    lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
     return Remedy("distortion", words, partial(on_cameras, names=bare, change=lambda c: c.replace(distortion=lens)))
 
 

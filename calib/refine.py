@@ -24,7 +24,7 @@ from arraygeom import Rig
 
 from .matches import Matches, match_cameras
 from .photometric import Views, photometric_errors, with_depths
-from .residuals import epipolar_residuals
+from .residuals import epipolar_residuals, related
 from .unknowns import Unknown, changed, unknowns
 
 Pairs = Mapping[tuple[str, str], Matches]
@@ -58,6 +58,8 @@ class Change:
     unit: str
 
     def __str__(self) -> str:
+        if self.unit == "F":
+            return f"F of {self.name}"
         amounts = ", ".join(f"{a:+.3g} +- {d:.2g}" for a, d in zip(self.amount, self.deviation))
         return f"{self.name} {amounts} {self.unit}".rstrip()
 
@@ -166,7 +168,7 @@ class Fit:
     @classmethod
     def of(cls, rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None) -> Fit:
         """Raises ValueError if nothing is free."""
-        used, held_out = split(frames)
+        used, held_out = split([related(rig, pairs) for pairs in frames])
         names = [name for name in rig.names if any(name in pair for pairs in (used, held_out) for pair in pairs)]
         given = unknowns(rig, names, free=free, sigma=sigma)
         if not given:

@@ -6,14 +6,14 @@ A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Link, Pair, Pose, View, essential_matrix
+from arraygeom import Camera, Distortion, Link, Pair, Pose, Rig, View, essential_matrix
 from arraygeom.pixels import to_homogeneous
 
 from .matches import Matches
@@ -94,6 +94,19 @@ def _depths(pair: Pair, a: Tensor, b: Tensor, seen: Tensor) -> SeenDepths:
     pixel = 1 / pair.cameras[1].K[..., :2, :2].det().abs().sqrt()[..., None]
     known = seen & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
     return SeenDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), known)
+
+
+def related(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> dict[tuple[str, str], Matches]:
+    """Those of the pairs of which the rig says how they are related: calibrated ones and those with an F.
+
+    Raises ValueError if it says so of none.
+    """
+    found = {names: m for names, m in pairs.items() if (pair := rig.pair(*names)).calibrated or pair.link is not None}
+    if not found:
+        raise ValueError(
+            "the rig says nothing of how these cameras are related: calibrate them, or make a rig with `pat rig start`"
+        )
+    return found
 
 
 def nature(pair: Pair) -> tuple[object, ...]:

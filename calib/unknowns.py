@@ -69,7 +69,7 @@ def unknowns(
         if name.rpartition(".")[0] in names and name not in fixed
     ]
     links = [f"{a} > {b}" for a, b in rig.links if a in names and b in names]
-    return found + [Unknown(name, torch.full((7,), LINK_SIGMA).double(), "", 1.0) for name in links]
+    return found + [Unknown(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
 
 
 def changed(rig: Rig, given: Sequence[Unknown], z: Float[Tensor, " n"]) -> Rig:

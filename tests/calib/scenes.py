@@ -27,14 +27,14 @@ def unlike_pair(*, lens: bool = False) -> Rig:
         K=intrinsics((300.0, 310.0), HW, (170.0, 110.0)),
         cam_from_world=Pose.from_centre(rotation_from_vector(vector(0.1, -0.2, 0.05)), vector(0.3, 0.1, -0.2)),
         hw=HW,
-        distortion=Distortion("brown-conrady", vector(-0.3, 0.1, 0.001, -0.002)) if lens else None,
+        distortion=Distortion("brown-conrady", vector(-0.45, 0.15, 0.0, 0.0005)) if lens else None,
     )
     second_from_first = Pose(rotation_from_vector(vector(0.06, 0.09, -0.12)), vector(-0.2, 0.05, 0.03))
     second = Camera(
         K=intrinsics((330.0, 335.0), (250, 330), (150.0, 140.0)),
         cam_from_world=second_from_first @ first.cam_from_world,
         hw=(250, 330),
-        distortion=Distortion("brown-conrady", vector(-0.25, 0.08, 0.0, 0.001)) if lens else None,
+        distortion=Distortion("brown-conrady", vector(-0.4, 0.12, 0.0005, 0.0)) if lens else None,
     )
     return Rig({"first": first, "second": second}, depth=(1.5, 8.0))
 

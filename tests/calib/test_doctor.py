@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from arraygeom import Pose, Rig, View
+from arraygeom import Link, Pose, Rig, View
 from calib.doctor import diagnose, diagnose_matches
 from calib.mistakes import TRANSPOSE, on_cameras, swap
 from pat.cli import main
@@ -103,7 +103,7 @@ def test_distortion_applied_twice_is_named():
 
 def test_drift_is_no_mistake():
     rig = unlike_pair()
-    drifted = rig.perturbed({"second.rotation": vector(0.004, -0.002, 0.003)})
+    drifted = rig.perturbed({"second.rotation": vector(0.001, -0.002, 0.012)})
     found = diagnose_matches(drifted, sizes(rig), seen_points(rig))
     assert found.named.kind == "nothing"
     assert not found.healthy
@@ -121,22 +121,16 @@ def test_what_cannot_be_told_apart_is_said():
     assert found.after.front > 0.9
 
 
-def test_an_uncalibrated_rig_from_matlab():
+def test_an_f_of_which_one_side_counts_from_one():
     rig = unlike_pair()
     F = rig.pair("first", "second").fundamental
     shift = torch.eye(3).double()
     shift[:2, 2] = -1
     views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
-    matlab = Rig(views, links={("first", "second"): dataclasses.replace(_link(F), F=shift.T @ F @ shift)})
+    matlab = Rig(views, links={("first", "second"): Link(F @ shift)})
     found = diagnose_matches(matlab, sizes(rig), seen_points(rig, noise=0.02))
     assert found.named.kind == "one-pixel shift", found.verdict
     assert math.isnan(found.before.front)
-
-
-def _link(F):
-    from arraygeom import Link
-
-    return Link(F)
 
 
 @pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "turned or mirrored")])
@@ -153,7 +147,8 @@ def test_pictures_tell_a_mirrored_one():
     rig, images = rectified_pair(), rectified_pictures()
     assert diagnose(rig, images).healthy
     found = diagnose(rig, images | {"right": images["right"].flip(-2)})
-    assert found.named.words == "picture of 'right' mirrored top to bottom"
+    assert "mirrored top to bottom" in found.named.words
+    assert found.before.handed < 0.1
 
 
 def test_bad_input_is_one_clear_line():

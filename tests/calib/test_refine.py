@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Rig, View
+from arraygeom import Camera, Link, Rig, View
 from calib.matches import Matches
 from calib.photometric import Views, photometric_errors
 from calib.refine import jacobian, line_distances, refine, refine_matches, sampson, solve
@@ -136,11 +136,12 @@ def test_solving_without_data_returns_the_prior():
 def test_a_fundamental_matrix_is_refined():
     rig = unlike_pair()
     bad = worse(rig).pair("first", "second").fundamental
-    from arraygeom import Link
-
     views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
-    found = refine_matches(Rig(views, links={("first", "second"): Link(bad)}), [seen_points(rig)])
+    uncalibrated = Rig({**views, "third": View(hw=HW)}, links={("first", "second"): Link(bad)})
+    points = seen_points(rig)
+    found = refine_matches(uncalibrated, [{**points, ("first", "third"): points["first", "second"]}])
     assert found.accepted
+    assert "changed: F of first > second" in found.as_text()
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
 
 
@@ -186,6 +187,9 @@ def test_bad_input_is_one_clear_line():
         refine(rig, [images], free=["rotatoin"])
     with pytest.raises(ValueError, match="nothing is free"):
         refine(rig, [images], free=["left.rotation"])
+    unknown = Rig({name: View(hw=HW) for name in images})
+    with pytest.raises(ValueError, match="says nothing of how these cameras are related"):
+        refine(unknown, [images])
     with pytest.raises(ValueError, match="--sigma"):
         refine(rig, [images], sigma={"center": 3})
 
