@@ -418,6 +418,8 @@ class SystemsRun:
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     photos: Path | None = None
     """Folder of photographs for the scene's surfaces; by default patterns and pictures that scikit-image ships."""
+    recording: Path | None = None
+    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
     out: Path | None = None
     """Folder for the results; by default out/systems/NAME."""
     weights: str = "mono-colour"
@@ -430,6 +432,8 @@ class SystemsRun:
         from .systems import load_system, run_system
 
         out = self.out or Path("out/systems") / self.name
+        if self.recording is not None:
+            return self._recorded(self.recording, out)
         result = run_system(
             self.name,
             out,
@@ -442,6 +446,15 @@ class SystemsRun:
         print(result.table, end="")
         if not self.full and load_system(self.name).expected:
             console.print(f"\nexpected:\n{load_system(self.name).expected}", markup=False)
+        console.print(f"written: {', '.join(map(str, result.written))}", soft_wrap=True)
+
+    def _recorded(self, recording: Path, out: Path) -> None:
+        from .systems.fast_slow.recorded import run_recorded
+
+        if self.name != "fast-slow":
+            raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
+        result = run_recorded(recording, out, weights=self.weights, say=lambda t: console.print(t, soft_wrap=True))
+        print(result.table, end="")
         console.print(f"written: {', '.join(map(str, result.written))}", soft_wrap=True)
 
 
