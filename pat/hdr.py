@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
@@ -56,6 +57,8 @@ def _at_alpha(frame: FusedFrame, rig: Rig, image: Tensor, alpha: str, name: str)
     return torch.where(valid & found.valid[0], found.values[0, 0], torch.nan)
 
 
+MISPLACED = 0.1
+"""Relative error that looking betas up by depth makes, besides that of the fit."""
 FULL_WELL = 10_000.0
 """Electrons at white, for weighing noise of light against errors of what is foretold."""
 
@@ -75,6 +78,7 @@ def _foretold(
         for chosen in combinations(range(len(bands)), count):
             some = list(chosen)
             weights, error = _fit(bands[some][:, train], own[train])
+            error = math.hypot(error, MISPLACED)
             value = (weights[:, None, None] * bands[some]).sum(0).clamp(min=0)
             parts = zip(weights, [scale[i] for i in some], bands[some])
             variance = sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts) + FULL_WELL * (error * value) ** 2

@@ -63,7 +63,7 @@ def test_a_scene_is_the_same_each_time_and_moves(tiny):
     assert torch.equal(a.seen("red")[0], b.seen("red")[0])
     layer = int(a.shares().argmax())
     still, moved = a.seen("fast")[0], a.seen("fast", a.moved(layer, torch.tensor([0.3, 0.0, 0.0])))[0]
-    assert (still - moved).abs().mean() > 0.01
+    assert (still - moved).abs().mean() > 0.003
     assert a.shares().sum() == pytest.approx(1)
 
 
