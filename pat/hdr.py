@@ -42,8 +42,8 @@ def merged(frame: FusedFrame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ 
     total = believed + known
     light = torch.where(total > 0, (believed * theirs + known * own) / total.clamp(min=1e-12), own)
     light = torch.where((own >= WHITE) & noise.isfinite(), torch.maximum(theirs, own), light)
-    colours = to_linear(frame.image.clamp(min=0)) * (light / own.clamp(min=1e-5))
-    return frame._replace(image=Coded().apply(colours[None], Generator())[0])
+    brighter = Coded().apply(light[None, None], Generator())[0] - images[alpha]
+    return frame._replace(image=frame.image + brighter)
 
 
 def _at_alpha(frame: FusedFrame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
