@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -125,7 +126,7 @@ class Fuse:
     carry: bool = True
     """Carry colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
     resume: bool = False
-    """Fuse only the frames that are not in --out."""
+    """Fuse only the frames that are not in --out; of a single frame, only the tiles that were not finished."""
     on_error: Literal["stop", "skip"] = "stop"
     """What to do when a frame cannot be fused (a corrupt picture, a full disk): stop, or report it and go on."""
     workers: int = 1
@@ -169,6 +170,9 @@ class Fuse:
         from .results import save_frame, view_of
 
         rig, images = read_views(rig, files, alpha=rig.known(self.alpha))
+        store = self.out / ".tiles"
+        if not self.resume:
+            shutil.rmtree(store, ignore_errors=True)
         frame = fuse_frame(
             self.weights,
             rig,
@@ -177,9 +181,11 @@ class Fuse:
             field=None if self.field == "auto" else FIELDS[self.field](),
             max_memory=self.max_memory,
             match_levels=self.match_levels,
+            store=store,
         )
         view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
         written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
+        shutil.rmtree(store, ignore_errors=True)
         console.print(f"written: {', '.join(map(str, written))}")
 
     def _many(self, rig: Rig, files: dict[str, list[Path]]) -> None:
