@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -126,7 +127,7 @@ class Fuse:
     carry: bool = True
     """Carry colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
     resume: bool = False
-    """Fuse only the frames that are not in --out."""
+    """Fuse only the frames that are not in --out; of a single frame, only the tiles that were not finished."""
     on_error: Literal["stop", "skip"] = "stop"
     """What to do when a frame cannot be fused (a corrupt picture, a full disk): stop, or report it and go on."""
     workers: int = 1
@@ -170,6 +171,9 @@ class Fuse:
         from .results import save_frame, view_of
 
         rig, images = read_views(rig, files, alpha=rig.known(self.alpha))
+        store = self.out / ".tiles"
+        if not self.resume:
+            shutil.rmtree(store, ignore_errors=True)
         frame = fuse_frame(
             self.weights,
             rig,
@@ -178,9 +182,11 @@ class Fuse:
             field=None if self.field == "auto" else FIELDS[self.field](),
             max_memory=self.max_memory,
             match_levels=self.match_levels,
+            store=store,
         )
         view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
         written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
+        shutil.rmtree(store, ignore_errors=True)
         console.print(f"written: {', '.join(map(str, written))}")
 
     def _many(self, rig: Rig, files: dict[str, list[Path]]) -> None:
@@ -739,6 +745,8 @@ class SystemsRun:
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     photos: Path | None = None
     """Folder of photographs for the scene's surfaces; by default patterns and pictures that scikit-image ships."""
+    recording: Path | None = None
+    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
     out: Path | None = None
     """Folder for the results; by default out/systems/NAME."""
     weights: str = "mono-colour"
@@ -751,6 +759,8 @@ class SystemsRun:
         from .systems import load_system, run_system
 
         out = self.out or Path("out/systems") / self.name
+        if self.recording is not None:
+            return self._recorded(self.recording, out)
         result = run_system(
             self.name,
             out,
@@ -763,6 +773,15 @@ class SystemsRun:
         print(result.table, end="")
         if not self.full and load_system(self.name).expected:
             console.print(f"\nexpected:\n{load_system(self.name).expected}", markup=False)
+        console.print(f"written: {', '.join(map(str, result.written))}", soft_wrap=True)
+
+    def _recorded(self, recording: Path, out: Path) -> None:
+        from .systems.fast_slow.recorded import run_recorded
+
+        if self.name != "fast-slow":
+            raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
+        result = run_recorded(recording, out, weights=self.weights, say=lambda t: console.print(t, soft_wrap=True))
+        print(result.table, end="")
         console.print(f"written: {', '.join(map(str, result.written))}", soft_wrap=True)
 
 

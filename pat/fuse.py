@@ -6,15 +6,19 @@ its segments touch, and a halo as wide as the network sees. Tiled and whole resu
 
 from __future__ import annotations
 
+import hashlib
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from arraygeom import (
@@ -41,7 +45,7 @@ from arraygeom.fields import pinhole_track
 from arraygeom.pixels import HW, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
-from .images import luminance
+from .images import luminance, write_atomically
 from .model import Fused, FusionNetwork, Look
 
 Progress = Callable[[Iterable["Tile"], int], Iterable["Tile"]]
@@ -93,6 +97,7 @@ def fuse(
     match_levels: bool = False,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
+    store: Path | None = None,
 ) -> FusedFrame:
     """Fuse one frame at the view of camera `alpha`.
 
@@ -114,6 +119,8 @@ def fuse(
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
         progress: shows the tiles as they are done.
+        store: a folder in which finished tiles of a frame of several are kept, so that one that was stopped goes on;
+            tiles of other pictures, rigs or weights are not taken. Whoever gave it removes it afterwards.
         announce: is told the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
@@ -135,6 +142,7 @@ def fuse(
             match_levels=match_levels,
             progress=progress,
             announce=announce,
+            store=store,
         )
         return _bent(seen, straight[alpha], images[alpha], straight_rig[alpha], rig[alpha])
     own = _grey(images[alpha])[None]
@@ -160,14 +168,45 @@ def fuse(
         memory = max(working_memory(network, tile, betas) for tile in tiles)
         large = math.prod(hw) > 16 * PROBE**2
         announce(Plan(tiles, memory, expected_seconds(network, own, betas, tiles) if large else None))
+    kept = TileStore.of(store, network, own, betas) if store and len(tiles) > 1 else None
     frame: list[Tensor] = []
     for tile in progress(tiles, len(tiles)) if progress else tiles:
-        parts = _fuse_tile(network, own, betas, tile)
+        make = partial(_fuse_tile, network, own, betas, tile)
+        parts = kept.fetch(tile, make) if kept else make()
         frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in parts]
         top, bottom, left, right = tile.inner
         for whole, part in zip(frame, parts):
             whole[..., top:bottom, left:right] = part
     return FusedFrame(*frame)
+
+
+class TileStore(NamedTuple):
+    """Finished tiles in a folder; `digest` is of all that they depend on and is part of their names."""
+
+    folder: Path
+    digest: str
+
+    @classmethod
+    def of(cls, folder: Path, network: FusionNetwork, own: Tensor, betas: list[Beta]) -> TileStore:
+        """The store for one frame's tiles."""
+        digest = hashlib.sha256(type(network).__name__.encode())
+        parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
+        for tensor in (*parameters, own, *(b.picture for b in betas)):
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        x = pixel_grid((own.shape[-2], own.shape[-1]), dtype=torch.float64)[::64, ::64].reshape(-1, 2)
+        for beta in betas:
+            digest.update(b"".join(part.numpy().tobytes() for part in vars(beta.look.at(x)).values()))
+        return cls(folder, digest.hexdigest()[:16])
+
+    def fetch(self, tile: Tile, make: Callable[[], FusedFrame]) -> FusedFrame:
+        """The tile as it was kept, or made and kept now."""
+        file = self.folder / f"{self.digest}_{'_'.join(map(str, tile.inner))}.safetensors"
+        if file.exists():
+            return FusedFrame(**load_file(file))
+        frame = make()
+        with write_atomically(file) as temporary:
+            save_file({name: part.contiguous() for name, part in frame._asdict().items()}, temporary)
+        return frame
 
 
 def without_lenses(rig: Rig, images: Mapping[str, Tensor]) -> tuple[Rig, dict[str, Tensor]]:

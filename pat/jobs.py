@@ -102,12 +102,15 @@ def run_tasks(
     title: str = "working",
     console: Console | None = None,
 ) -> Report:
-    """Run all tasks; with `resume`, only those whose file is not there.
+    """Run all tasks; with `resume`, only those whose file is not there. Without, such files are removed first.
 
     What goes wrong in a task (ValueError, OSError) is reported with its file's name and skipped, or stops the job: then
     JobError is raised, and what is made stays.
     """
-    kept = [t.makes for t in tasks if resume and t.makes.exists()]
+    if not resume:
+        for task in tasks:
+            task.makes.unlink(missing_ok=True)
+    kept = [t.makes for t in tasks if t.makes.exists()]
     report = Report(kept=kept)
     there = set(kept)
     left = [t for t in tasks if t.makes not in there]
@@ -178,7 +181,9 @@ def _why(future: object) -> str:
 
 
 def attempt(task: Task, threads: int) -> Outcome:
-    """Run a task; errors of what was given become the outcome."""
+    """Run a task, unless a worker that died since has done it; errors of what was given become the outcome."""
+    if task.makes.exists():
+        return Outcome(task.makes, None)
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     try:

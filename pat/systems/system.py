@@ -256,16 +256,17 @@ def _sequence_table(methods: Mapping[str, list[Tensor]], truth: list[Tensor], gr
     ]
 
 
+WRONG = 0.1
+"""Chroma farther off than this counts as a wrong colour."""
+
+
 def _known_where(frame: FusedFrame, truth: Tensor) -> list[str]:
-    """Whether confidence knows where colour is right: mean error of chroma of the surest and the least sure quarter."""
-    off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(truth)[1]).abs().mean(0).flatten()
+    """Whether confidence knows where colour is wrong: among the surest and the least sure quarter of the pixels."""
+    off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(truth)[1]).abs().amax(0).flatten()
     order = frame.confidence.flatten().argsort()
     quarter = len(order) // 4
-    sure, doubtful = (float(off[part].mean()) for part in (order[-quarter:], order[:quarter]))
-    return [
-        "",
-        f"Mean error of chroma: {sure:.4f} where confidence is highest (a quarter), {doubtful:.4f} where lowest.",
-    ]
+    sure, doubtful = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
+    return ["", f"Wrong colours: {sure:.1%} of the quarter where confidence is highest, {doubtful:.1%} where lowest."]
 
 
 def _ranges(

@@ -115,6 +115,31 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
     assert (cut.image - whole.image).abs().mean() < 2e-3
 
 
+def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
+    hw, beta_hw = (34, 300), (30, 210)
+    network, rig = network_of("PAT"), rig_of(hw, beta_hw)
+    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    monkeypatch.setattr(pat.fuse, "plan", lambda *_: list(tiles_of(hw, 64, network.halo)))
+    whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fuse._fuse_tile
+
+    def counted(network, own, betas, tile):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(tile)
+        return fuse_tile(network, own, betas, tile)
+
+    monkeypatch.setattr(pat.fuse, "_fuse_tile", counted)
+    with pytest.raises(KeyboardInterrupt):
+        fuse(network, rig, images, alpha="mono", store=tmp_path)
+    made.clear()
+    resumed = fuse(network, rig, images, alpha="mono", store=tmp_path)
+    assert len(made) == 2
+    assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(resumed, whole))
+    made.clear()
+    with pytest.raises(KeyboardInterrupt):
+        fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
+
+
 def test_bytes_are_read():
     assert parse_bytes("4GiB") == 4 * 2**30
     assert parse_bytes("500 MB") == 5e8

@@ -119,3 +119,14 @@ def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # no
     assert len(after) == 40
     assert {n: after[n] for n in before} == before
     assert contents(tmp_path / "part") == contents(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_workers_of_a_scheduler_elsewhere_do_the_work(tmp_path):
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = Workers(scheduler=cluster.scheduler_address)
+        report = run_tasks(tasks(tmp_path, "a", "b", "bad"), workers=there, on_error="skip")
+    assert len(report.made) == 2
+    assert str(os.getpid()) not in (tmp_path / "a.calls").read_text().split()

@@ -18,7 +18,7 @@ from pat.systems.system import Recording, coded
 
 TITLE = "four mono cameras, three filters, four exposures: more range than any one of them has"
 REDUCED = 2 / 5
-DEPTHS, LAYERS, SEED = (2.2, 11.0), 10, 7
+DEPTHS, LAYERS, SEED = (2.2, 11.0), 10, 13
 ELECTRONS, READ = 10_500, 4
 """Of the sensors: electrons at white, and noise of reading in electrons."""
 DARKEST = 0.004

@@ -16,7 +16,7 @@ from pat.systems.system import Recording, coded
 
 TITLE = "fast mono alpha, three slow cameras with filters, not synchronised; an object moves"
 REDUCED = 1 / 4
-DEPTHS, LAYERS, SEED = (2.2, 9.0), 9, 11
+DEPTHS, LAYERS, SEED = (2.2, 9.0), 9, 14
 FRAMES = 11
 SPEED = 18.0
 """Of the object, per cent of alpha's width in the time of a slow frame."""

@@ -16,7 +16,7 @@ from pat.systems.system import Recording, coded
 
 TITLE = "near infrared alpha, colour beta: the same materials look different"
 REDUCED = 1 / 5
-DEPTHS, LAYERS, SEED = (12.0, 150.0), 10, 3
+DEPTHS, LAYERS, SEED = (12.0, 150.0), 10, 10
 HAZE = 0.002
 """Part of the light lost in a metre."""
 

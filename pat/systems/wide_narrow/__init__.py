@@ -17,7 +17,7 @@ from pat.systems.system import Recording, coded, mosaic
 
 TITLE = "mono telephoto, and a wide colour camera with 10 times fewer pixels on what both see"
 REDUCED = 1 / 8
-DEPTHS, LAYERS, SEED = (4.5, 30.0), 10, 5
+DEPTHS, LAYERS, SEED = (4.5, 30.0), 10, 13
 FOCUS, FOCAL_LENGTH, F_NUMBER, PITCH = 7.0, 0.025, 4.0, 1.85e-6
 
 
