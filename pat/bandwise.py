@@ -8,14 +8,15 @@ nothing else.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .guided import GuidedPAT, GuidedPATConfig, Match
-from .model import Fused, Looks
+from .consensus import Consensus
+from .guided import GuidedPAT, GuidedPATConfig, Seen
+from .model import Fused, Look, Looks
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,10 @@ class BandwisePAT(nn.Module):
         self.config = config
         self.single = GuidedPAT(GuidedPATConfig(**asdict(config)))
 
+    def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus | None:
+        """What can be known before attention looks, once for all bands of a beta."""
+        return self.single.survey(alpha, beta, look)
+
     def forward(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
     ) -> Fused:
@@ -52,10 +57,14 @@ class BandwisePAT(nn.Module):
 
     def explain(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> tuple[Fused, list[Match]]:
-        """The same, with the first look's matches, which training supervises."""
-        bands = [(band, look) for beta, look in zip(betas, looks) for band in beta.split(1, 1)]
+    ) -> tuple[Fused, list[Seen]]:
+        """The same, with what each band told, which training supervises."""
+        bands = [
+            (band, look if look.known is None else replace(look, known=look.known.band(i)))
+            for beta, look in zip(betas, looks)
+            for i, band in enumerate(beta.split(1, 1))
+        ]
         answers = [self.single.explain(alpha, [band], [look]) for band, look in bands]
-        fused, matches = zip(*answers)
+        fused, seen = zip(*answers)
         lists = ([part[0] for part in parts] for parts in list(zip(*fused))[1:])
-        return Fused(torch.cat([f.image for f in fused], 1), *lists), [m for found in matches for m in found]
+        return Fused(torch.cat([f.image for f in fused], 1), *lists), [told for each in seen for told in each]

@@ -73,9 +73,7 @@ def attend(
         TypeError: not Segments or Positions; dtypes that differ or are not supported.
         RuntimeError: an explicit backend that cannot serve.
     """
-    return attend_with_statistics(
-        query, key, value, look, samples=samples, interpolation=interpolation, bias=bias, backend=backend
-    ).value
+    return _attend(query, key, value, look, samples, interpolation, bias, backend, measured=False).value
 
 
 def attend_with_statistics(
@@ -93,17 +91,33 @@ def attend_with_statistics(
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
+    return _attend(query, key, value, look, samples, interpolation, bias, backend, measured=True)
+
+
+def _attend(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    look: Where | Callable[[Tensor], Where],
+    samples: int | None,
+    interpolation: Interpolation,
+    bias: Tensor | None,
+    backend: Backend,
+    *,
+    measured: bool,
+) -> Attended:
+    """The statistics are of no length if not `measured`, but for the reference's."""
     query, key, value = _autocast(query, key, value)
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
 
     def run(q: Tensor, k: Tensor, v: Tensor, where: Where, part: Tensor | None) -> Attended:
         form = _form(where, q, samples)
-        return _run(q, k, v, form, _bias(part, q, form.samples), nearest, backend)
+        return _run(q, k, v, form, _bias(part, q, form.samples), nearest, backend, measured)
 
     if not callable(look):
         return run(query, key, value, look, bias)
-    return _attend_chunks(query, key, value, look, bias, run)
+    return _attend_chunks(query, key, value, look, bias, run, measured)
 
 
 def _autocast(*tensors: Tensor) -> list[Tensor]:
@@ -175,11 +189,13 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
         raise ValueError(f"bias {tuple(bias.shape)} does not broadcast to {(b, ha, wa, samples)}") from None
 
 
-def _run(q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend) -> Attended:
+def _run(
+    q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend, measured: bool
+) -> Attended:
     chosen = _choose(backend, q.device.type)
     if chosen == "reference":
         return reference.attend(q, k, v, look, bias, nearest)
-    return op.attend(q, k, v, look, bias, nearest, backend=chosen, strict=backend != "auto")
+    return op.attend(q, k, v, look, bias, nearest, measured=measured, backend=chosen, strict=backend != "auto")
 
 
 def _choose(backend: Backend, device: str) -> str:
@@ -203,6 +219,7 @@ def _attend_chunks(
     look: Callable[[Tensor], Where],
     bias: Tensor | None,
     run: Callable[..., Attended],
+    measured: bool,
 ) -> Attended:
     """Asks `look` for a piece of alpha at a time.
 
@@ -237,6 +254,8 @@ def _attend_chunks(
         for top in range(0, ha, step)
     ]
     values, positions, spreads, peaks = zip(*chunks)
+    if not measured:
+        return chunks[0]._replace(value=torch.cat(values, 2))
     return Attended(torch.cat(values, 2), torch.cat(positions, 2), torch.cat(spreads, 1), torch.cat(peaks, 1))
 
 

@@ -70,7 +70,7 @@ class TrainConfig:
     """Batches a step, shared out among processes."""
     hw: tuple[int, int] = (96, 192)
     """Height and width of alpha in the scenes."""
-    loss: Literal["psnr", "mse"] = "psnr"
+    loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
     """On the picture: minus the mean PSNR, or the mean squared error."""
     rate: float = 8e-4
     """Learning rate of Adam."""

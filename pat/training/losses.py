@@ -6,10 +6,10 @@ from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss, smooth_l1_loss
+from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
 from pat.bandwise import BandwisePAT
-from pat.guided import COARSE, GuidedPAT, Match
+from pat.guided import GuidedPAT, Seen
 from pat.model import Fused
 from pat.weights import Network
 
@@ -21,7 +21,29 @@ def picture_loss(image: Tensor, truth: Tensor) -> Tensor:
     return ((image - truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
 
-PICTURE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {"psnr": picture_loss, "mse": mse_loss}
+def structure_loss(image: Tensor, truth: Tensor) -> Tensor:
+    """One minus the mean structural similarity in windows of 7x7 pixels (Wang et al. 2004)."""
+
+    def mean(x: Tensor) -> Tensor:
+        return avg_pool2d(x, 7, 1)
+
+    a, b = mean(image), mean(truth)
+    spread = mean(image * image) - a * a + mean(truth * truth) - b * b
+    common = mean(image * truth) - a * b
+    likeness = (2 * a * b + 1e-4) * (2 * common + 9e-4) / ((a * a + b * b + 1e-4) * (spread + 9e-4))
+    return 1 - likeness.mean()
+
+
+def picture_and_structure_loss(image: Tensor, truth: Tensor) -> Tensor:
+    """`picture_loss` and `structure_loss` together."""
+    return picture_loss(image, truth) + structure_loss(image, truth)
+
+
+PICTURE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "psnr": picture_loss,
+    "psnr-ssim": picture_and_structure_loss,
+    "mse": mse_loss,
+}
 
 
 class Objective(nn.Module):
@@ -34,34 +56,27 @@ class Objective(nn.Module):
 
     def forward(self, given: Sample) -> Tensor:
         """The loss of a group of samples."""
-        fused, matches = explained(self.network, given)
+        fused, seen = explained(self.network, given)
         loss = self.picture_loss(fused.image, given.truth)
-        return loss + match_loss(fused, matches, given) if matches else loss
+        return loss + match_loss(seen, given) if seen else loss
 
 
-def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Match]]:
-    """The network's answer, and its first look where it tells of one."""
+def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Seen]]:
+    """The network's answer, and what each beta told where it says."""
     if isinstance(network, (GuidedPAT, BandwisePAT)):
         return network.explain(given.alpha, given.betas, given.looks)
     return network(given.alpha, given.betas, given.looks), []
 
 
-def match_loss(fused: Fused, matches: list[Match], given: Sample) -> Tensor:
+def match_loss(seen: list[Seen], given: Sample) -> Tensor:
     """How far off the looks were where beta sees the point, pixels, and how wrong the confidence."""
-    total = fused.image.new_zeros(())
-    for i, match in enumerate(matches):
-        near = given.position[i].movedim(-1, 1)
-        seen = given.visible[i][:, None]
-        coarse = avg_pool2d(near, COARSE)
-        all_seen = avg_pool2d(seen.float(), COARSE)
-        error = smooth_l1_loss(match.position, coarse, reduction="none", beta=2.0).sum(1, keepdim=True)
-        weight = 0.1 + 0.9 * all_seen
-        total = total + 0.02 * (error.clamp(max=40) * weight).sum() / weight.sum()
-        fine = (fused.position[i] - near).abs().sum(1, keepdim=True).clamp(max=6.0)
-        total = total + 0.02 * (fine * seen).sum() / seen.sum().clamp(min=1)
-        good = all_seen * ((match.position - coarse).square().sum(1, keepdim=True) < 9).float()
-        total = total + 0.1 * binary_cross_entropy_with_logits(match.logit, good.detach())
-    return total / len(matches)
+    total = given.truth.new_zeros(())
+    for told, truth, visible in zip(seen, given.position, given.visible):
+        off = (told.attended.position - truth.movedim(-1, 1)).abs().sum(1)
+        total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
+        good = (visible & (off.detach() < 1.5)).to(off)
+        total = total + 0.05 * binary_cross_entropy_with_logits(told.logit[:, 0], good)
+    return total / len(seen)
 
 
 @torch.no_grad()

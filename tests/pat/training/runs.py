@@ -10,7 +10,7 @@ from pat.guided import GuidedPATConfig
 from pat.images import write_image
 from pat.train import TrainConfig
 
-SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4, taps=5)
+SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
 
 
 def short_run(folder: Path, **changes) -> TrainConfig:
