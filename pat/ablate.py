@@ -288,8 +288,9 @@ def markdown(rows: Sequence[Row]) -> str:
     scenes = len({row.scene for row in rows})
     note = (
         f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% interval.\n"
-        "The rectified assumption takes lines for rows, and both pictures for the same field of view; 'rows around H x'\n"
-        "is told place and scale, and takes only the lines for rows. Off: how far the depth found puts points in beta.\n\n"
+        "The rectified assumption takes lines for rows, and both pictures for the same field of view; 'rows around\n"
+        "H x' is told place and scale, and takes only the lines for rows. Off: how far the depth found puts points in\n"
+        "beta.\n\n"
     )
     return note + "".join(f"| {' | '.join(cells)} |\n" for cells in table)
 
