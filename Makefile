@@ -18,7 +18,7 @@ help:
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
-	@echo "make bench      measure attention"
+	@echo "make bench      measure attention and training"
 	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make env        only the environment, in $(VENV)"
@@ -64,6 +64,7 @@ synthesis: $(READY)
 
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
+	@$(BIN)/python -m tests.benchmarks.bench_training
 
 train: $(READY)
 	@$(BIN)/pat train $(ARGS)

@@ -293,6 +293,8 @@ class Ablate:
     """Name of weights in the package, or a file."""
     photos: tuple[Path, ...] = ()
     """Folders of photographs; those that scikit-image ships if none is given."""
+    rendered: Path | None = None
+    """Folder with scenes that `pat render` made, instead: their first camera is alpha, their second beta."""
     scenes: int = 12
     """How many scenes."""
     hw: tuple[int, int] = (240, 320)
@@ -304,12 +306,15 @@ class Ablate:
 
     def run(self) -> None:
         """Do it."""
-        from .ablate import ablate, layered_cases
+        from .ablate import ablate, layered_cases, rendered_cases
         from .weights import load_weights
 
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
-        cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
+        if self.rendered is not None:
+            cases = rendered_cases(self.rendered, seed=self.seed)
+        else:
+            cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
         ablate(load_weights(self.weights), cases, out=self.out)
         print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
         console.print(f"written: {self.out / 'ablation.md'}, ablation.csv and ablation.png beside it")
