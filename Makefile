@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env demo showcase readme test test-long check format bench train
+.PHONY: help env demo showcase readme test test-long check format bench train notebooks docs drawings
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -20,6 +20,9 @@ help:
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention"
 	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
+	@echo "make notebooks  run the notebooks and keep what they put out"
+	@echo "make docs       the documentation as a site, in out/site"
+	@echo "make drawings   the documentation's drawings"
 	@echo "make env        only the environment, in $(VENV)"
 
 env: $(READY)
@@ -59,6 +62,15 @@ format: $(READY)
 
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
+
+notebooks: $(READY)
+	@$(BIN)/python notebooks/run.py
+
+docs: $(READY)
+	@$(BIN)/mkdocs build --strict --quiet
+
+drawings: $(READY)
+	@$(BIN)/python docs/drawings.py
 
 train: $(READY)
 	@$(BIN)/pat train $(ARGS)

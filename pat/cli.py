@@ -228,6 +228,38 @@ class Show:
         console.print(f"written: {', '.join(map(str, written))}")
 
 
+@dataclass
+class Explore:
+    """Serve a page on this machine: click a pixel of alpha, see where every other camera looks, and move the rig.
+
+    Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
+    """
+
+    rig: Positional[Path]
+    """Rig file."""
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each camera."""
+    alpha: str | None = None
+    """The camera to click in; by default the first with a picture."""
+    port: int = 0
+    """Port on localhost; 0 takes a free one."""
+    browser: bool = True
+    """Open the browser."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .images import read_image
+
+        try:
+            from .explore.page import serve
+        except ModuleNotFoundError as error:
+            raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
+        rig = Rig.load(self.rig)
+        files = dict(_name_and_file(text) for text in self.image)
+        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        serve(rig, images, alpha=self.alpha, port=self.port, browser=self.browser)
+
+
 @dataclass(frozen=True)
 class Train(TrainConfig):
     """Train weights on scenes made from photographs while training.
@@ -318,6 +350,7 @@ Command = (
     | Annotated[Evaluate, tyro.conf.subcommand("evaluate")]
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
+    | Annotated[Explore, tyro.conf.subcommand("explore")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[RigCommand, tyro.conf.subcommand("rig")]
 )
