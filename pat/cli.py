@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -280,6 +281,8 @@ class Info:
     """Rig file of any format known."""
     depth: tuple[float, float] | None = None
     """Near and far bounds in metres, instead of the rig's."""
+    json: bool = False
+    """Print JSON instead of tables."""
 
     def run(self) -> None:
         """Do it."""
@@ -287,6 +290,10 @@ class Info:
 
         rig = Rig.load(self.rig)
         rig = rig if self.depth is None else rig.replace(depth=self.depth)
+        if self.json:
+            found = {"cameras": summarise_cameras(rig), "pairs": summarise_pairs(rig)}
+            print(dumps({kind: [row._asdict() for row in rows] for kind, rows in found.items()}))
+            return
         table = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
         for c in summarise_cameras(rig):
             wh = f"{c.wh[0]}x{c.wh[1]}"
@@ -398,6 +405,9 @@ def main(arguments: list[str] | None = None) -> None:
     )
     try:
         command.run()
+    except KeyboardInterrupt:
+        console.print("pat: interrupted; no file is left half written", style="red")
+        sys.exit(130)
     except (ValueError, OSError) as error:
         if debug:
             raise

@@ -48,7 +48,8 @@ class Explorer:
         self.sources = {name: beta_sources(name) for name in self.betas}
         self.facts = pn.pane.HTML(name="facts", sizing_mode="stretch_width", min_height=60)
         self.space = pn.pane.Plotly(None, height=340, sizing_mode="stretch_width", config={"displaylogo": False})
-        self.drawn: tuple[object, dict[str, Any]] | None = None
+        self.drawn: tuple[object, dict[str, Any]] = None, {}
+        self.pointed: tuple[float, float] | None = None
         self.controls = Controls(scene.rig, self.state, self.moved)
         self.alpha_figure = self._alpha_figure()
         self.figures = [self._beta_figure(i, name) for i, name in enumerate(self.betas)]
@@ -78,19 +79,20 @@ class Explorer:
             for source, data in zip(sources, beta_data(seen.betas.get(name))):
                 source.data = data
         self.facts.object = facts(state, seen)
-        self.space.object = {
-            **self._rig_drawn(seen),
-            "data": [*self._rig_drawn(seen)["data"], *ray_trace(seen.rig, state)],
-        }
+        self._show_space(seen)
         return seen
 
-    def _rig_drawn(self, seen: Seen) -> dict[str, Any]:
-        """The rig in space, drawn anew only when it has changed."""
+    def _show_space(self, seen: Seen) -> None:
+        """The cameras, drawn anew only when the rig has changed, and the ray, only when the pixel has."""
         state = self.state
         key = (state.near, state.far, tuple(state.changes.items()))
-        if self.drawn is None or self.drawn[0] != key:
+        if key != self.drawn[0]:
             self.drawn = key, space(seen.rig, state.alpha)
-        return self.drawn[1]
+        elif state.x == self.pointed:
+            return
+        self.pointed = state.x
+        rig = self.drawn[1]
+        self.space.object = {**rig, "data": [*rig["data"], *ray_trace(seen.rig, state)]}
 
     def panel(self) -> pn.viewable.Viewable:
         """The page."""

@@ -119,7 +119,8 @@ def test_a_slider_moves_the_segment(page):
 
 
 def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
-    """From a slider's move to the segment's in the page: the quickest of 15, so that other work does not count."""
+    """From a slider's move to the segment's in the page: the quickest of 15, on a machine with nothing else to do."""
+    slower = slowed_by_others()
     times = page.execute_async_script(
         SCRIPT
         + """
@@ -134,9 +135,19 @@ def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
         next();
         """
     )
+    slower = max(1.0, min(slower, slowed_by_others()))
     record_property("milliseconds", times)
-    print("milliseconds from slider to segment:", sorted(round(t) for t in times))
-    assert min(times) < 100
+    record_property("slower", slower)
+    print(f"ms from slider to segment: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
+    assert min(times) < 100 * slower
+
+
+def slowed_by_others():
+    """How many times longer work takes than it would alone: seconds gone by for each that a core worked."""
+    start, end = time.perf_counter(), time.thread_time() + 0.15
+    while time.thread_time() < end:
+        pass
+    return (time.perf_counter() - start) / 0.15
 
 
 def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page):
