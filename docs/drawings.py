@@ -45,8 +45,8 @@ def main() -> None:
     array = load_sample()
     x = torch.tensor([[60.0, 60], [150, 90], [330, 210], [420, 60], [520, 320], [600, 200]])
     save_figure(draw_rig(array.rig, alpha=ALPHA), OUT / "rig.png", dpi=80)
-    save_figure(draw_fields(array.rig, ALPHA, x, images=array.images), OUT / "segments.png", dpi=80)
-    save_figure(families(array, x[1::2]), OUT / "families.png", dpi=80)
+    save_figure(draw_fields(array.rig, ALPHA, x, images=array.images), OUT / "segments.jpg", dpi=80)
+    save_figure(families(array, x[1::2]), OUT / "families.jpg", dpi=80)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from json import dumps
@@ -291,7 +292,7 @@ class Info:
         rig = Rig.load(self.rig)
         rig = rig if self.depth is None else rig.replace(depth=self.depth)
         if self.json:
-            found = {"cameras": summarise_cameras(rig), "pairs": summarise_pairs(rig)}
+            found: dict[str, list[Any]] = {"cameras": summarise_cameras(rig), "pairs": summarise_pairs(rig)}
             print(dumps({kind: [row._asdict() for row in rows] for kind, rows in found.items()}))
             return
         table = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
@@ -393,6 +394,11 @@ def _name_and_file(text: str) -> tuple[str, Path]:
     return name, Path(path)
 
 
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A warning as one line, without the place in the code that it comes from."""
+    console.print(f"pat: warning: {message}", style="yellow", markup=False, soft_wrap=True)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run `pat`. Errors in what was given are one line on standard error, and exit status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
@@ -404,7 +410,9 @@ def main(arguments: list[str] | None = None) -> None:
         args=[a for a in arguments if a != "--debug"],
     )
     try:
-        command.run()
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            command.run()
     except KeyboardInterrupt:
         console.print("pat: interrupted; no file is left half written", style="red")
         sys.exit(130)

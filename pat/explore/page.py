@@ -213,8 +213,8 @@ def picture_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"
         title=title,
         width=480,
         height=round(480 * h / w) + 50,
-        x_range=Range1d(-0.5, w - 0.5),
-        y_range=Range1d(h - 0.5, -0.5),
+        x_range=Range1d(start=-0.5, end=w - 0.5),
+        y_range=Range1d(start=h - 0.5, end=-0.5),
         match_aspect=True,
         tools="pan,wheel_zoom,reset",
         active_scroll="wheel_zoom",
@@ -325,13 +325,14 @@ def ray_trace(rig: Rig, state: State) -> list[dict[str, Any]]:
 
 
 def pixel_ray(rig: Rig, state: State) -> np.ndarray | None:
-    """World points of the pixel at near and far (at most 40 m), (2, 3); None without calibration or a depth range."""
+    """World points on the pixel's ray: alpha's centre, near, far (at most 40 m), (3, 3); None if they are not known."""
     camera = rig[state.alpha]
     if rig.depth is None or not isinstance(camera, Camera):
         return None
     near, far = (min(float(d), 40.0) for d in rig.depth)
     x = torch.tensor([state.x] * 2, dtype=torch.float64)
-    return camera.unproject(x, torch.tensor([near, far], dtype=torch.float64)).numpy()
+    ends = camera.unproject(x, torch.tensor([near, far], dtype=torch.float64))
+    return torch.cat([camera.centre[None], ends]).detach().numpy()
 
 
 def explorer(

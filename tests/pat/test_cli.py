@@ -177,3 +177,14 @@ def test_explore_says_what_is_missing(small, capsys):
     pytest.importorskip("panel")
     told = fails(["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys)
     assert "two cameras or more" in told
+
+
+def test_warnings_are_one_line(small, capsys):
+    text = (small / "rig.yaml").read_text().replace("translation: [-0.12", "translation: [-120.12")
+    assert "-120.12" in text
+    (small / "rig.yaml").write_text(text)
+    main(["rig", "info", str(small / "rig.yaml")])
+    told = capsys.readouterr().err
+    assert told.startswith("pat: warning: ")
+    assert "millimetres" in told
+    assert ".py" not in told.replace(str(small), "")

@@ -150,7 +150,7 @@ def slowed_by_others():
     return (time.perf_counter() - start) / 0.15
 
 
-def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page):
+def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page, tmp_path):
     click(page, 320, 210)
     facts = page.execute_script(SCRIPT + "return [...doc._all_models.values()].map(m => m.text || '').join(' ')")
     assert "pixel (320, 2" in facts.replace("&lt;", "<")
@@ -159,4 +159,5 @@ def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page):
         + "return [...doc._all_models.values()].filter(m => m.type.endsWith('PlotlyPlot'))[0].data.map(t => t.name)"
     )
     assert {"mono", "colour", "the pixel"} <= set(traces)
+    page.save_screenshot(str(tmp_path / "explorer.png"))
     assert [entry for entry in page.get_log("browser") if entry["level"] == "SEVERE"] == []
