@@ -68,3 +68,14 @@ def test_outputs_are_kept_and_none_is_an_error(path):
     notebook = read(path)
     assert any("display_data" in k or "execute_result" in k for k in kinds(notebook))
     assert not any("error" in k or "stderr" in k for k in kinds(notebook))
+
+
+@pytest.mark.slow
+def test_the_explorer_is_shown_by_a_cell(tmp_path):
+    pytest.importorskip("panel")
+    source = "from pat.demo import load_sample\nfrom pat.explore import explorer\nexplorer(*load_sample()[:2])"
+    cells = [nbformat.v4.new_code_cell(source)]
+    fresh = run().execute(nbformat.v4.new_notebook(cells=cells), tmp_path)
+    shown = [kind for output in fresh.cells[0].outputs for kind in output.get("data", {})]
+    assert "application/vnd.holoviews_exec.v0+json" in shown
+    assert not [o for o in fresh.cells[0].outputs if o.output_type == "error"]

@@ -113,8 +113,8 @@ class Explorer:
         drawn = picture_figure(name, self.scene.rig[name].hw, self.scene.images[name])
         segment, samples, match = self.sources[name]
         colour = COLOURS[(index + 1) % len(COLOURS)]
-        drawn.line("x", "y", source=segment, color="white", line_width=5, alpha=0.6)
-        drawn.line("x", "y", source=segment, color=colour, line_width=2)
+        drawn.line("x", "y", source=segment, color="white", line_width=7, alpha=0.85)
+        drawn.line("x", "y", source=segment, color=colour, line_width=3)
         drawn.scatter("x", "y", source=samples, size="size", color=colour, fill_alpha=0.45, line_alpha=0.7)
         drawn.scatter("x", "y", source=match, marker="cross", size=18, color="yellow", line_width=2)
         return drawn
@@ -132,6 +132,8 @@ class Explorer:
             colour = COLOURS[(index + 1) % len(COLOURS)]
             drawn.line("depth", "weight", source=self.sources[name].samples, color=colour, legend_label=name)
             drawn.scatter("depth", "weight", source=self.sources[name].samples, color=colour, size=4)
+        if self.betas:
+            drawn.legend.location = "top_left"
         return drawn
 
 
@@ -141,7 +143,7 @@ class Controls:
     def __init__(self, rig: Rig, state: State, moved: Any) -> None:
         self.moved = moved
         self.changes: dict[str, list[float]] = {name: [0.0] * n for name, n in numbers_of(rig).items()}
-        self.family = pn.widgets.Select(name="field", options=list(FAMILIES), value=state.family)
+        self.family = pn.widgets.Select(label="field", options=list(FAMILIES), value=state.family)
         self.family.param.watch(lambda e: moved(family=e.new), "value")
         self.sliders = [*depth_sliders(rig, moved), *field_sliders(moved)]
         self.numbers = {name: self._sliders_of(name) for name in self.changes}
@@ -250,7 +252,7 @@ def logarithmic(name: str, value: float, ends: tuple[float, float], changed: Any
     """A slider of the decimal logarithm that shows the number itself."""
     low, high = (math.log10(e) for e in ends)
     shown = CustomJSTickFormatter(code="return (10 ** tick).toPrecision(3)")
-    made = pn.widgets.FloatSlider(name=name, start=low, end=high, step=0.005, value=math.log10(value), format=shown)
+    made = pn.widgets.FloatSlider(label=name, start=low, end=high, step=0.005, value=math.log10(value), format=shown)
     made.param.watch(lambda e: changed(10**e.new), "value")
     return made
 
@@ -267,7 +269,7 @@ def field_sliders(moved: Any) -> list[Any]:
 def slider(name: str, bounds: tuple[float, float, float], value: float, changed: Any) -> Any:
     """A slider that calls `changed` with its value."""
     start, end, step = bounds
-    made = pn.widgets.FloatSlider(name=name, start=start, end=end, step=step, value=value)
+    made = pn.widgets.FloatSlider(label=name, start=start, end=end, step=step, value=value)
     made.param.watch(lambda e: changed(e.new), "value")
     return made
 

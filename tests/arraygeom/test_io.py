@@ -502,3 +502,9 @@ def test_colmap_models_that_lost_entries(tmp_path):
     lines = file.read_text().splitlines(keepends=True)
     message = refusal(copied(file, tmp_path, "".join(lines[:6])), "colmap")
     assert message.endswith("announces 2 images and holds 1; was it cut off?")
+
+
+def test_a_size_that_is_missing_is_called_missing(tmp_path):
+    (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
+    with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):
+        Rig.load(tmp_path / "rig.yaml")
