@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme test test-long check format bench train
+.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -21,6 +21,10 @@ help:
 	@echo "make bench      measure attention and training"
 	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
+	@echo "make notebooks  run the notebooks and keep what they put out"
+	@echo "make docs       the documentation as a site, in out/site"
+	@echo "make drawings   the documentation's drawings"
+	@echo "make wheel      build the wheel, install it into an empty environment, run 'pat demo' from there"
 	@echo "make env        only the environment, in $(VENV)"
 
 env: $(READY)
@@ -65,6 +69,23 @@ synthesis: $(READY)
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
 	@$(BIN)/python -m tests.benchmarks.bench_training
+
+notebooks: $(READY)
+	@$(BIN)/python notebooks/run.py
+
+docs: $(READY)
+	@$(BIN)/mkdocs build --strict --quiet
+
+drawings: $(READY)
+	@$(BIN)/python docs/drawings.py
+
+wheel: $(READY)
+	@rm -rf out/wheel
+	@$(BIN)/python -m pip wheel -qq --no-deps --wheel-dir out/wheel .
+	@$(PYTHON) -m venv out/wheel/venv
+	@echo "== installing it and what it needs into out/wheel/venv"
+	@out/wheel/venv/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt torch out/wheel/*.whl
+	@cd out/wheel && venv/bin/pat demo --out demo
 
 train: $(READY)
 	@$(BIN)/pat train $(ARGS)

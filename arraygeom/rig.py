@@ -82,7 +82,10 @@ class Pair:
     def depth_range(self) -> Depths:
         """(near, far) in metres. Raises ValueError if the rig states none."""
         if self.depth is None:
-            raise ValueError("this field needs a depth range: give the rig one, `rig.replace(depth=(near, far))`")
+            raise ValueError(
+                "this field needs a depth range: give the rig one, `depth: [near, far]` in its file "
+                "or `rig.replace(depth=(near, far))`"
+            )
         return self.depth
 
     @property

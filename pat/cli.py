@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from json import dumps
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -374,6 +376,38 @@ class Show:
 
 
 @dataclass
+class Explore:
+    """Serve a page on this machine: click a pixel of alpha, see where every other camera looks, and move the rig.
+
+    Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
+    """
+
+    rig: Positional[Path]
+    """Rig file."""
+    image: UseAppendAction[tuple[str, ...]]
+    """NAME=FILE, once for each camera."""
+    alpha: str | None = None
+    """The camera to click in; by default the first with a picture."""
+    port: int = 0
+    """Port on localhost; 0 takes a free one."""
+    browser: bool = True
+    """Open the browser."""
+
+    def run(self) -> None:
+        """Do it."""
+        from .images import read_image
+
+        try:
+            from .explore.page import serve
+        except ModuleNotFoundError as error:
+            raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
+        rig = Rig.load(self.rig)
+        files = dict(_name_and_file(text) for text in self.image)
+        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        serve(rig, images, alpha=self.alpha, port=self.port, browser=self.browser)
+
+
+@dataclass
 class Train:
     """Train weights by a recipe, on scenes made from photographs while training; see `pat train --help`.
 
@@ -557,6 +591,8 @@ class Info:
     """Rig file of any format known."""
     depth: tuple[float, float] | None = None
     """Near and far bounds in metres, instead of the rig's."""
+    json: bool = False
+    """Print JSON instead of tables."""
 
     def run(self) -> None:
         """Do it."""
@@ -564,6 +600,10 @@ class Info:
 
         rig = Rig.load(self.rig)
         rig = rig if self.depth is None else rig.replace(depth=self.depth)
+        if self.json:
+            found: dict[str, list[Any]] = {"cameras": summarise_cameras(rig), "pairs": summarise_pairs(rig)}
+            print(dumps({kind: [row._asdict() for row in rows] for kind, rows in found.items()}))
+            return
         table = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
         for c in summarise_cameras(rig):
             wh = f"{c.wh[0]}x{c.wh[1]}"
@@ -811,6 +851,7 @@ Command = (
     | Annotated[Showcase, tyro.conf.subcommand("showcase")]
     | Annotated[Show, tyro.conf.subcommand("show")]
     | Annotated[Systems, tyro.conf.subcommand("systems")]
+    | Annotated[Explore, tyro.conf.subcommand("explore")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Render, tyro.conf.subcommand("render")]
     | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
@@ -923,12 +964,22 @@ def _name_and_number(text: str, option: str) -> tuple[str, float]:
         raise ValueError(f"--{option}: '{text}' is not NAME=NUMBER, such as mono=30") from None
 
 
+def _warn(message: Warning | str, *_: Any, **__: Any) -> None:
+    """A warning as one line, without the place in the code that it comes from."""
+    console.print(f"pat: warning: {message}", style="yellow", markup=False, soft_wrap=True)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Run `pat`. Errors in what was given are one line on standard error, and exit status 2."""
     arguments = sys.argv[1:] if arguments is None else arguments
     debug = "--debug" in arguments
     try:
-        _command([a for a in arguments if a != "--debug"]).run()
+        with warnings.catch_warnings():
+            warnings.showwarning = _warn
+            _command([a for a in arguments if a != "--debug"]).run()
+    except KeyboardInterrupt:
+        console.print("pat: interrupted; no file is left half written", style="red")
+        sys.exit(130)
     except (ValueError, OSError, FloatingPointError) as error:
         if debug:
             raise

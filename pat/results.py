@@ -82,13 +82,18 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     return path
 
 
-def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, columns: int) -> None:
-    """One figure of pictures by title, row by row. It appears whole or not at all."""
+def draw_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0) -> Figure:
+    """One figure, `width` inches wide, of pictures by title, row by row."""
     rows = -(-len(panels) // columns)
     h, w = next(iter(panels.values())).shape[-2:]
-    figure = Figure(figsize=(16, (16 / columns * h / w + 0.3) * rows), layout="constrained")
+    figure = Figure(figsize=(width, (width / columns * h / w + 0.3) * rows), layout="constrained")
     for i, (title, picture) in enumerate(panels.items()):
         axes = figure.add_subplot(rows, columns, i + 1, title=title)
         axes.imshow(picture.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
         axes.set_axis_off()
-    save_figure(figure, path)
+    return figure
+
+
+def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, columns: int) -> None:
+    """`draw_panels`, 16 inches wide, as a file that appears whole or not at all."""
+    save_figure(draw_panels(panels, columns=columns, width=16), path)

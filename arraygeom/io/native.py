@@ -282,6 +282,8 @@ class _Reader:
 
     def pair(self, value: Any, entry: str) -> tuple[float, float]:
         """Two numbers; a single one counts for both."""
+        if value is None:
+            raise self.fail(entry, "is missing; wanted two numbers, in pixels")
         a, b = self.numbers(value if isinstance(value, list) else [value, value], (2,), entry).tolist()
         return a, b
 

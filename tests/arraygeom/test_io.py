@@ -533,3 +533,9 @@ def test_wrong_facts_of_a_sensor_are_named(tmp_path, entry, message):
     (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], " + entry + "}\n")
     with pytest.raises(RigFileError, match=message):
         Rig.load(tmp_path / "rig.yaml")
+
+
+def test_a_size_that_is_missing_is_called_missing(tmp_path):
+    (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
+    with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):
+        Rig.load(tmp_path / "rig.yaml")

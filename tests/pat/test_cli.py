@@ -1,5 +1,6 @@
 """The command line: it does the main job, and what is wrong is one line and exit status 2."""
 
+import json
 import shutil
 
 import pytest
@@ -156,3 +157,38 @@ def test_rig_convert_and_back(small, capsys):
         assert torch.allclose(a.K, b.K)
         assert torch.allclose(a.cam_from_world.t, b.cam_from_world.t, atol=1e-9)
     assert "known" in fails(["rig", "convert", str(small / "rig.yaml"), "x", "--write-as", "word"], capsys)
+
+
+def test_rig_info_as_json(small, capsys):
+    main(["rig", "info", str(small / "rig.yaml"), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert [camera["name"] for camera in told["cameras"]] == ["mono", "colour"]
+    assert told["pairs"][0]["baseline"] == pytest.approx(0.1241, abs=1e-3)
+
+
+def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
+    def interrupted(self):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pat.cli.Demo.run", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        main(["demo"])
+    assert stop.value.code == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_explore_says_what_is_missing(small, capsys):
+    pytest.importorskip("panel")
+    told = fails(["explore", str(small / "rig.yaml"), "--image", f"mono={small / 'mono.png'}", "--no-browser"], capsys)
+    assert "two cameras or more" in told
+
+
+def test_warnings_are_one_line(small, capsys):
+    text = (small / "rig.yaml").read_text().replace("translation: [-0.12", "translation: [-120.12")
+    assert "-120.12" in text
+    (small / "rig.yaml").write_text(text)
+    main(["rig", "info", str(small / "rig.yaml")])
+    told = capsys.readouterr().err
+    assert told.startswith("pat: warning: ")
+    assert "millimetres" in told
+    assert ".py" not in told.replace(str(small), "")

@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from pat.matches import match_points, seen_depths
 
 import pat.fuse
 from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
@@ -11,7 +12,6 @@ from pat.demo import load_sample
 from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, quarter_turns, tiles_of, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
 from pat.images import luminance, read_image
-from pat.matches import match_points, seen_depths
 from pat.metrics import score
 from pat.model import PAT, PATConfig
 from pat.weights import load_weights

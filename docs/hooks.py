@@ -1,0 +1,78 @@
+"""What the pages take from elsewhere: {{ file PATH }}, {{ commands }}, {{ formats }}."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin, get_type_hints
+
+ROOT = Path(__file__).parents[1]
+MISSING = "*(not made yet)*"
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Fill in what a page asks for."""
+    markdown = re.sub(r"\{\{ file (\S+) \}\}", lambda found: included(found[1]), markdown)
+    for name, made in (("commands", commands), ("formats", formats)):
+        if f"{{{{ {name} }}}}" in markdown:
+            markdown = markdown.replace(f"{{{{ {name} }}}}", made())
+    return markdown
+
+
+def included(name: str) -> str:
+    """A file of the repository without its first heading; a note if it has not been made."""
+    path = ROOT / name
+    if not path.exists():
+        return MISSING
+    return re.sub(r"\A# .*\n", "", path.read_text(encoding="utf-8"))
+
+
+def commands() -> str:
+    """Every command with what its --help says."""
+    from pat.cli import Command
+
+    return "\n".join(f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in paths(Command))
+
+
+def paths(union: Any, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    """The words of every command that does something, those of groups like `pat rig` in full."""
+    found: list[tuple[str, ...]] = []
+    for part in get_args(union):
+        command, *marks = get_args(part)
+        name = next(m.name for m in marks if hasattr(m, "name"))
+        inner = command.__annotations__.get("command")
+        found += paths(subcommands(command), (*before, name)) if inner else [(*before, name)]
+    return found
+
+
+def subcommands(group: type) -> Any:
+    """The union of a group's commands, whatever marks tyro was given about it."""
+    hint = get_type_hints(group, include_extras=True)["command"]
+    while get_origin(hint) is Annotated:
+        hint = get_args(hint)[0]
+    return hint
+
+
+def help_of(path: tuple[str, ...]) -> str:
+    """What `pat PATH --help` prints, without colours."""
+    from pat.cli import main
+
+    os.environ |= {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        main([*path, "--help"])
+    text = re.sub(r"\x1b\[[0-9;]*m", "", printed.getvalue())
+    return "\n".join(line.rstrip() for line in text.strip().splitlines())
+
+
+def formats() -> str:
+    """A table of the formats that are read, with the convention that each reader states."""
+    from arraygeom.io import READERS, WRITERS
+
+    rows = [
+        f"| `{n}` | {r.CONVENTION} | {'yes' if n in WRITERS else ''} |" for n, r in READERS.items() if n != "native"
+    ]
+    return "\n".join(["| name | its convention, and what is done about it | written |", "|---|---|---|", *rows])

@@ -1,0 +1,37 @@
+"""Run the notebooks in place, outputs kept: python notebooks/run.py [FILE ...]. A file appears whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from pathlib import Path
+
+import nbformat
+from nbclient import NotebookClient
+
+HERE = Path(__file__).parent
+
+
+def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
+    """The notebook with its outputs, run in `folder` with this checkout's packages. Raises nbclient's errors."""
+    client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
+    client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+    return notebook
+
+
+def main(files: list[str]) -> None:
+    """Run each and write it back."""
+    for path in [Path(f) for f in files] or sorted(HERE.glob("*.ipynb")):
+        start = time.monotonic()
+        notebook = execute(nbformat.read(path, as_version=4), path.parent)
+        temporary = path.with_suffix(".tmp")
+        nbformat.write(notebook, temporary)
+        temporary.replace(path)
+        print(f"{path.name}: {time.monotonic() - start:.0f} s, {path.stat().st_size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

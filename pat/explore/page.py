@@ -1,0 +1,390 @@
+"""The explorer's page: pictures, the rig and controls, drawn from `seen`. The same in a browser and in Jupyter."""
+
+from __future__ import annotations
+
+import html
+import math
+import socket
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import panel as pn
+import torch
+from bokeh.events import Tap
+from bokeh.models import ColumnDataSource, CustomJSTickFormatter, Range1d
+from bokeh.plotting import figure
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Camera, Rig
+from arraygeom.viz import COLOURS, calibrated, extent_of, frustum_size, interactive_rig
+
+from .seen import FAMILIES, Scene, Seen, SeenInBeta, State, look_at, numbers_of, picture_pixel
+
+UNITS = {
+    "rotation": (180 / math.pi, "xyz", 3.0, 0.05, "deg"),
+    "translation": (1000.0, "xyz", 50.0, 0.5, "mm"),
+    "focal": (1.0, "xy", 50.0, 0.5, "px"),
+    "centre": (1.0, "xy", 30.0, 0.5, "px"),
+    "distortion": (1.0, "", 0.2, 0.002, ""),
+}
+"""For each kind of number: shown units to one of the rig's, names of its parts, reach and step of the slider, unit."""
+
+SHOWN_PIXELS = 2_000_000
+"""Larger pictures are drawn reduced; what is worked out uses them as they are."""
+
+
+class Explorer:
+    """Widgets and figures over a `State`; `seen` is what is drawn. `panel()` is what to serve or show in a cell."""
+
+    def __init__(self, scene: Scene, alpha: str) -> None:
+        hw = scene.rig[alpha].hw
+        self.scene = scene
+        self.state = State(alpha, picture_pixel(hw[1] / 2, hw[0] / 2, hw))
+        self.betas = [n for n in scene.rig.betas(alpha) if n in scene.images]
+        self.marker = ColumnDataSource({"x": [], "y": []}, name="pixel")
+        self.sources = {name: beta_sources(name) for name in self.betas}
+        self.facts = pn.pane.HTML(name="facts", sizing_mode="stretch_width", min_height=60)
+        self.space = pn.pane.Plotly(None, height=340, sizing_mode="stretch_width", config={"displaylogo": False})
+        self.drawn: tuple[object, dict[str, Any]] = None, {}
+        self.pointed: tuple[float, float] | None = None
+        self.controls = Controls(scene.rig, self.state, self.moved)
+        self.alpha_figure = self._alpha_figure()
+        self.figures = [self._beta_figure(i, name) for i, name in enumerate(self.betas)]
+        self.depth_figure = self._depth_figure()
+        self.seen = self.show(self.state)
+
+    def moved(self, **changes: object) -> None:
+        """Draw what the controls now say."""
+        self.show(self.state.replace(**changes))
+
+    def tapped(self, event: Any) -> None:
+        """Go to the alpha pixel that was clicked."""
+        hw = self.scene.rig[self.state.alpha].hw
+        self.moved(x=picture_pixel(event.x, event.y, hw))
+
+    def show(self, state: State) -> Seen | None:
+        """Work out a state and draw it. A state that is impossible is told, and what was drawn stays."""
+        self.state = state
+        try:
+            seen = look_at(self.scene, state)
+        except ValueError as error:
+            self.facts.object = f"<b>{html.escape(str(error))}</b>"
+            return None
+        self.seen = seen
+        self.marker.data = {"x": [state.x[0]], "y": [state.x[1]]}
+        for name, sources in self.sources.items():
+            for source, data in zip(sources, beta_data(seen.betas.get(name))):
+                source.data = data
+        self.facts.object = facts(state, seen)
+        self._show_space(seen)
+        return seen
+
+    def _show_space(self, seen: Seen) -> None:
+        """The cameras, drawn anew only when the rig has changed, and the ray, only when the pixel has."""
+        state = self.state
+        key = (state.near, state.far, tuple(state.changes.items()))
+        if key != self.drawn[0]:
+            self.drawn = key, space(seen.rig, state.alpha)
+        elif state.x == self.pointed:
+            return
+        self.pointed = state.x
+        rig = self.drawn[1]
+        self.space.object = {**rig, "data": [*rig["data"], *ray_trace(seen.rig, state)]}
+
+    def panel(self) -> pn.viewable.Viewable:
+        """The page."""
+        pictures = pn.FlexBox(*map(pn.pane.Bokeh, (self.alpha_figure, *self.figures)))
+        below = pn.Row(self.space, pn.pane.Bokeh(self.depth_figure))
+        return pn.Row(self.controls.panel(), pn.Column(pictures, self.facts, below), sizing_mode="stretch_width")
+
+    def _alpha_figure(self) -> Any:
+        name = self.state.alpha
+        drawn = picture_figure(f"{name} (alpha): click a pixel", self.scene.rig[name].hw, self.scene.images[name])
+        drawn.scatter("x", "y", source=self.marker, marker="cross", size=18, color="black", line_width=4)
+        drawn.scatter("x", "y", source=self.marker, marker="cross", size=16, color="yellow", line_width=2)
+        drawn.name = "alpha"
+        drawn.on_event(Tap, self.tapped)
+        return drawn
+
+    def _beta_figure(self, index: int, name: str) -> Any:
+        drawn = picture_figure(name, self.scene.rig[name].hw, self.scene.images[name])
+        segment, samples, match = self.sources[name]
+        colour = COLOURS[(index + 1) % len(COLOURS)]
+        drawn.line("x", "y", source=segment, color="white", line_width=7, alpha=0.85)
+        drawn.line("x", "y", source=segment, color=colour, line_width=3)
+        drawn.scatter("x", "y", source=samples, size="size", color=colour, fill_alpha=0.45, line_alpha=0.7)
+        drawn.scatter("x", "y", source=match, marker="cross", size=18, color="yellow", line_width=2)
+        return drawn
+
+    def _depth_figure(self) -> Any:
+        drawn = figure(
+            width=440,
+            height=340,
+            title="weight against depth (m)",
+            x_axis_type="log",
+            tools="pan,wheel_zoom,reset",
+            output_backend="canvas",
+        )
+        for index, name in enumerate(self.betas):
+            colour = COLOURS[(index + 1) % len(COLOURS)]
+            drawn.line("depth", "weight", source=self.sources[name].samples, color=colour, legend_label=name)
+            drawn.scatter("depth", "weight", source=self.sources[name].samples, color=colour, size=4)
+        if self.betas:
+            drawn.legend.location = "top_left"
+        return drawn
+
+
+class Controls:
+    """Sliders that call `moved` with what changed of the state."""
+
+    def __init__(self, rig: Rig, state: State, moved: Any) -> None:
+        self.moved = moved
+        self.changes: dict[str, list[float]] = {name: [0.0] * n for name, n in numbers_of(rig).items()}
+        self.family = pn.widgets.Select(label="field", options=list(FAMILIES), value=state.family)
+        self.family.param.watch(lambda e: moved(family=e.new), "value")
+        self.sliders = [*depth_sliders(rig, moved), *field_sliders(moved)]
+        self.numbers = {name: self._sliders_of(name) for name in self.changes}
+
+    def panel(self) -> pn.viewable.Viewable:
+        """Field and depth above, the numbers of each camera below."""
+        cameras = dict.fromkeys(name.rpartition(".")[0] for name in self.numbers)
+        groups = [
+            (
+                camera,
+                pn.Column(*(s for n, found in self.numbers.items() if n.rpartition(".")[0] == camera for s in found)),
+            )
+            for camera in cameras
+        ]
+        return pn.Column(self.family, *self.sliders, pn.Accordion(*groups, toggle=True), width=320)
+
+    def _sliders_of(self, name: str) -> list[Any]:
+        kind = name.rpartition(".")[2]
+        scale, parts, reach, step, unit = UNITS[kind]
+
+        def changed(index: int, shown: float) -> None:
+            self.changes[name][index] = shown / scale
+            self.moved(changes={n: tuple(v) for n, v in self.changes.items() if any(v)})
+
+        return [
+            slider(
+                f"{name} {parts[i] if parts else i} ({unit})" if unit else f"{name} {i}",
+                (-reach, reach, step),
+                0.0,
+                lambda value, i=i: changed(i, value),
+            )
+            for i in range(len(self.changes[name]))
+        ]
+
+
+class BetaSources(tuple):
+    """Segment, samples and match of one beta, as Bokeh's data sources."""
+
+    @property
+    def samples(self) -> ColumnDataSource:
+        """The samples, with depth and weight."""
+        return self[1]
+
+
+def beta_sources(name: str) -> BetaSources:
+    """Empty ones, named so that a page's script can find them."""
+    kinds = ("segment", "samples", "match")
+    return BetaSources(ColumnDataSource(d, name=f"{k}:{name}") for k, d in zip(kinds, beta_data(None)))
+
+
+def beta_data(seen: SeenInBeta | None) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Columns of the segment's ends (near, far), of the samples, and of where the match is expected."""
+    if seen is None:
+        return {"x": [], "y": []}, {"x": [], "y": [], "weight": [], "depth": [], "size": []}, {"x": [], "y": []}
+    ends = np.empty((0, 2)) if seen.ends is None else seen.ends.numpy()
+    counts = seen.counts
+    x, y = seen.xy[counts].numpy().T
+    weight = seen.weight[counts].numpy()
+    size = 2 + 12 * np.sqrt(weight / max(seen.peak, 1e-9))
+    samples = {"x": x, "y": y, "weight": weight, "depth": seen.depth[counts].numpy(), "size": size}
+    where = [[float(v)] if bool(counts.any()) else [] for v in seen.position]
+    return {"x": ends[:, 0], "y": ends[:, 1]}, samples, {"x": where[0], "y": where[1]}
+
+
+def picture_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"]) -> Any:
+    """A picture with pixel centres at whole numbers and y downwards."""
+    h, w = hw
+    drawn = figure(
+        title=title,
+        width=480,
+        height=round(480 * h / w) + 50,
+        x_range=Range1d(start=-0.5, end=w - 0.5),
+        y_range=Range1d(start=h - 0.5, end=-0.5),
+        match_aspect=True,
+        tools="pan,wheel_zoom,reset",
+        active_scroll="wheel_zoom",
+    )
+    drawn.image_rgba([rgba(image)], x=-0.5, y=-0.5, dw=w, dh=h)
+    drawn.grid.visible = False
+    return drawn
+
+
+def rgba(image: Float[Tensor, "c h w"]) -> np.ndarray:
+    """The picture as Bokeh wants it, (H, W) of 32 bits, reduced if it is very large."""
+    shrink = math.sqrt(SHOWN_PIXELS / (image.shape[1] * image.shape[2]))
+    if shrink < 1:
+        image = interpolate(image[None], scale_factor=shrink, mode="bilinear", antialias=True)[0]
+    colours = image if image.shape[0] == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
+    opaque = torch.cat([colours.clamp(0, 1), torch.ones_like(colours[:1])])
+    bytes_ = (255 * opaque).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
+    return bytes_.view(np.uint32)[..., 0]
+
+
+def depth_sliders(rig: Rig, moved: Any) -> list[Any]:
+    """Near and far on logarithmic scales, if the rig has them; an infinite far stands at 1000 m until it is moved."""
+    if rig.depth is None:
+        return []
+    near, far = (min(float(d), 1000.0) for d in rig.depth)
+    return [
+        logarithmic("near (m)", near, (near / 4, far), lambda v: moved(near=v)),
+        logarithmic("far (m)", far, (near, max(4 * far, 1000.0)), lambda v: moved(far=v)),
+    ]
+
+
+def logarithmic(name: str, value: float, ends: tuple[float, float], changed: Any) -> Any:
+    """A slider of the decimal logarithm that shows the number itself."""
+    low, high = (math.log10(e) for e in ends)
+    shown = CustomJSTickFormatter(code="return (10 ** tick).toPrecision(3)")
+    made = pn.widgets.FloatSlider(label=name, start=low, end=high, step=0.005, value=math.log10(value), format=shown)
+    made.param.watch(lambda e: changed(10**e.new), "value")
+    return made
+
+
+def field_sliders(moved: Any) -> list[Any]:
+    """Displacement, width, sharpness. The displacement covers the depth range until it is moved from 0."""
+    return [
+        slider("displacement (px; 0: what covers the depths)", (0, 200, 1), 0, lambda v: moved(displacement=v or None)),
+        slider("widened by (px)", (0, 10, 0.5), 0, lambda v: moved(across=v)),
+        slider("sharpness of the weights", (1, 100, 1), 30, lambda v: moved(sharpness=v)),
+    ]
+
+
+def slider(name: str, bounds: tuple[float, float, float], value: float, changed: Any) -> Any:
+    """A slider that calls `changed` with its value."""
+    start, end, step = bounds
+    made = pn.widgets.FloatSlider(label=name, start=start, end=end, step=step, value=value)
+    made.param.watch(lambda e: changed(e.new), "value")
+    return made
+
+
+def facts(state: State, seen: Seen) -> str:
+    """A line of HTML for the pixel, and one for each beta."""
+    depth = f"depth {seen.depth:.3g} m" if math.isfinite(seen.depth) else "depth not told"
+    lines = [f"<b>pixel ({state.x[0]:.0f}, {state.x[1]:.0f})</b> {depth} fused colour {swatch(seen.colour)}"]
+    for name, beta in seen.betas.items():
+        told = f"length {float((beta.ends[1] - beta.ends[0]).norm()):.1f} px, " if beta.ends is not None else ""
+        lines.append(
+            f"<b>{html.escape(name)}</b> {told}{int(beta.counts.sum())} samples, peak {beta.peak:.2f}, "
+            f"spread {beta.spread:.1f} px, sees {swatch(beta.value)}"
+        )
+    lines += [f"<b>{html.escape(n)}</b> {html.escape(problem)}" for n, problem in seen.problems.items()]
+    return "<br>".join(lines)
+
+
+def swatch(colour: Float[Tensor, "c"]) -> str:
+    """A square of the colour, and its numbers."""
+    values = [float(v) for v in colour.clamp(0, 1)]
+    r, g, b = (round(255 * v) for v in (values if len(values) == 3 else [sum(values) / len(values)] * 3))
+    square = f'<span style="display:inline-block;width:1.4em;height:1em;background:rgb({r},{g},{b})"></span>'
+    return f"{square} ({', '.join(f'{v:.2f}' for v in values)})"
+
+
+def space(rig: Rig, alpha: str) -> dict[str, Any]:
+    """The rig in 3-D as plotly's plain data; nothing if no camera is calibrated."""
+    if not any(isinstance(c, Camera) for c in rig.cameras.values()):
+        return {"data": [], "layout": {"title": "no camera is calibrated: no drawing in space"}}
+    drawn = interactive_rig(rig, alpha=alpha if isinstance(rig[alpha], Camera) else None)
+    drawn.update_layout(margin={"l": 0, "r": 0, "t": 30, "b": 0}, uirevision="rig", showlegend=False)
+    drawn.update_scenes(**around_cameras(rig))
+    return drawn.to_plotly_json()
+
+
+def around_cameras(rig: Rig) -> dict[str, Any]:
+    """Ranges of plotly's axes (x, z, -y) in which the cameras are large; what lies farther is cut off."""
+    cameras = calibrated(rig)
+    centres = np.stack([camera.centre.detach().double().numpy() for camera in cameras.values()])
+    room = max(extent_of(cameras), 1.5 * frustum_size(cameras))
+    (x0, y0, z0), (x1, y1, z1) = centres.min(0) - room, centres.max(0) + room
+    ranges = {"xaxis": (x0, x1), "yaxis": (z0, z1 + 2 * room), "zaxis": (-y1, -y0)}
+    return {f"{axis}_range": [float(v) for v in ends] for axis, ends in ranges.items()}
+
+
+def ray_trace(rig: Rig, state: State) -> list[dict[str, Any]]:
+    """The pixel's ray from near to far as a trace of plotly's, if it can be told."""
+    ray = pixel_ray(rig, state)
+    if ray is None:
+        return []
+    x, y, z = ray.T
+    line = {"color": "gold", "width": 6}
+    return [{"type": "scatter3d", "x": x, "y": z, "z": -y, "mode": "lines", "line": line, "name": "the pixel"}]
+
+
+def pixel_ray(rig: Rig, state: State) -> np.ndarray | None:
+    """World points on the pixel's ray: alpha's centre, near, far (at most 40 m), (3, 3); None if they are not known."""
+    camera = rig[state.alpha]
+    if rig.depth is None or not isinstance(camera, Camera):
+        return None
+    near, far = (min(float(d), 40.0) for d in rig.depth)
+    x = torch.tensor([state.x] * 2, dtype=torch.float64)
+    ends = camera.unproject(x, torch.tensor([near, far], dtype=torch.float64))
+    return torch.cat([camera.centre[None], ends]).detach().numpy()
+
+
+def explorer(
+    rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], *, alpha: str | None = None
+) -> pn.viewable.Viewable:
+    """The explorer of a rig and pictures (C, H, W) by camera name, to show in a cell of a notebook.
+
+    `alpha` is the camera to click in, by default the first with a picture. Raises ValueError for a camera the rig
+    lacks, a picture of another size, and if alpha or every beta has no picture.
+    """
+    return Explorer(*prepared(rig, images, alpha)).panel()
+
+
+def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple[Scene, str]:
+    """The checked scene and alpha's name."""
+    for name in images:
+        rig.known(name)
+    if len(images) < 2:
+        raise ValueError("the explorer needs pictures of two cameras or more: give one of alpha and one of each beta")
+    alpha = rig.known(alpha or next(n for n in rig.names if n in images))
+    if alpha not in images:
+        raise ValueError(f"no picture of alpha, '{alpha}': give one, or choose another alpha")
+    pn.extension("plotly")
+    return Scene(rig, images), alpha
+
+
+def serve(
+    rig: Rig,
+    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    *,
+    alpha: str | None = None,
+    port: int = 0,
+    browser: bool = True,
+) -> None:
+    """Serve the explorer to this machine alone until interrupted; port 0 takes a free one. Raises as `explorer`."""
+    scene, alpha = prepared(rig, images, alpha)
+    port = port or free_port()
+    print(f"the explorer is at http://localhost:{port} (Ctrl+C ends it)", flush=True)
+    pn.serve(
+        {"/": lambda: Explorer(scene, alpha).panel()},
+        port=port,
+        address="localhost",
+        show=browser,
+        title=f"pat explore {rig.name}".strip(),
+        verbose=False,
+    )
+
+
+def free_port() -> int:
+    """A port on localhost that nothing listens at."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return probe.getsockname()[1]

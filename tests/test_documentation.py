@@ -1,0 +1,88 @@
+"""The documentation's samples run, its links lead somewhere, and the site builds without a warning."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from arraygeom import Rig
+from pat.images import write_image
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted((ROOT / "docs").glob("*.md"))
+
+
+def blocks(path: Path, language: str) -> list[str]:
+    """Blocks of code, also those indented in lists."""
+    found = re.findall(rf"^( *)```{language}\n(.*?)^\1```$", path.read_text(), re.M | re.S)
+    return [re.sub(rf"^{indent}", "", text, flags=re.M) for indent, text in found]
+
+
+def those_with(language: str):
+    pages = [p for p in PAGES if blocks(p, language)]
+    return pytest.mark.parametrize("page", pages, ids=lambda p: p.stem)
+
+
+@those_with("yaml")
+def test_rig_files_in_the_pages_are_read(page, tmp_path):
+    for text in blocks(page, "yaml"):
+        (tmp_path / "rig.yaml").write_text(text)
+        assert len(Rig.load(tmp_path / "rig.yaml").names) == 2
+
+
+@those_with("python")
+def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
+    if page.stem == "explorer":
+        pytest.importorskip("panel")
+    (tmp_path / "rig.yaml").write_text(blocks(ROOT / "docs" / "index.md", "yaml")[0])
+    for name, channels in (("a", 1), ("b", 3)):
+        write_image(tmp_path / f"{name}.png", torch.rand(channels, 400, 640))
+    monkeypatch.chdir(tmp_path)
+    scope: dict = {}
+    for text in blocks(page, "python"):
+        exec(text, scope)
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda p: p.stem)
+def test_links_lead_somewhere(page):
+    links = re.findall(r"\]\(([^)]+)\)", page.read_text())
+    local = [link.partition("#")[0] for link in links if "://" not in link]
+    assert [link for link in local if link and not (page.parent / link).exists()] == []
+
+
+def test_commands_in_the_pages_exist():
+    """Every `pat ...` that a page shows parses: its --help is printed."""
+    from pat.cli import Command
+
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        from hooks import paths
+    finally:
+        sys.path.pop(0)
+    known = {" ".join(path) for path in paths(Command)}
+    shown = {
+        re.match(r"pat ((?:rig |data )?[a-z]+)", line)[1]
+        for page in [*PAGES, ROOT / "README.md"]
+        for text in [*blocks(page, "text"), *blocks(page, "")]
+        for line in text.splitlines()
+        if re.match(r"pat [a-z]", line)
+    }
+    assert shown
+    assert shown <= known
+
+
+@pytest.mark.slow
+def test_the_site_builds_without_a_warning(tmp_path):
+    pytest.importorskip("material")
+    built = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+    )
+    assert built.returncode == 0, built.stderr
+    assert "Epipolar" in (tmp_path / "api" / "arraygeom.html").read_text()
+    assert "--alpha" in (tmp_path / "commands.html").read_text()

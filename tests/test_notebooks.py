@@ -1,0 +1,81 @@
+"""The notebooks run from a fresh kernel, claim something at their end, and say what is committed."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+nbformat = pytest.importorskip("nbformat")
+ROOT = Path(__file__).parents[1]
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
+QUICK = "3_your_own_rig"
+"""The one that runs in the normal tests: it needs no network."""
+
+
+def read(path):
+    return nbformat.read(path, as_version=4)
+
+
+def run():
+    spec = importlib.util.spec_from_file_location("notebooks_run", ROOT / "notebooks" / "run.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def kinds(notebook):
+    """For each cell of code, the kinds of what it puts out."""
+    return [
+        sorted({o.output_type if o.output_type != "stream" else o.name for o in cell.outputs})
+        for cell in notebook.cells
+        if cell.cell_type == "code"
+    ]
+
+
+def executed(path, tmp_path):
+    kept = read(path)
+    fresh = run().execute(read(path), tmp_path)
+    assert kinds(fresh) == kinds(kept), "run `make notebooks`: what is committed is not what comes out"
+
+
+def each(paths):
+    return pytest.mark.parametrize("path", paths, ids=lambda p: p.stem)
+
+
+@each([p for p in NOTEBOOKS if p.stem == QUICK])
+def test_a_notebook_runs(path, tmp_path):
+    executed(path, tmp_path)
+
+
+@pytest.mark.slow
+@each([p for p in NOTEBOOKS if p.stem != QUICK])
+def test_the_other_notebooks_run(path, tmp_path):
+    executed(path, tmp_path)
+
+
+@each(NOTEBOOKS)
+def test_notebooks_are_short_stories_with_a_claim(path):
+    cells = read(path).cells
+    code = [c for c in cells if c.cell_type == "code"]
+    assert len(cells) <= 40
+    assert max(len(c.source.splitlines()) for c in code) <= 25
+    assert any(c.source.lstrip().startswith("assert") or "\nassert" in c.source for c in code[-1:])
+    assert path.stat().st_size < 1_500_000
+
+
+@each(NOTEBOOKS)
+def test_outputs_are_kept_and_none_is_an_error(path):
+    notebook = read(path)
+    assert any("display_data" in k or "execute_result" in k for k in kinds(notebook))
+    assert not any("error" in k or "stderr" in k for k in kinds(notebook))
+
+
+@pytest.mark.slow
+def test_the_explorer_is_shown_by_a_cell(tmp_path):
+    pytest.importorskip("panel")
+    source = "from pat.demo import load_sample\nfrom pat.explore import explorer\nexplorer(*load_sample()[:2])"
+    cells = [nbformat.v4.new_code_cell(source)]
+    fresh = run().execute(nbformat.v4.new_notebook(cells=cells), tmp_path)
+    shown = [kind for output in fresh.cells[0].outputs for kind in output.get("data", {})]
+    assert "application/vnd.holoviews_exec.v0+json" in shown
+    assert not [o for o in fresh.cells[0].outputs if o.output_type == "error"]
