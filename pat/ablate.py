@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import astuple, dataclass, fields
 from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -217,7 +217,8 @@ def ablate(
     shown: int = 4,
 ) -> list[Row]:
     """Every family on every case; ablation.md, ablation.csv and ablation.png (crops of `shown` cases) go to `out`."""
-    rows, crops = [], []
+    rows: list[Row] = []
+    crops: list[Any] = []
     for case in track(cases, "ablating", disable=not sys.stderr.isatty()):
         found, pictures = _case(network, case, chosen or families())
         rows += found
