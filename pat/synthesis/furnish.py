@@ -72,9 +72,11 @@ class Setting:
         """One of the cameras, drawn."""
         return self.cameras[int(self.rng.integers(len(self.cameras)))]
 
-    def distance(self, X: NDArray) -> float:
-        """From the nearest camera, metres."""
-        return float(np.linalg.norm(self.centres - X, axis=1).min())
+    def nearest(self, X: NDArray) -> float:
+        """The least depth at which a camera can see a point; to cameras that it is not before, the distance."""
+        distances = np.linalg.norm(self.centres - X, axis=1)
+        depths = [float(c.cam_from_world.apply(c.K.new_tensor(X)[None])[0, 2]) for c in self.cameras]
+        return float(min(z if z > 0.3 * d else d for z, d in zip(depths, distances)))
 
     def ahead(self, camera: Camera, fraction: NDArray, depth: float) -> NDArray:
         """The point at a depth in the middle `fraction` (-1..1, across and down) of a camera's picture."""
@@ -124,16 +126,16 @@ def _room(setting: Setting) -> _Room:
         centre, extent = np.array([0, 0, (front + back) / 2]), np.array([2 * half[0], 2 * half[1], front - back])
         room = _Room(R, setting.centres[0] + R @ centre, extent)
         nearest, farthest = _reach(room, setting.cameras, rays)
-        if farthest <= 0.99 * setting.far and nearest >= setting.near:
+        if farthest <= 0.98 * setting.far and nearest >= setting.near:
             return room
-        front = front if farthest <= 0.99 * setting.far else 0.93 * front
+        front = front if farthest <= 0.98 * setting.far else 0.93 * front
         half = half if nearest >= setting.near else 1.15 * half
     return room
 
 
 def _rays(camera: Camera) -> NDArray:
     """Directions in the world, per metre of depth, of pixels all over the picture."""
-    grid = coarse_grid(camera.hw, max(camera.hw) // 8 or 1).reshape(-1, 2)
+    grid = coarse_grid(camera.hw, max(camera.hw) // 24 or 1).reshape(-1, 2)
     directions = (camera.unproject(grid, grid.new_ones(len(grid))) - camera.centre).double().numpy()
     return np.asarray(directions[np.isfinite(directions).all(1)])
 
@@ -200,7 +202,7 @@ def _object(setting: Setting, room: _Room, others: list[Object], surface: Surfac
     depth = float(1 / rng.uniform(1 / (0.75 * setting.far), 1 / (1.25 * setting.near)))
     centre = setting.ahead(camera, rng.uniform(-0.95, 0.95, 2), depth)
     view = depth * min(n / 2 / float(f) for n, f in zip((camera.hw[1], camera.hw[0]), camera.K[:2, :2].abs().amax(1)))
-    radius = float(min(view * rng.uniform(0.2, 0.55), 0.9 * (setting.distance(centre) - setting.near)))
+    radius = float(min(view * rng.uniform(0.2, 0.55), 0.85 * (setting.nearest(centre) - setting.near)))
     if not radius > 0.05 * view or not room.holds(centre, 0.4 * radius) or _crowded(centre, radius, others):
         return None
     shape = _SHAPES[int(rng.integers(len(_SHAPES)))]
@@ -240,7 +242,7 @@ def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple
     rng, keys = setting.rng, [start]
     for k in range(1, 4):
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius
-        if setting.distance(position) - radius < setting.near:
+        if setting.nearest(position) - 1.2 * radius < setting.near:
             position = np.asarray(keys[-1].position)
         turn = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(keys[-1].rotation)
         extent = np.asarray(start.extent) * rng.uniform(0.8, 1.2, 3)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from numpy.random import Generator
@@ -35,7 +36,8 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
 def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
     """Scenes like those of `abstract`, with the pictures under a folder on all surfaces.
 
-    Raises ValueError if the folder holds no pictures.
+    Pictures that are black in large parts are used only if there are no others. Raises ValueError if the folder holds
+    no pictures.
     """
     files = _pictures(Path(folder))
 
@@ -44,7 +46,7 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
         width = setting.metres(depth, rng.uniform(150, 400))
         paint = Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0)))
         shift = (float(rng.uniform()), float(rng.uniform()), 0.0)
-        return Texture(kind="picture", picture=str(rng.choice(files)), scale=1 / width, paints=(paint,), offset=shift)
+        return Texture(kind="picture", picture=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift)
 
     return furnished("photographs", seed, rig, picture, moving)
 
@@ -134,6 +136,19 @@ def _pictures(folder: Path) -> tuple[str, ...]:
     if not found:
         raise ValueError(f"{folder}: no pictures ({', '.join(sorted(PICTURES))}) under this folder")
     return tuple(found)
+
+
+def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:
+    """One of the pictures, and if it can be helped none that is black in large parts."""
+    drawn = [str(rng.choice(files)) for _ in range(8)]
+    return next((file for file in drawn if _blackness(file) < 0.3), drawn[0])
+
+
+@lru_cache(maxsize=4096)
+def _blackness(file: str) -> float:
+    """The share of pixels that are nearly black; 1 for what is no picture."""
+    small = cv2.imread(file, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    return 1.0 if small is None else float((small < 24).mean())
 
 
 def _linear(coded: float) -> float:

@@ -65,11 +65,16 @@ class Lens(NamedTuple):
 
 
 def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
-    """Inverse depth at positions by that of the nearest pixel and its slopes to the more even sides."""
+    """Inverse depth at positions by that of the nearest pixel and its slopes to the more even sides.
+
+    It stays within what the four pixels around have: no surface is nearer or farther than any that was seen.
+    """
     layers = torch.stack([inverse, _gentlest(inverse, 1), _gentlest(inverse, 0)])
     q, across, down = sample(layers[None], x[None], interpolation="nearest").values[0]
     dx, dy = (x - (x + 0.5).floor()).unbind(-1)
-    return (q + across * dx + down * dy).clamp(min=0)
+    steps = x.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]])[:, None, None]
+    around = sample(inverse[None, None], (x.floor() + steps)[None], interpolation="nearest").values[0, 0]
+    return torch.clamp(q + across * dx + down * dy, around.amin(0), around.amax(0))
 
 
 def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:

@@ -113,6 +113,7 @@ class Studio:
     def _engine(self) -> None:
         if self.settings.engine == "eevee":
             self.blender.render.engine = compat.eevee(self.blender)
+            self.blender.eevee.taa_render_samples = self.settings.samples
 
     def _plain(self) -> Any:
         name = "plain"

@@ -64,7 +64,8 @@ def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
         torch.testing.assert_close(camera.K, rig[name].K)
         assert frame.rgb.shape == (3, *camera.hw)
         on_walls(scene, camera, frame)
-        on_sphere(scene, camera, frame)
+        if camera.distortion is None:
+            on_sphere(scene, camera, frame)
         assert (frame.normals.norm(dim=0) - 1).abs().max() < 2e-3
         grey = frame.rgb.mean(0)
         assert torch.corrcoef(torch.stack([grey.flatten(), frame.nir[0].flatten()]))[0, 1] < 0.98
@@ -139,7 +140,7 @@ def test_fiducials_are_where_arraygeom_projects_them(worker, tmp_path, name):
     camera = unlike_cameras(128)[name]
     squares = fiducials(camera)
     rig = Rig({name: camera})
-    done = worker.render(Scene(objects=tuple(squares)), rig, tmp_path / "x", settings=replaced(CLEAN, samples=128))
+    done = worker.render(Scene(objects=tuple(squares)), rig, tmp_path / "x", settings=replaced(CLEAN, samples=256))
     light = done.frame(name).rgb.mean(0)
     errors = []
     for square in squares:
@@ -272,7 +273,8 @@ def test_twenty_scenes_of_four_unlike_cameras(worker, tmp_path):
         done = worker.render(abstract(seed, rig), rig, tmp_path / str(seed), settings=QUICK)
         p95 += [figures["p95"] for figures in done.about["check"]["pairs"].values()]
         assert done.accepted, (seed, done.about["check"]["reasons"])
-        assert all(1.5 < f["near"] < f["far"] <= 12 for f in done.about["check"]["views"].values())
+        depths = [(figures["near"], figures["far"]) for figures in done.about["check"]["views"].values()]
+        assert all(2 <= near < far <= 12 for near, far in depths), (seed, depths)
     print(f"view to view, 240 pairs: p95 at most {max(p95):.4f} px")
     assert max(p95) < 0.02
 
