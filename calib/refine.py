@@ -179,6 +179,12 @@ class Fit:
         """The rig after a change of z, in standard deviations."""
         return changed(self.rig, self.given, z)
 
+    def prior(self) -> Solution:
+        """What is known before any point: no change, give or take a standard deviation."""
+        count = sum(len(u.sigma) for u in self.given)
+        eye = torch.eye(count, dtype=torch.float64)
+        return Solution(torch.zeros(count, dtype=torch.float64), torch.ones(count, dtype=torch.bool), eye)
+
     def solve(self) -> Solution:
         """What the used points tell."""
         return solve(lambda z: sampson(self.after(z), self.used), sum(len(u.sigma) for u in self.given))

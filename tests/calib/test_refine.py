@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from arraygeom import Camera, Link, Rig, View
-from calib.matches import Matches
+from calib.matches import Matches, match_cameras
 from calib.photometric import Views, photometric_errors
-from calib.refine import jacobian, line_distances, refine, refine_matches, sampson, solve
+from calib.refine import Fit, jacobian, line_distances, polish, refine, refine_matches, sampson, solve
 from calib.residuals import epipolar_residuals
 from calib.unknowns import changed, unknowns
 from pat.cli import main
@@ -171,6 +171,24 @@ def test_the_fusions_error_brings_a_rig_nearer_its_truth():
     assert found.photometric is not None
     assert "fusion's own error" in found.as_text()
     assert median_off(found.rig, seen_points(rig, noise=0.0)) < 0.1
+
+
+def test_the_fusions_error_alone_does_too():
+    """No point is used: the gradient through attention's segments moves the rig."""
+    rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_pictures()
+    fit = Fit.of(
+        rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}),
+        [match_cameras(images)],
+        free=["right.rotation"],
+        sigma=None,
+    )
+    truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
+    before = median_off(fit.rig, truth)
+    found, errors = polish(fit, fit.prior(), [images])
+    assert before > 1
+    assert median_off(fit.after(found.z), truth) < 0.3 * before
+    assert errors.accepted
+    assert errors.after < errors.before
 
 
 def test_bad_input_is_one_clear_line():
