@@ -67,7 +67,7 @@ class Change:
 class Agreement(NamedTuple):
     """How far points are from their lines: their number, the median and the root mean square of the nearest 85%."""
 
-    count: int
+    points: int
     median: float
     rms: float
 
@@ -103,7 +103,7 @@ class Refined:
     def as_text(self) -> str:
         """What changed and whether points that were held out agree, as people read it."""
         before, after = self.held_out
-        lines = [f"held-out points ({before.count}) lie {before} off their lines before, {after} after"]
+        lines = [f"held-out points ({before.points}) lie {before} off their lines before, {after} after"]
         if self.accepted:
             lines += [f"changed: {change}" for change in self.changes]
         else:

@@ -97,7 +97,7 @@ def fast_and_slow(data: Path) -> Iterator[str]:
         before, after = found.held_out
         own = own_agreement(matches)
         medians = " | ".join(f"{a.median:.2f}" for a in (own, before, after))
-        yield f"| {name} | {before.count} | {medians} | {beyond(after, own):.2f} |"
+        yield f"| {name} | {before.points} | {medians} | {beyond(after, own):.2f} |"
 
 
 def rendered_rigs(draws: int, g: torch.Generator) -> Iterator[str]:

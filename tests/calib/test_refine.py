@@ -57,8 +57,8 @@ def test_several_frames_hold_a_whole_one_out():
     rig = unlike_pair()
     frames = [seen_points(rig, count=100, seed=seed) for seed in range(3)]
     found = refine_matches(worse(rig), frames)
-    assert found.held_out[0].count == 100
-    assert found.fitted[0].count == 200
+    assert found.held_out[0].points == 100
+    assert found.fitted[0].points == 200
     assert found.accepted
 
 
