@@ -67,7 +67,7 @@ class Change:
 class Agreement(NamedTuple):
     """How far points are from their lines: their number, the median and the root mean square of the nearest 85%."""
 
-    count: int
+    points: int
     median: float
     rms: float
 
@@ -103,7 +103,7 @@ class Refined:
     def as_text(self) -> str:
         """What changed and whether points that were held out agree, as people read it."""
         before, after = self.held_out
-        lines = [f"held-out points ({before.count}) lie {before} off their lines before, {after} after"]
+        lines = [f"held-out points ({before.points}) lie {before} off their lines before, {after} after"]
         if self.accepted:
             lines += [f"changed: {change}" for change in self.changes]
         else:
@@ -178,6 +178,12 @@ class Fit:
     def after(self, z: Float[Tensor, " n"]) -> Rig:
         """The rig after a change of z, in standard deviations."""
         return changed(self.rig, self.given, z)
+
+    def prior(self) -> Solution:
+        """What is known before any point: no change, give or take a standard deviation."""
+        count = sum(len(u.sigma) for u in self.given)
+        eye = torch.eye(count, dtype=torch.float64)
+        return Solution(torch.zeros(count, dtype=torch.float64), torch.ones(count, dtype=torch.bool), eye)
 
     def solve(self) -> Solution:
         """What the used points tell."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import NamedTuple
 
 import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -71,9 +73,9 @@ def _K(name: str, focal: Mapping[str, float], sizes: Mapping[str, HW]) -> Tensor
 def _fundamental(matches: Matches, K: Tensor | None, K_beta: Tensor | None) -> tuple[Tensor, float, bool]:
     """F of all points; how far it, fitted to the rest, puts held-out points off; whether it is by focal lengths."""
     (used,), (held_out,) = (list(part.values()) for part in split([{("", ""): matches}]))
-    ways = {False: fit_fundamental}
+    ways: dict[bool, Callable[[Matches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:
-        ways[True] = lambda some: _by_focal(some, K, K_beta)
+        ways[True] = partial(_by_focal, K=K, K_beta=K_beta)
     off = {by: float(line_distance(held_out, fit(used)).median()) for by, fit in ways.items()}
     best = min(off, key=lambda by: off[by])
     return ways[best](matches), off[best], best
@@ -81,7 +83,8 @@ def _fundamental(matches: Matches, K: Tensor | None, K_beta: Tensor | None) -> t
 
 def _by_focal(matches: Matches, K: Tensor, K_beta: Tensor) -> Tensor:
     x, y = (points.numpy() for points in matches)
-    E, _ = cv2.findEssentialMat(x, y, K.numpy(), None, K_beta.numpy(), None, method=cv2.RANSAC, threshold=1.0)
+    no_lens = np.zeros(5)
+    E, _ = cv2.findEssentialMat(x, y, K.numpy(), no_lens, K_beta.numpy(), no_lens, method=cv2.RANSAC, threshold=1.0)
     if E is None or E.shape != (3, 3):
         return fit_fundamental(matches)
     return torch.linalg.inv(K_beta).T @ torch.from_numpy(E) @ torch.linalg.inv(K)

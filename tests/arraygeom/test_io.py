@@ -14,7 +14,7 @@ import pytest
 import scipy.io
 import torch
 
-from arraygeom import Camera, Pose, Rig, View
+from arraygeom import Camera, Pose, Rig, View, intrinsics
 from arraygeom.distortion import Distortion
 from arraygeom.io import READERS, RigFileError, RigFileWarning, convention, read_rig, recognise, write_rig
 from arraygeom.pose import rotation_from_vector
@@ -539,3 +539,11 @@ def test_a_size_that_is_missing_is_called_missing(tmp_path):
     (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
     with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):
         Rig.load(tmp_path / "rig.yaml")
+
+
+def test_a_picture_turned_upside_down_survives_the_native_file(tmp_path):
+    """Its K has negative focal lengths, which `focal` cannot state."""
+    K = intrinsics(300.0, (240, 320))
+    rig = Rig({"a": Camera(K=K, cam_from_world=Pose.identity(), hw=(240, 320))}).turn("a", 2)
+    rig.save(tmp_path / "rig.yaml")
+    assert torch.equal(Rig.load(tmp_path / "rig.yaml")["a"].K, rig["a"].K)
