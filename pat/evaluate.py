@@ -330,7 +330,7 @@ def _fused(name: str, fuse: Fusion, pair: StereoPair, task: MonoColourTask, max_
 
 
 def _row(pair: StereoPair, rate: int, method: str, answer: Answer, truth: Tensor) -> Row:
-    errors = (None, None)
+    errors: tuple[float | None, float | None] = (None, None)
     if answer.disparity is not None and pair.disparity is not None:
         errors = disparity_errors(answer.disparity.detach().cpu(), pair.disparity)
     return Row(pair.name, rate, method, *score(answer.image, truth), *errors)
