@@ -12,6 +12,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 from torch.utils.data import Dataset, Sampler
 
+from arraygeom.camera import Camera
 from arraygeom.fields import ReceptiveField
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
@@ -180,11 +181,14 @@ class RenderedScenes:
     """Patches of rendered scenes where layered ones are expected: `sample` is that of `LayeredScenes`.
 
     A batch mixes patches of several scenes that are in memory; `mixed` of them are, and one is exchanged about
-    every time that as many patches as it has were given.
+    every time that as many patches as it has were given. Raises ValueError for cameras with a lens model.
     """
 
     def __init__(self, root: str | Path, *, alpha: str | None = None, patches: Patches | None = None, mixed: int = 16):
         self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
+        for name, camera in self.scenes.rig.cameras.items():
+            if isinstance(camera, Camera) and camera.distortion is not None:
+                raise ValueError(f"camera '{name}' has a lens model, training scenes are of pinholes: use ScenePatches")
         self.mixed = min(mixed, len(self.scenes))
         self._pool: list[int] = []
 
@@ -200,8 +204,7 @@ class RenderedScenes:
         depth = [torch.stack([stack.depth[n][i] for stack, i in stacks]) for n in names]
         cameras = [rig[n].to(torch.float32) for n in names]
         K, R, t, hw = ([getattr(c, key) for c in cameras] for key in ("K", "R", "t", "hw"))
-        bounds = torch.stack(depth[0].flatten(1).aminmax(dim=1), -1)
-        return ArrayBatch(images, depth, K, R, t, hw, bounds)
+        return ArrayBatch(images, depth, K, R, t, hw, _bounds(depth[0]))
 
     def _exchange(self, batch: int, generator: Generator) -> None:
         while len(self._pool) < self.mixed:
@@ -209,6 +212,14 @@ class RenderedScenes:
         chance = batch / self.scenes.patches.count
         if float(torch.rand((), generator=generator)) < chance:
             self._pool[_draw(self.mixed, generator)] = _draw(len(self.scenes), generator)
+
+
+def _bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
+    """The nearest and the farthest of what is there; what is infinitely far, or not seen by a lens, does not count."""
+    there = depth.isfinite()
+    near = torch.where(there, depth, torch.inf).flatten(1).amin(1)
+    far = torch.where(there, depth, 0.0).flatten(1).amax(1)
+    return torch.stack([near, torch.maximum(near, far)], -1)
 
 
 def _draw(below: int, generator: Generator) -> int:

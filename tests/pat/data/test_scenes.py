@@ -8,6 +8,7 @@ import torch
 from torch.utils.data import DataLoader
 
 from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
+from arraygeom.distortion import Distortion
 from arraygeom.fields import look
 from pat.cli import main
 from pat.data import (
@@ -23,6 +24,7 @@ from pat.data import (
     write_indices,
 )
 from pat.data.patches import cut, reduced_depth, select
+from pat.data.scenes import _bounds
 from pat.farm.backends import LayeredSettings
 from pat.images import read_image
 from pat.sensors import BoxBlur, Case, Clip, Resample
@@ -103,6 +105,16 @@ def test_samples_are_seeded_and_mix_scenes(rendered):
     assert not torch.equal(one.images[0], other.images[0])
     assert one.K[0].shape == (8, 3, 3)
     assert len({round(float(d.max()), 4) for d in one.depth[0]}) > 3
+
+
+def test_training_scenes_are_of_pinholes_and_know_what_is_there(broken):
+    depth = torch.tensor([[[2.0, torch.inf], [torch.nan, 5.0]], [[torch.inf, torch.inf], [3.0, torch.nan]]])
+    assert _bounds(depth).tolist() == [[2, 5], [3, 3]]
+    rig = make_rig()
+    lens = Distortion("brown-conrady", torch.tensor([-0.1, 0.01, 0, 0]).double())
+    rig.with_camera("mono", rig["mono"].replace(distortion=lens)).save(broken / "scenes/000000/rig.yaml")
+    with pytest.raises(ValueError, match="'mono' has a lens model"):
+        RenderedScenes(broken)
 
 
 def test_reduced_depth_is_exact_on_planes_and_takes_sides_at_edges():
