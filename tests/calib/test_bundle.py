@@ -221,7 +221,7 @@ def test_fifteen_cameras_fit_better_than_published(shared_data):
 def test_caliscopes_tracks_fit_better_than_published(shared_data):
     """Its own intrinsics, corners as free points, as its calibration has them: at most its 1.66 px (RMS).
 
-    Least squares lower the RMS; the robust fit lowers the mean, and leaves larger residuals to the frames that contradict.
+    Least squares lower the RMS; the robust fit lowers the mean, and leaves larger residuals to a few frames.
     """
     folder = shared_data / "rigs" / "caliscope_4cam"
     rig = read_rig(folder / "camera_array.toml")
