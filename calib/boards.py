@@ -126,7 +126,7 @@ class Charuco(Board):
     def _draw(self, axes: Any) -> None:
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
         white = set()
-        for corners, number in zip(self.opencv.getObjPoints(), self.opencv.getIds().reshape(-1)):
+        for corners, number in zip(np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)):
             left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
             self._draw_marker(axes, int(number), left, top, marker)

@@ -55,8 +55,8 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
         near, far = depths(covers.values())
         parts += [
             "<h2>Uncertainty of what is predicted</h2>",
-            "<p>How far, in pixels (one standard deviation, worst direction), what the first camera sees may be from where "
-            f"the rig says that the others see it: at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
+            "<p>How far (pixels, one standard deviation, worst direction) what the first camera sees may be from where "
+            f"the rig says the others see it, at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
             image(draw_uncertainty(calibration, (near, far))),
         ]
     body = "\n".join(parts)

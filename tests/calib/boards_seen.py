@@ -1,12 +1,14 @@
 """Arrays of cameras with known truth, and what they see of a board: corners by projection, pictures by warping."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
 from calib.boards import Board, Circles, draw_board, parse_board
-from calib.bundle import BoardPoses, Observations, Scene
+from calib.bundle import BoardPoses, Observations, Scene, parameter_names
 from calib.detect import Detection
 from calib.intrinsics import Views
 
@@ -80,20 +82,27 @@ def scene_of(rig, boards, views, board: Board = BOARD) -> Scene:
     return Scene(dict(rig.cameras), BoardPoses(boards), seen)
 
 
-def photograph(camera, cam_from_board: Pose, board: Board = BOARD, *, dpi=160, background=90) -> np.ndarray:
+def photograph(camera, cam_from_board: Pose, board: Board = BOARD, *, dpi=160, background=90, rays=None) -> np.ndarray:
     """The picture (h, w) uint8 that a camera takes of a printed board, through its lens, twice oversampled."""
     print_, per_metre, origin = printed(board, dpi)
-    fine = camera.resize((2 * camera.hw[0], 2 * camera.hw[1]))
-    rays, valid = fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
+    directions, valid = fine_rays(camera) if rays is None else rays
+    hw = 2 * camera.hw[0], 2 * camera.hw[1]
     R, t = cam_from_board.R, cam_from_board.t
-    distance = (R[:, 2] @ t) / (rays @ R[:, 2])
-    on_board = (rays * distance[:, None] - t) @ R
-    on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*fine.hw, 2)
-    on_print[~valid.reshape(fine.hw).numpy()] = -1
+    distance = (R[:, 2] @ t) / (directions @ R[:, 2])
+    on_board = (directions * distance[:, None] - t) @ R
+    on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*hw, 2)
+    on_print[~valid.reshape(hw).numpy()] = -1
     picture = cv2.remap(print_, on_print, None, cv2.INTER_LINEAR, borderValue=background)
     return cv2.resize(picture, camera.hw[::-1], interpolation=cv2.INTER_AREA)
 
 
+def fine_rays(camera):
+    """The rays of a camera's pixels at twice its size, for photographs of many boards."""
+    fine = camera.resize((2 * camera.hw[0], 2 * camera.hw[1]))
+    return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
+
+
+@cache
 def printed(board: Board, dpi: int) -> tuple[np.ndarray, float, np.ndarray]:
     """The board as it comes out of a printer: pixels, pixels a metre, the pixel of its first point."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -108,3 +117,30 @@ def printed(board: Board, dpi: int) -> tuple[np.ndarray, float, np.ndarray]:
     origin = np.full(2, (0.012 + first) * per_metre - 0.5)
     origin[1] += len(grey) - figure.get_size_inches()[1] * dpi  # the canvas is cut to whole pixels at its top
     return np.ascontiguousarray(grey), per_metre, origin
+
+
+def errors_of(fit, rig):
+    """Estimate minus truth of every free number, in the order of `fit.names`."""
+    found = []
+    for name, camera_found in fit.scene.cameras.items():
+        truth = rig[name]
+        R = (camera_found.R @ truth.R.T).numpy()
+        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+        K, lens = (
+            (camera_found.K - truth.K).numpy(),
+            camera_found.distortion.coefficients - truth.distortion.coefficients,
+        )
+        values = [*turn, *(camera_found.t - truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
+        entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
+        found += [v for v, entry in zip(values, entries) if entry in fit.names]
+    return np.array(found)
+
+
+def pose_errors(fit, rig):
+    """The largest error of orientations (degrees) and of optical centres (metres)."""
+    degrees = [
+        np.degrees(np.linalg.norm(errors_of(fit, rig)[[fit.names.index(f"{n}.rotation.{i}") for i in range(3)]]))
+        for n in list(fit.scene.cameras)[1:]
+    ]
+    metres = [float((c.centre - rig[n].centre).norm()) for n, c in fit.scene.cameras.items()]
+    return max(degrees), max(metres)

@@ -23,7 +23,7 @@ from calib.bundle import (
     normal_equations,
     parameter_names,
 )
-from tests.calib.boards_seen import board_poses, camera, four_cameras, scene_of, see, tensor
+from tests.calib.boards_seen import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
 
 
 def free_of(scene, *, lens=5):
@@ -164,33 +164,6 @@ def test_fixed_numbers_stay_bit_identical(small):
     assert torch.equal(fit.scene.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients)
 
 
-def errors_of(fit, rig):
-    """Estimate minus truth of every free number, in the order of `fit.names`."""
-    found = []
-    for name, camera_found in fit.scene.cameras.items():
-        truth = rig[name]
-        R = (camera_found.R @ truth.R.T).numpy()
-        turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        K, lens = (
-            (camera_found.K - truth.K).numpy(),
-            camera_found.distortion.coefficients - truth.distortion.coefficients,
-        )
-        values = [*turn, *(camera_found.t - truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
-        entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
-        found += [v for v, entry in zip(values, entries) if entry in fit.names]
-    return np.array(found)
-
-
-def pose_errors(fit, rig):
-    """The largest error of orientations (degrees) and of optical centres (metres)."""
-    degrees = [
-        np.degrees(np.linalg.norm(errors_of(fit, rig)[[fit.names.index(f"{n}.rotation.{i}") for i in range(3)]]))
-        for n in list(fit.scene.cameras)[1:]
-    ]
-    metres = [float((c.centre - rig[n].centre).norm()) for n, c in fit.scene.cameras.items()]
-    return max(degrees), max(metres)
-
-
 @pytest.mark.slow
 def test_the_covariance_is_true():
     """Thirty draws of noise: squared errors in units of the covariance are chi-square, and so is each number's."""
@@ -246,7 +219,10 @@ def test_fifteen_cameras_fit_better_than_published(shared_data):
 
 @pytest.mark.slow
 def test_caliscopes_tracks_fit_better_than_published(shared_data):
-    """Its own intrinsics, corners as free points, as its calibration has them: at most its 1.66 px (RMS)."""
+    """Its own intrinsics, corners as free points, as its calibration has them: at most its 1.66 px (RMS).
+
+    Least squares lower the RMS; the robust fit lowers the mean, and leaves larger residuals to a few frames.
+    """
     folder = shared_data / "rigs" / "caliscope_4cam"
     rig = read_rig(folder / "camera_array.toml")
     corners = {}
@@ -263,12 +239,12 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
     }
     published = Scene(dict(rig.cameras), FreePoints(np.array(list(corners.values()))), observations)
     free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(rig.names)}
-    fit = adjust(published, free)
-    before, after = rms_and_mean(published), rms_and_mean(fit.scene)
-    print("before", before, "after", after)
+    squares, robust = (adjust(published, free, rounds=rounds) for rounds in (0, 4))
+    before, after = rms_and_mean(published), rms_and_mean(squares.scene)
+    print("before", before, "least squares", after, "robust", rms_and_mean(robust.scene))
     assert before[0] == pytest.approx(1.6625, abs=1e-3)
     assert after[0] < before[0]
-    assert after[1] < before[1]
+    assert rms_and_mean(robust.scene)[1] < before[1]
 
 
 def test_world_points_of_boards_are_their_poses():

@@ -26,8 +26,8 @@ def picture(text, **changes):
 @pytest.mark.parametrize(
     ("text", "pixels"),
     [
-        ("chessboard:9x6:25mm", 0.06),
-        ("charuco:8x6:30mm", 0.06),
+        ("chessboard:9x6:25mm", 0.08),
+        ("charuco:8x6:30mm", 0.12),
         ("circles:7x5:25mm", 0.15),
         ("acircles:4x11:16mm", 0.15),
     ],
