@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env demo showcase readme test test-long check format bench train notebooks docs drawings wheel
+.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -18,8 +18,9 @@ help:
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
-	@echo "make bench      measure attention"
+	@echo "make bench      measure attention and training"
 	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
+	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
 	@echo "make drawings   the documentation's drawings"
@@ -61,8 +62,13 @@ format: $(READY)
 	@$(BIN)/ruff format .
 	@$(BIN)/ruff check --fix .
 
+synthesis: $(READY)
+	@echo "== installing Blender"
+	@$(PIP) --editable '.[dev,synthesis]'
+
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
+	@$(BIN)/python -m tests.benchmarks.bench_training
 
 notebooks: $(READY)
 	@$(BIN)/python notebooks/run.py

@@ -25,6 +25,7 @@ from .fields import (
     EpipolarLine,
     HomographyDisplacement,
     Local,
+    Moved,
     NearestVoxels,
     ReceptiveField,
     Rectified,
@@ -42,6 +43,7 @@ from .sampling import sample, to_grid
 from .segments import Positions, Segments
 from .sensor import Band, Curve, Sensor
 from .triangulation import Triangulated, depth_of, triangulate
+from .undistortion import pinhole_view, retaken
 
 __all__ = [
     "Band",
@@ -56,6 +58,7 @@ __all__ = [
     "HomographyDisplacement",
     "Link",
     "Local",
+    "Moved",
     "NearestVoxels",
     "Pair",
     "Pose",
@@ -86,10 +89,12 @@ __all__ = [
     "intrinsics",
     "lazily",
     "look",
+    "pinhole_view",
     "pixel_grid",
     "plane_homography",
     "rectify",
     "resize_matrix",
+    "retaken",
     "rotation_from_vector",
     "sample",
     "segments_between",

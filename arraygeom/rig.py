@@ -114,7 +114,15 @@ class Pair:
 
     def resize_beta(self, hw: HW) -> Pair:
         """The pair whose beta records pictures of another size."""
-        A = resize_matrix(self.beta.hw, hw)
+        return self.map_beta(resize_matrix(self.beta.hw, hw), hw)
+
+    def turn_beta(self, quarter_turns: int) -> Pair:
+        """The pair whose beta has its picture turned; see `Camera.turn`."""
+        h, w = self.beta.hw
+        return self.map_beta(turn_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
+
+    def map_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
+        """The pair in which beta's pixels are x' ~ A x and its picture's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)
         link = None if self.link is None else self.link.mapped(eye, A)
         return dataclasses.replace(self, beta=self.beta.mapped(A, hw), link=link)

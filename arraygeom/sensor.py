@@ -21,6 +21,10 @@ class Curve:
     response: tuple[float, ...]
 
 
+PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
+"""Colour filter patterns: the first two pixels of the first row, then of the second."""
+
+
 @dataclass(frozen=True)
 class Sensor:
     """Facts about a camera that geometry carries along but does not use.
@@ -28,6 +32,10 @@ class Sensor:
     `response` is a name ("mono", "rgb", "nir"), a band or a curve. `frame_rate` is in frames a second,
     `time_offset` in seconds after the rig's clock. `coding` says how pixel values relate to light:
     "srgb" or "linear". `bayer` is the colour filter pattern from the top left ("RGGB"), for raw pictures.
+
+    A file's values are counts from 0 to 2^bits - 1 (by default the file's own 8 or 16 bits), of which
+    `black_level` stands for no light. Light times `exposure` (seconds) times `gain` makes the value; a gain of three
+    numbers is of red, green and blue. Both are relative: only their ratios between cameras matter.
     """
 
     response: str | Band | Curve | None = None
@@ -35,3 +43,7 @@ class Sensor:
     time_offset: float = 0.0
     coding: str = "srgb"
     bayer: str | None = None
+    bits: int | None = None
+    black_level: float = 0.0
+    exposure: float | None = None
+    gain: float | tuple[float, float, float] = 1.0

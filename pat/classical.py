@@ -104,6 +104,33 @@ def classical_fusion_calibrated(
     return _recoloured(alpha, back)
 
 
+def classical_band_calibrated(
+    alpha: Float[Tensor, "1 h w"],
+    beta: Float[Tensor, "1 hb wb"],
+    K_alpha: Float[Tensor, "3 3"],
+    K_beta: Float[Tensor, "3 3"],
+    R: Float[Tensor, "3 3"],
+    t: Float[Tensor, " 3"],
+    *,
+    depth: tuple[float, float],
+) -> Float[Tensor, "1 h w"]:
+    """Beta's band at alpha's view, for a beta that sees one band: the same pipeline, what alpha has less is carried.
+
+    Arguments and errors are as of `classical_fusion_calibrated`.
+    """
+    near, far = depth
+    if not 0 < near < far:
+        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
+    matrices = (x.detach().cpu().double().numpy() for x in (K_alpha, K_beta, R, t))
+    plane = _rectified_plane(*matrices, hw=(alpha.shape[1], alpha.shape[2]), depth=depth)
+    mono = _warped(_planes(alpha), plane.from_alpha, plane.wh)
+    inside = _covered((beta.shape[1], beta.shape[2]), plane.from_beta, plane.wh)
+    band = _warped(_planes(beta), plane.from_beta, plane.wh)
+    difference = _carried_band(mono, band, inside, plane.max_disparity, float(K_beta[0, 0] / K_alpha[0, 0]))
+    back = _warped(difference, np.linalg.inv(plane.from_alpha), (alpha.shape[2], alpha.shape[1]))
+    return (alpha + torch.from_numpy(back)[None].to(alpha)).clamp(0, 1)
+
+
 class _Plane(NamedTuple):
     """A common picture plane: where alpha's and beta's pixels are in it, its size, its disparities."""
 
@@ -179,6 +206,19 @@ def _carried_chroma(
     likeness = np.exp(-np.square(cv2.GaussianBlur(np.abs(soft - levelled), (0, 0), 1) / LIKENESS))
     trust = np.maximum(match.consistent, DOUBT) * seen * likeness
     return _blended(chroma, _filled(chroma, trust + 1e-4, guide, COLOUR_FILL), trust)
+
+
+def _carried_band(mono: Picture, band: Picture, inside: Picture, max_disparity: float, sharpness: float) -> Picture:
+    """What `band` has more than `mono`, at `mono`'s pixels; both (h, w) on one rectified grid."""
+    soft, guide = _softened(mono, sharpness), _bytes(mono)
+    match = _matched(soft, _levelled(band, mono, inside), max_disparity)
+    disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
+    columns, rows = _grid(mono.shape)
+    columns = columns - np.where(match.consistent, match.disparity, disparity)
+    warped, seen = _looked_up(band, columns, rows), _looked_up(inside, columns, rows) * (columns >= -0.5)
+    trust = np.maximum(match.consistent, DOUBT) * seen
+    difference = (warped - soft)[..., None]
+    return _blended(difference, _filled(difference, trust + 1e-4, guide, COLOUR_FILL), trust)[..., 0]
 
 
 def _softened(mono: Picture, sharpness: float) -> Picture:

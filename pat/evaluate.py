@@ -1,11 +1,17 @@
-"""Fusions compared on stereo pairs by the paper's mono + colour protocol: scores, tables, pictures."""
+"""Fusions compared on stereo pairs by the paper's protocols: scores, controls, tables, pictures.
+
+The protocol `table1` is the paper's mono + colour (its Table 1): left made grey is alpha, right, reduced, is beta.
+`table2` is mono + three bands (its Table 2): the bands of right are three cameras, each of one channel.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import math
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -16,10 +22,12 @@ from rich.progress import track
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import Rectified, Rig, View
+from arraygeom import Camera, Pair, Pose, Positions, ReceptiveField, Rectified, Rig, Segments, intrinsics
+from arraygeom.pixels import HW
 from pat.classical import classical_fusion
 from pat.data import (
     PAPER_DISPARITY,
+    Disparity,
     MonoColourTask,
     StereoPair,
     flickr_pairs,
@@ -28,26 +36,40 @@ from pat.data import (
     middlebury_pairs,
     mono_colour_task,
 )
+from pat.demo import BETA, SAMPLE
 from pat.fuse import fuse
-from pat.images import write_image, write_text
-from pat.metrics import bootstrap_interval, score
+from pat.images import read_image, write_image, write_text
+from pat.metrics import bootstrap_interval, disparity_score, score
 from pat.model import FusionNetwork
-
-Fusion = Callable[[Tensor, Tensor, float], Tensor]
-"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour picture (3, H, W), 0..1."""
-
 
 T = TypeVar("T")
 
 
+class Answer(NamedTuple):
+    """A colour picture (3, H, W), 0..1, and the disparity (H, W) that it was found at, pixels of alpha; NaN unknown."""
+
+    image: Tensor
+    disparity: Tensor | None = None
+
+
+Fusion = Callable[[Tensor, Tensor, float], Tensor | Answer]
+"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour picture (3, H, W), 0..1, or more."""
+
+
 class Row(NamedTuple):
-    """How one method did on one pair with beta reduced `rate` times."""
+    """How one method did on one pair with beta reduced `rate` times.
+
+    Where the true disparity is known and the method tells one: its mean error, pixels, and the share of all pixels
+    with a true disparity that is within one pixel of it.
+    """
 
     pair: str
     rate: int
     method: str
     psnr: float
     ssim: float
+    end_point_error: float | None = None
+    within_one: float | None = None
 
 
 def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
@@ -65,16 +87,81 @@ def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
     return classical_fusion(alpha, beta, max_disparity=max_disparity)
 
 
-def rectified_fusion(network: FusionNetwork) -> Fusion:
-    """`fuse` with a network as a method, alpha on the left: it looks along rows, up to `max_disparity` pixels."""
+def rectified_fusion(
+    network: FusionNetwork,
+    *,
+    bands: bool = False,
+    beta: Callable[[Tensor], Tensor] = lambda beta: beta,
+    shuffled: bool = False,
+) -> Fusion:
+    """`fuse` with a network as a method, alpha on the left: it looks along rows, up to `max_disparity` pixels.
 
-    def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-        rig = Rig({"alpha": View(hw=_hw(alpha)), "beta": View(hw=_hw(beta))})
-        field = Rectified(max_disparity, alpha_is="left")
-        return fuse(network, rig, {"alpha": alpha, "beta": beta}, alpha="alpha", field=field).image
+    With `bands` each channel of beta is a camera. For controls: `beta` makes of beta what the network is given, and
+    `shuffled` lets each pixel look where another one, drawn at random, should.
+    """
+
+    def fused(alpha: Tensor, given: Tensor, max_disparity: float) -> Answer:
+        picture = beta(given)
+        betas = dict(zip("rgb", picture.split(1))) if bands else {"beta": picture}
+        rig = rectified_rig(_hw(alpha), {name: _hw(band) for name, band in betas.items()}, max_disparity)
+        field: ReceptiveField = Rectified(max_disparity, alpha_is="left")
+        field = Shuffled(field) if shuffled else field
+        frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=field)
+        return Answer(frame.image, alpha.shape[-1] / frame.depth)
 
     return fused
 
+
+def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:
+    """Cameras one behind the other along x, such that disparity is alpha's width over depth, pixels of alpha.
+
+    All see the same field of view; betas are at one place, one metre to the right of alpha.
+    """
+    alpha = Camera(K=intrinsics(float(hw[1]), hw), cam_from_world=Pose.identity(), hw=hw)
+    right = alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-1.0, 0.0, 0.0])))
+    cameras = {"alpha": alpha} | {name: right.resize(size) for name, size in betas.items()}
+    return Rig(cameras, depth=(hw[1] / max_disparity, math.inf))
+
+
+@dataclass(frozen=True)
+class Shuffled:
+    """A field that tells each alpha pixel where another one should look: the same looks, in the wrong places."""
+
+    field: ReceptiveField
+    seed: int = 0
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments | Positions:
+        """The looks of the pixels that a random permutation puts in the place of x."""
+        h, w = pair.alpha.hw
+        order = torch.randperm(h * w, generator=torch.Generator().manual_seed(self.seed)).to(x.device)
+        column, row = x[..., 0].round().long().clamp(0, w - 1), x[..., 1].round().long().clamp(0, h - 1)
+        drawn = order[row * w + column]
+        return self.field(pair, torch.stack([drawn % w, drawn // w], -1).to(x))
+
+
+def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, Fusion]:
+    """A fusion that uses beta must fall with each: no beta (zeros), beta of another scene, shuffled fields."""
+    other = read_image(SAMPLE / f"{BETA}.png")[None]
+
+    def foreign(beta: Tensor) -> Tensor:
+        return interpolate(other, _hw(beta), mode="bicubic", align_corners=False, antialias=True)[0].clamp(0, 1)
+
+    return {
+        "no beta": rectified_fusion(network, bands=bands, beta=torch.zeros_like),
+        "another scene's beta": rectified_fusion(network, bands=bands, beta=foreign),
+        "shuffled fields": rectified_fusion(network, bands=bands, shuffled=True),
+    }
+
+
+PROTOCOLS = {"table1": False, "table2": True}
+"""Whether each channel of beta is a camera of its own."""
+PRINTED = {
+    ("table1", "flickr1024"): {2: (27.26, 0.8992), 4: (25.85, 0.8840)},
+    ("table1", "kitti"): {2: (29.55, 0.9097), 4: (28.40, 0.8957)},
+    ("table2", "flickr1024"): {2: (25.55, 0.8714), 4: (24.00, 0.8493)},
+    ("table2", "kitti"): {2: (28.77, 0.8955), 4: (28.13, 0.8903)},
+}
+"""PSNR and SSIM of fusion as the paper prints them, by protocol, data set and rate; on its own choice of pictures."""
 
 BASELINES: dict[str, Fusion] = {"alpha": alpha_alone, "beta": beta_alone, "classical": classical}
 """What a fusion can be compared with."""
@@ -121,9 +208,10 @@ def evaluate_pairs(
     for pair in track(pairs, "evaluating", disable=not sys.stderr.isatty()):
         for rate in rates:
             task = mono_colour_task(pair, rate)
-            images = {name: _fused(name, fuse, pair, task, max_disparity) for name, fuse in methods.items()}
-            rows += [Row(pair.name, rate, name, *score(image, task.truth)) for name, image in images.items()]
+            answers = {name: _fused(name, fuse, pair, task, max_disparity) for name, fuse in methods.items()}
+            rows += [_row(pair, rate, name, answer, task.truth) for name, answer in answers.items()]
             if pictures:
+                images = {name: answer.image for name, answer in answers.items()}
                 write_image(Path(pictures) / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, images))
     return rows
 
@@ -161,19 +249,62 @@ def write_markdown(path: str | Path, rows: Sequence[Row]) -> None:
     write_text(path, markdown(rows))
 
 
-def markdown(rows: Sequence[Row]) -> str:
-    """A table for each rate: pairs and mean as lines, methods as columns, PSNR / SSIM in the cells."""
+Printed = Mapping[int, tuple[float, float]]
+"""PSNR and SSIM by rate that somebody printed."""
+
+
+def markdown(rows: Sequence[Row], *, printed: Printed = {}) -> str:  # noqa: B006
+    """A table for each rate: pairs and mean as lines, methods as columns, PSNR / SSIM in the cells.
+
+    `printed` figures of the paper, by rate, get a column with a mean only.
+    """
     rates = _unique(row.rate for row in rows)
-    return "\n".join(_table([row for row in rows if row.rate == rate]) for rate in rates)
+    return "\n".join(_table([row for row in rows if row.rate == rate], printed.get(rate)) for rate in rates)
 
 
-def _hw(image: Tensor) -> tuple[int, int]:
+def depth_markdown(rows: Sequence[Row]) -> str:
+    """Errors of depth where it is known: end-point error in pixels / share within one pixel. Empty if nowhere."""
+    told = [row for row in rows if row.end_point_error is not None]
+    if not told:
+        return ""
+    methods, rates = _unique(row.method for row in told), _unique(row.rate for row in told)
+    head = ["depth", *(f"{method}, {rate}x" for method in methods for rate in rates)]
+    found = {(row.pair, row.method, row.rate): row for row in told}
+    lines = [
+        [pair, *(_depth_cell([found[pair, m, r]]) if (pair, m, r) in found else "" for m in methods for r in rates)]
+        for pair in _unique(row.pair for row in told)
+    ]
+    groups = [[row for row in told if (row.method, row.rate) == (m, r)] for m in methods for r in rates]
+    table = [head, ["---", *("---:" for _ in head[1:])], *lines, ["**mean**", *map(_depth_cell, groups)]]
+    return "".join(f"| {' | '.join(cells)} |\n" for cells in table)
+
+
+def falls(rows: Sequence[Row], *, method: str = "fusion", names: Iterable[str]) -> str:
+    """One line for each control: by how much mean PSNR is below that of `method`, and the least of any picture."""
+    psnr = {(row.pair, row.rate, row.method): row.psnr for row in rows}
+    lines = []
+    for name in names:
+        fall = [value - psnr[pair, rate, name] for (pair, rate, m), value in psnr.items() if m == method]
+        lines.append(f"- {name}: {np.mean(fall):.2f} dB below {method}, at least {min(fall):.2f} dB\n")
+    return "".join(lines)
+
+
+def _hw(image: Tensor) -> HW:
     return image.shape[-2], image.shape[-1]
 
 
-def sets_markdown(rows: Mapping[str, Sequence[Row]]) -> str:
-    """`markdown` of each data set under its name, and what `structure_kept` says of each."""
-    return "\n".join(f"#### {name}\n\n{markdown(rows)}\n{structure_kept(rows)}\n" for name, rows in rows.items())
+def sets_markdown(rows: Mapping[str, Sequence[Row]], *, protocol: str = "") -> str:
+    """`markdown` of each data set under its name, and what `structure_kept` says of each.
+
+    With a protocol, also the paper's printed figures, and errors of depth.
+    """
+    return "\n".join(_set_markdown(name, found, protocol) for name, found in rows.items())
+
+
+def _set_markdown(name: str, rows: Sequence[Row], protocol: str) -> str:
+    tables = markdown(rows, printed=PRINTED.get((protocol, name), {}))
+    depth = depth_markdown(rows) if protocol else ""
+    return f"#### {name}\n\n{tables}\n{structure_kept(rows)}\n" + (f"\n{depth}" if depth else "")
 
 
 def structure_kept(rows: Sequence[Row], *, method: str = "fusion", than: str = "alpha") -> str:
@@ -185,15 +316,38 @@ def structure_kept(rows: Sequence[Row], *, method: str = "fusion", than: str = "
     return f"{kept}; **below it**: {', '.join(lost)}." if lost else f"{kept}."
 
 
-def _fused(name: str, fuse: Fusion, pair: StereoPair, task: MonoColourTask, max_disparity: float) -> Tensor:
-    image = fuse(task.alpha, task.beta, max_disparity).detach().cpu()
+def _fused(name: str, fuse: Fusion, pair: StereoPair, task: MonoColourTask, max_disparity: float) -> Answer:
+    given = fuse(task.alpha, task.beta, max_disparity)
+    answer = given if isinstance(given, Answer) else Answer(given)
+    image = answer.image.detach().cpu()
     if image.shape != task.truth.shape:
         raise ValueError(
             f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted a picture {tuple(task.truth.shape)}"
         )
     if not image.isfinite().all():
         raise ValueError(f"{name} on {pair.name}: gave NaN or infinite values")
-    return image.float().clamp(0, 1)
+    return Answer(image.float().clamp(0, 1), answer.disparity)
+
+
+def _row(pair: StereoPair, rate: int, method: str, answer: Answer, truth: Tensor) -> Row:
+    errors: tuple[float | None, float | None] = (None, None)
+    if answer.disparity is not None and pair.disparity is not None:
+        errors = disparity_errors(answer.disparity.detach().cpu(), pair.disparity)
+    return Row(pair.name, rate, method, *score(answer.image, truth), *errors)
+
+
+def disparity_errors(found: Float[Tensor, "h w"], truth: Disparity) -> tuple[float | None, float | None]:
+    """Mean error of `found` where it and the truth are known, and the share of known truth that is within a pixel.
+
+    The truth may be larger by what was cut off at the bottom and the right.
+    """
+    h, w = found.shape
+    value, valid = truth.value[:h, :w], truth.valid[:h, :w]
+    told = valid & found.isfinite()
+    if not told.any():
+        return None, None
+    errors = disparity_score(found.to(value), value, told)
+    return errors.end_point_error, errors.within_one * float(told.sum() / valid.sum())
 
 
 def _strip(task: MonoColourTask, images: Mapping[str, Tensor]) -> Float[Tensor, "3 h w"]:
@@ -206,7 +360,12 @@ def _summary(rate: int, method: str, rows: Sequence[Row]) -> Summary:
     return Summary(rate, method, len(rows), float(np.mean(psnrs)), bootstrap_interval(psnrs), ssim)
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _depth_cell(rows: Sequence[Row]) -> str:
+    error, within = (float(np.mean([getattr(row, name) for row in rows])) for name in ("end_point_error", "within_one"))
+    return f"{error:.2f} px / {within:.1%}"
+
+
+def _table(rows: Sequence[Row], printed: tuple[float, float] | None = None) -> str:
     """The table of one rate."""
     methods = _unique(row.method for row in rows)
     scores = {(row.pair, row.method): f"{row.psnr:.2f} / {row.ssim:.4f}" for row in rows}
@@ -214,8 +373,11 @@ def _table(rows: Sequence[Row]) -> str:
     lines = [[pair, *(scores.get((pair, method), "") for method in methods)] for pair in pairs]
     means = {summary.method: _mean_cell(summary) for summary in summarise(rows)}
     header = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
-    rule = ["---", *("---:" for _ in methods)]
-    table = [header, rule, *lines, ["**mean**", *(means[method] for method in methods)]]
+    last = ["**mean**", *(means[method] for method in methods)]
+    if printed:
+        header, lines = [*header, "the paper, printed, on its own data"], [[*line, ""] for line in lines]
+        last = [*last, f"{printed[0]:.2f} / {printed[1]:.4f}"]
+    table = [header, ["---", *("---:" for _ in header[1:])], *lines, last]
     return "".join(f"| {' | '.join(cells)} |\n" for cells in table)
 
 

@@ -6,33 +6,46 @@ its segments touch, and a halo as wide as the network sees. Tiled and whole resu
 
 from __future__ import annotations
 
+import hashlib
 import math
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
 from torch.nn.functional import interpolate, pad
 
 from arraygeom import (
+    Camera,
+    Curved,
     Epipolar,
     HomographyDisplacement,
+    Moved,
     Pair,
     Positions,
     ReceptiveField,
     Rectified,
     Rig,
     Segments,
+    View,
+    Widened,
     apply_homography,
     depth_from_track,
+    pinhole_view,
     pixel_grid,
+    retaken,
 )
 from arraygeom.fields import pinhole_track
-from arraygeom.pixels import HW
+from arraygeom.pixels import HW, map_homogeneous, shift_matrix
+from arraygeom.undistortion import pixels_between
 
-from .images import luminance
+from .images import luminance, write_atomically
 from .model import Fused, FusionNetwork, Look
 
 Progress = Callable[[Iterable["Tile"], int], Iterable["Tile"]]
@@ -54,11 +67,15 @@ class FusedFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Beta:
-    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look."""
+    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look.
+
+    `points` says where alpha's pixels are when beta records: elsewhere only if they move (`Moved`).
+    """
 
     picture: Tensor
     pair: Pair
     look: Look
+    points: Callable[[Tensor], Tensor]
 
 
 class Tile(NamedTuple):
@@ -75,12 +92,19 @@ def fuse(
     *,
     alpha: str,
     depth: tuple[float, float] | None = None,
-    field: ReceptiveField | None = None,
+    field: ReceptiveField | Mapping[str, ReceptiveField] | None = None,
     max_memory: float | str | None = None,
     match_levels: bool = False,
     progress: Progress | None = None,
+    announce: Callable[[Plan], None] | None = None,
+    store: Path | None = None,
 ) -> FusedFrame:
     """Fuse one frame at the view of camera `alpha`.
+
+    Lenses: unless `field` is `Curved`, pictures that a lens bends are taken across to pinhole views first (up to 62
+    degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha is bent back,
+    alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta turned by about
+    a quarter or half a turn against alpha is turned upright.
 
     Args:
         network: `load_weights("mono-colour")`, say.
@@ -89,33 +113,144 @@ def fuse(
         alpha: the camera whose view is wanted.
         depth: (near, far) in metres, instead of the rig's.
         field: where to look; by default the depth-bounded epipolar segment of calibrated cameras, the run of the
-            epipolar line around H x of those known by F, and a row of beta of those known only by size.
+            epipolar line around H x of those known by F, and a row of beta of those known only by size. Or a field for
+            each of some betas, by name.
         max_memory: bytes, or like "4GiB"; about what the work may take on top of the pictures. Default: no limit.
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
         progress: shows the tiles as they are done.
+        store: a folder in which finished tiles of a frame of several are kept, so that one that was stopped goes on;
+            tiles of other pictures, rigs or weights are not taken. Whoever gave it removes it afterwards.
+        announce: is told the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
         ValueError: a camera that the rig lacks, a picture of another size, a rig whose views do not overlap.
     """
     rig = rig if depth is None else rig.replace(depth=depth)
     _check(rig, images, alpha)
+    fields = field if isinstance(field, Mapping) else dict.fromkeys(rig.betas(alpha), field)
+    if any(_has_lens(rig[name]) for name in images) and not any(map(_follows_lenses, fields.values())):
+        straight_rig, straight = without_lenses(rig, images)
+        fields = {name: _straightened(f, rig[alpha], straight_rig[alpha]) for name, f in fields.items()}
+        seen = fuse(
+            network,
+            straight_rig,
+            straight,
+            alpha=alpha,
+            field={name: f for name, f in fields.items() if f is not None},
+            max_memory=max_memory,
+            match_levels=match_levels,
+            progress=progress,
+            announce=announce,
+            store=store,
+        )
+        return _bent(seen, straight[alpha], images[alpha], straight_rig[alpha], rig[alpha])
     own = _grey(images[alpha])[None]
     betas = [
-        _prepare(network, rig.pair(alpha, name), images[name][None], field, own if match_levels else None, name)
+        _surveyed(
+            network,
+            own,
+            _prepare(
+                network,
+                rig.pair(alpha, name),
+                images[name][None],
+                fields.get(name),
+                own if match_levels else None,
+                name,
+            ),
+        )
         for name in rig.betas(alpha)
         if name in images
     ]
     hw = rig[alpha].hw
     tiles = plan(network, hw, betas, None if max_memory is None else parse_bytes(max_memory))
+    if announce:
+        memory = max(working_memory(network, tile, betas) for tile in tiles)
+        large = math.prod(hw) > 16 * PROBE**2
+        announce(Plan(tiles, memory, expected_seconds(network, own, betas, tiles) if large else None))
+    kept = TileStore.of(store, network, own, betas) if store and len(tiles) > 1 else None
     frame: list[Tensor] = []
     for tile in progress(tiles, len(tiles)) if progress else tiles:
-        parts = _fuse_tile(network, own, betas, tile)
+        make = partial(_fuse_tile, network, own, betas, tile)
+        parts = kept.fetch(tile, make) if kept else make()
         frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in parts]
         top, bottom, left, right = tile.inner
         for whole, part in zip(frame, parts):
             whole[..., top:bottom, left:right] = part
     return FusedFrame(*frame)
+
+
+class TileStore(NamedTuple):
+    """Finished tiles in a folder; `digest` is of all that they depend on and is part of their names."""
+
+    folder: Path
+    digest: str
+
+    @classmethod
+    def of(cls, folder: Path, network: FusionNetwork, own: Tensor, betas: list[Beta]) -> TileStore:
+        """The store for one frame's tiles."""
+        digest = hashlib.sha256(type(network).__name__.encode())
+        parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
+        for tensor in (*parameters, own, *(b.picture for b in betas)):
+            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+        x = pixel_grid((own.shape[-2], own.shape[-1]), dtype=torch.float64)[::64, ::64].reshape(-1, 2)
+        for beta in betas:
+            digest.update(b"".join(part.numpy().tobytes() for part in vars(beta.look.at(x)).values()))
+        return cls(folder, digest.hexdigest()[:16])
+
+    def fetch(self, tile: Tile, make: Callable[[], FusedFrame]) -> FusedFrame:
+        """The tile as it was kept, or made and kept now."""
+        file = self.folder / f"{self.digest}_{'_'.join(map(str, tile.inner))}.safetensors"
+        if file.exists():
+            return FusedFrame(**load_file(file))
+        frame = make()
+        with write_atomically(file) as temporary:
+            save_file({name: part.contiguous() for name, part in frame._asdict().items()}, temporary)
+        return frame
+
+
+def without_lenses(rig: Rig, images: Mapping[str, Tensor]) -> tuple[Rig, dict[str, Tensor]]:
+    """The rig and its pictures with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
+    straight = dict(images)
+    for name, image in images.items():
+        camera = rig[name]
+        if isinstance(camera, Camera) and camera.distortion is not None:
+            rig = rig.with_camera(name, pinhole_view(camera))
+            straight[name] = retaken(image, camera, rig[name]).values[0].clamp(min=0)  # type: ignore[arg-type]
+    return rig, straight
+
+
+def _has_lens(view: View) -> bool:
+    return isinstance(view, Camera) and view.distortion is not None
+
+
+def _follows_lenses(field: ReceptiveField | None) -> bool:
+    while isinstance(field, Widened | Moved):
+        field = field.field
+    return isinstance(field, Curved)
+
+
+def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
+    """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
+    if not (isinstance(field, Moved) and isinstance(lens, Camera) and isinstance(pinhole, Camera) and _has_lens(lens)):
+        return field
+    x, seen = pixels_between(lens, pinhole)
+    rays, valid = lens.to(torch.float64).rays(field.points(x))
+    there = map_homogeneous(pinhole.K.double()[:2], rays[..., :2] / rays[..., 2:])
+    known = seen & valid & (rays[..., 2] > 0)
+    step = torch.where(known[..., None], there - pixel_grid(pinhole.hw, dtype=torch.float64), 0.0)
+    return Moved(field.field, step.movedim(-1, 0).to(field.displacement))
+
+
+def _bent(frame: FusedFrame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> FusedFrame:
+    """The frame at the pixels of alpha's own picture."""
+    if not (isinstance(pinhole, Camera) and isinstance(lens, Camera) and lens.distortion is not None):
+        return frame
+    added = frame.image - _grey(straight)
+    inverse = (1 / frame.depth).nan_to_num(0.0)
+    back = retaken(torch.cat([added, frame.confidence[None]]), pinhole, lens, interpolation="bilinear").values[0]
+    depth = 1 / retaken(inverse[None], pinhole, lens, interpolation="nearest").values[0, 0]
+    return FusedFrame(_grey(own) + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
 
 
 def levelled(picture: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
@@ -132,30 +267,100 @@ def default_field(pair: Pair) -> ReceptiveField:
     return Rectified(alpha_is="either", max_disparity=0.12 * pair.beta.hw[1])
 
 
+class Plan(NamedTuple):
+    """How a frame will be fused: tiles, working memory of the largest (bytes), and the time, if estimated (seconds)."""
+
+    tiles: list[Tile]
+    memory: float
+    seconds: float | None
+
+    def __str__(self) -> str:
+        time = "" if self.seconds is None else f", about {_duration(self.seconds)}"
+        many = "1 piece" if len(self.tiles) == 1 else f"{len(self.tiles)} tiles"
+        return f"{many}, {self.memory / 2**30:.2f} GiB of working memory{time}"
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
+
 def plan(network: FusionNetwork, hw: HW, betas: list[Beta], limit: float | None) -> list[Tile]:
-    """The largest tiles whose work stays under `limit` bytes; one tile if the whole frame does.
+    """The tiles with the least work (their halos overlap) of which none takes over `limit` bytes.
 
-    Raises ValueError if not even a tile of 64 pixels does.
+    One tile if the whole frame does not. Raises ValueError if not even tiles of 64 pixels do.
     """
-    per_pixel = network.bytes_per_pixel * (
-        1 + sum(b.picture.shape[-1] * b.picture.shape[-2] for b in betas) / math.prod(hw)
-    )
-    if limit is None or per_pixel * math.prod(hw) <= limit:
-        return [Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))]
-    side = int(math.sqrt(limit / per_pixel)) - 2 * network.halo
-    side = side // network.multiple * network.multiple
-    if side < 64:
-        least = per_pixel * (64 + 2 * network.halo) ** 2
-        raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this network needs at least {least / 2**20:.0f} MiB")
-    return list(tiles_of(hw, side, network.halo))
+    whole = Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
+    if limit is None or working_memory(network, whole, betas) <= limit:
+        return [whole]
+    for sides in _by_work(hw, network, limit):
+        tiles = list(tiles_of(hw, sides, network.halo))
+        if max(working_memory(network, tile, betas) for tile in tiles) <= limit:
+            return tiles
+    least = max(working_memory(network, tile, betas) for tile in tiles_of(hw, 64, network.halo))
+    raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this network needs at least {least / 2**20:.0f} MiB")
 
 
-def tiles_of(hw: HW, side: int, halo: int) -> Iterator[Tile]:
-    """Square tiles with a halo, cut off at the frame's borders."""
+def working_memory(network: FusionNetwork, tile: Tile, betas: list[Beta]) -> float:
+    """Bytes that a tile takes: those for its part of alpha and for the part of each beta that it looks at."""
+    pixels = _area(tile.outer)
+    for beta in betas:
+        top, bottom, left, right = tile.outer
+        x = pixel_grid((-(-(bottom - top) // 32) + 1, -(-(right - left) // 32) + 1)) * 32
+        x = torch.minimum(x, x.new_tensor([right - left - 1, bottom - top - 1])) + x.new_tensor([left, top])
+        pixels += _area(_touched(beta.look.at(x.reshape(-1, 2)), beta.pair.beta.hw, network))
+    return network.bytes_per_pixel * pixels
+
+
+def _by_work(hw: HW, network: FusionNetwork, limit: float) -> list[tuple[int, int]]:
+    """Heights and widths of tiles, those that alpha's part alone does not forbid, the least work first."""
     h, w = hw
-    for top in range(0, h, side):
-        for left in range(0, w, side):
-            bottom, right = min(top + side, h), min(left + side, w)
+    sides = {}
+    for rows in range(1, -(-h // 64) + 1):
+        for columns in range(1, -(-w // 64) + 1):
+            m = network.multiple
+            side = (max(-(-h // rows // m) * m, 64), max(-(-w // columns // m) * m, 64))
+            outer = [min(s + 2 * network.halo, n) for s, n in zip(side, hw)]
+            if side not in sides and math.prod(outer) * network.bytes_per_pixel <= limit:
+                covered = [_covered_length(n, s, network.halo) for n, s in zip(hw, side)]
+                sides[side] = math.prod(covered)
+    return sorted(sides, key=lambda side: sides[side])
+
+
+def _covered_length(length: int, side: int, halo: int) -> int:
+    """What pieces of a length add up to with their halos."""
+    return sum(min(i + side + halo, length) - max(i - halo, 0) for i in range(0, length, side))
+
+
+def _area(box: tuple[int, int, int, int]) -> int:
+    top, bottom, left, right = box
+    return (bottom - top) * (right - left)
+
+
+PROBE = 192
+"""Side of the piece of alpha that is fused to estimate the time, pixels."""
+
+
+def expected_seconds(network: FusionNetwork, own: Tensor, betas: list[Beta], tiles: list[Tile]) -> float:
+    """About how long the tiles will take here, by fusing a small piece from the middle of alpha twice."""
+    h, w = own.shape[-2:]
+    m = network.multiple
+    top, left = (max((side - PROBE) // 2, 0) // m * m for side in (h, w))
+    box = (top, min(top + PROBE, h), left, min(left + PROBE, w))
+    piece = Tile(box, box)
+    _fuse_tile(network, own, betas, piece)
+    start = time.perf_counter()
+    _fuse_tile(network, own, betas, piece)
+    spent = time.perf_counter() - start
+    work = sum(working_memory(network, tile, betas) for tile in tiles)
+    return spent * work / working_memory(network, piece, betas)
+
+
+def tiles_of(hw: HW, side: int | tuple[int, int], halo: int) -> Iterator[Tile]:
+    """Tiles (square, or of a height and a width) with a halo, cut off at the frame's borders."""
+    (h, w), (rows, columns) = hw, side if isinstance(side, tuple) else (side, side)
+    for top in range(0, h, rows):
+        for left in range(0, w, columns):
+            bottom, right = min(top + rows, h), min(left + columns, w)
             outer = (max(top - halo, 0), min(bottom + halo, h), max(left - halo, 0), min(right + halo, w))
             yield Tile((top, bottom, left, right), outer)
 
@@ -197,16 +402,42 @@ def _grey(picture: Tensor) -> Tensor:
 def _prepare(
     network: FusionNetwork, pair: Pair, picture: Tensor, field: ReceptiveField | None, levels: Tensor | None, name: str
 ) -> Beta:
-    """A beta at the pitch that the network wants, its field checked to reach it somewhere."""
+    """A beta upright and at the pitch that the network wants, its field checked to reach it somewhere."""
+    turns = quarter_turns(pair)
+    if turns:
+        pair, picture = pair.turn_beta(turns), picture.rot90(turns, (-2, -1))
     if network.equal_pitch:
-        pair, picture = _at_equal_pitch(pair, picture)
+        pair, picture = _at_equal_pitch(*_common_part(pair, picture, field, network))
     if levels is not None:
         picture = levelled(picture, levels)
-    look = Look.along(field or default_field(pair), pair)
+    field = field or default_field(pair)
+    look = Look.along(field, pair)
     if not _reaches(look, pair):
         bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
         raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
-    return Beta(picture, pair, look)
+    return Beta(picture, pair, look, field.points if isinstance(field, Moved) else lambda x: x)
+
+
+def _common_part(
+    pair: Pair, picture: Tensor, field: ReceptiveField | None, network: FusionNetwork
+) -> tuple[Pair, Tensor]:
+    """A calibrated beta without what alpha never looks at, if that is much: it would be enlarged for nothing."""
+    h, w = pair.beta.hw
+    if pair.link is not None or not pair.calibrated or pitch_ratio(pair) > 0.8:
+        return pair, picture
+    found = Look.along(field or default_field(pair), pair).at(pixel_grid(pair.alpha.hw)[::8, ::8].reshape(-1, 2))
+    top, bottom, left, right = _touched(found, (h, w), network)
+    if (bottom - top) * (right - left) > 0.75 * h * w:
+        return pair, picture
+    part = pair.map_beta(shift_matrix(left, top), (bottom - top, right - left))
+    return part, picture[..., top:bottom, left:right]
+
+
+def _surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta) -> Beta:
+    """The beta with what the network wants to know of whole pictures."""
+    with torch.no_grad():
+        known = network.survey(_padded(alpha, network.multiple), _padded(beta.picture, network.multiple), beta.look)
+    return replace(beta, look=replace(beta.look, known=known))
 
 
 def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
@@ -221,12 +452,27 @@ def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
 
 def pitch_ratio(pair: Pair) -> float:
     """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if undefined."""
+    steps = _steps_in_beta(pair)
+    area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
+    return math.sqrt(area) if area > 0 else 1.0
+
+
+def quarter_turns(pair: Pair) -> int:
+    """How often beta's picture must be turned (see `Camera.turn`) to be upright as alpha's is, 0 to 3."""
+    steps = _steps_in_beta(pair)
+    if steps is None:
+        return 0
+    (a, c), (b, d) = steps.tolist()
+    return round(math.atan2(c - b, a + d) / (math.pi / 2)) % 4
+
+
+def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
+    """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
     x, valid = apply_homography(pair.homography.double(), steps)
-    area = abs(float(torch.linalg.det(x[1:] - x[:1])))
-    return math.sqrt(area) if bool(valid.all()) and area > 0 else 1.0
+    return x[1:] - x[:1] if bool(valid.all()) else None
 
 
 def _reaches(look: Look, pair: Pair) -> bool:
@@ -258,6 +504,7 @@ class Strip:
     look: Look
     pair: Pair
     offset: tuple[int, int]
+    points: Callable[[Tensor], Tensor]
 
 
 def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) -> Strip:
@@ -273,7 +520,11 @@ def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork)
             return Positions(found.xy - shift.to(x), found.mask)
         return Segments(found.start - shift.to(x), found.end - shift.to(x), found.valid)
 
-    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples), beta.pair, (x0, y0))
+    m = network.multiple
+    known = beta.look.known
+    if known is not None:
+        known = known.cut((top, top - (top - bottom) // m * m, left, left - (left - right) // m * m))
+    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples, known), beta.pair, (x0, y0), beta.points)
 
 
 def _touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
@@ -310,7 +561,7 @@ def _depth(fused: Fused, pieces: list[Strip], hw: HW, corner: tuple[int, int]) -
         if piece.pair.link is not None or not piece.pair.calibrated:
             continue
         seen = position[0, :, :h, :w].movedim(0, -1) + like.new_tensor(piece.offset)
-        found = depth_from_track(pinhole_track(piece.pair, x), seen.reshape(-1, 2))
+        found = depth_from_track(pinhole_track(piece.pair, piece.points(x)), seen.reshape(-1, 2))
         told = found.valid.reshape(h, w) & (confidence[0, :h, :w] > UNSEEN)
         weight = torch.where(told, confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)

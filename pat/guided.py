@@ -1,9 +1,9 @@
 """GuidedPAT: C3 attention from coarse to fine, colour guided by alpha.
 
-Our own network, for one alpha whose detail is to be kept and betas that know the colours. It matches
-luminance-like features at a quarter of the size with wide context, corrects the match and judges whether beta
-sees the point at all, looks again at full size in a short window around it, carries colour from pixels that are
-certain to those that are not, and adds it to alpha.
+Our own network, for one alpha whose detail is to be kept and betas that know the colours. Neighbouring pixels
+first agree on where along their segments they look (`pat.consensus`); attention looks there at full size in a
+short window. The network judges whether what it found is the point that alpha sees, carries colour from pixels
+that are certain to those that are not, and adds it to alpha.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 
 from .attention import Attended, attend, attend_with_statistics
 from .blocks import ResidualBlock, conv, enlarge
+from .consensus import FILLS, FINE, Consensus, consensus
 from .images import luminance
 from .model import Fused, Look, Looks
 
 COARSE = 4
-"""The first look is at pictures of a quarter of the size."""
+"""Context is worked out at a quarter of the size."""
 UNSURE = 1e-3
 """The certainty that every pixel has at least."""
 NOWHERE = -10.0
@@ -34,36 +35,40 @@ NOWHERE = -10.0
 
 @dataclass(frozen=True)
 class GuidedPATConfig:
-    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, and of the keys.
+    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
-    The second look reaches `window` pixels to either side of the first's answer, with `taps` samples.
-    Colour is carried within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4.
-    `keep_luminance` lets the network add colour to alpha, and never luminance.
+    Attention reaches `window` pixels to either side of the consensus, with `taps` samples. Colour is carried
+    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. `keep_luminance` lets
+    the network add colour to alpha, and never luminance.
     """
 
     widths: tuple[int, int, int, int] = (16, 32, 40, 48)
-    coarse_dim: int = 32
-    coarse_value: int = 16
     fine_dim: int = 8
-    window: float = 4.0
-    taps: int = 17
+    window: float = 3.0
+    taps: int = 13
+    judge_dim: int = 16
+    trust_dim: int = 24
     carry_dim: int = 8
     carry_steps: tuple[int, ...] = (1, 3, 8)
+    head_dim: int = 32
     bands: int = 3
     keep_luminance: bool = True
 
 
-class Match(NamedTuple):
-    """The first look, corrected, at a quarter of the size.
+class Seen(NamedTuple):
+    """What one beta tells of alpha's view.
 
-    reach: (B, 1, h, w), how far from the segment's end (the far bound) the match is, pixels of beta.
-    position: (B, 2, h, w), the match in beta's pixels.
-    logit: (B, 1, h, w), of the confidence that beta sees the point there.
+    colour: (B, C, H, W), its bands minus alpha, where attention found them.
+    spread: (B, fills, C, H, W), the same spread by the consensus from pixels with trust.
+    logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
+    choice: (B, 1 + fills, H, W), logits of taking, where it is not, what is carried within alpha or each `spread`.
     """
 
-    reach: Tensor
-    position: Tensor
+    attended: Attended
+    colour: Tensor
+    spread: Tensor
     logit: Tensor
+    choice: Tensor
 
 
 class Encoded(NamedTuple):
@@ -82,8 +87,8 @@ class GuidedPAT(nn.Module):
 
     multiple = 16
     equal_pitch = True
-    halo = 608
-    """Encoder 85, judge 176, carrying 148, propagation 180 and head 12: the sum, rounded up."""
+    halo = 640
+    """Encoder 85, judge 176, trust 8, carrying 148, propagation 180 and head 16: the sum, rounded up."""
     beta_halo = 96
     bytes_per_pixel = 320.0
 
@@ -92,13 +97,16 @@ class GuidedPAT(nn.Module):
         self.config = c = config
         w2, w4, _, _ = c.widths
         self.encoder = Encoder(c.widths)
-        self.coarse_key = nn.Conv2d(w4, c.coarse_dim, 1)
-        self.coarse_value = nn.Conv2d(w4, c.coarse_value, 1)
-        self.judge = UNet(w4 + c.coarse_value + 4, c.widths[1:], 2)
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
-        self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], c.widths[0])
+        self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
+        self.trust = Trust(c.judge_dim + w2 + 4 + 12, c.trust_dim)
         self.carry = nn.ModuleList(Carry(w4, c.carry_dim, step) for step in c.carry_steps)
-        self.head = Head(w2, c.bands)
+        self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
+        self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
+
+    def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
+        """What can be known before attention looks, of whole pictures; for pieces of them it is cut, not redone."""
+        return self._agreed(alpha, beta, look, _segments(look, hw_of(alpha), 1, alpha.double()))
 
     def forward(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
@@ -111,70 +119,91 @@ class GuidedPAT(nn.Module):
 
     def explain(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> tuple[Fused, list[Match]]:
-        """The same, with the first look's matches, which training supervises."""
+    ) -> tuple[Fused, list[Seen]]:
+        """The same, with what each beta told, which training supervises."""
         bands = sum(b.shape[1] for b in betas)
         if bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
         own = self.encoder(alpha)
-        seen = [self._see(own, beta, look) for beta, look in zip(betas, looks)]
-        attended, matches = zip(*seen)
-        colours = [a.value.to(alpha) - alpha for a in attended]
-        logits = [enlarge(m.logit, COARSE) for m in matches]
-        carried = torch.cat([self._carried(own, c, z.sigmoid()) for c, z in zip(colours, logits)], 1)
-        certain = torch.cat([z.sigmoid().expand_as(c) for z, c in zip(logits, colours)], 1)
-        colour = torch.cat(colours, 1)
+        seen = [self._see(own, alpha, beta, look) for beta, look in zip(betas, looks)]
+        certain = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in seen], 1)
+        colour = torch.cat([s.colour for s in seen], 1)
+        rest = torch.cat([self._unseen(own, s) for s in seen], 1)
         rough = avg_pool2d(torch.cat([colour * certain, certain], 1), COARSE)
         context = self.propagate(torch.cat([own.quarter, rough], 1))
-        colour = torch.lerp(enlarge(carried, COARSE), colour, certain)
-        residual = colour + self.head(alpha, own.half, context, colour, certain)
+        blend = torch.lerp(rest, colour, certain)
+        residual = blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
         if self.config.keep_luminance:
             residual = residual - luminance(residual)
         fused = Fused(
             alpha + residual,
-            [a.position for a in attended],
-            [a.spread for a in attended],
-            [z[:, 0].sigmoid() * (a.peak > 0) for z, a in zip(logits, attended)],
+            [s.attended.position for s in seen],
+            [s.attended.spread for s in seen],
+            [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in seen],
         )
-        return fused, list(matches)
+        return fused, seen
 
-    def _carried(self, own: Encoded, colour: Tensor, certain: Tensor) -> Tensor:
-        """Colour at 1/4 of the size, carried from certain pixels to others that look alike in alpha."""
+    def _unseen(self, own: Encoded, seen: Seen) -> Tensor:
+        """Colour for where beta does not see the point: carried at 1/4 of the size from certain pixels to others
+        that look alike in alpha, or as the consensus spread it."""
+        certain = seen.logit.sigmoid()
         known = avg_pool2d(certain, COARSE)
-        colour = avg_pool2d(colour * certain, COARSE) / (known + UNSURE)
+        colour = avg_pool2d(seen.colour * certain, COARSE) / (known + UNSURE)
         for carry in self.carry:
             colour, known = carry(own.quarter, colour, known)
-        return colour
+        choices = torch.cat([enlarge(colour, COARSE)[:, None], seen.spread], 1)
+        return (seen.choice.softmax(1)[:, :, None] * choices).sum(1)
 
-    def _see(self, own: Encoded, beta: Tensor, look: Look) -> tuple[Attended, Match]:
-        guide = luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
-        other = self.encoder(guide)
-        hw = own.half.shape[-2] * 2, own.half.shape[-1] * 2
-        match = self._first_look(own, other, look, hw)
-        window = window_around(match.reach, _segments(look, hw, 1, self._exact(own.half)), self.config.window)
+    def _see(self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look) -> Seen:
+        other = self.encoder(_guide(beta))
+        segments = _segments(look, hw_of(alpha), 1, self._exact(alpha))
+        known = look.known if look.known is not None else self._agreed(alpha, beta, look, segments)
+        window = window_around(known.reach, segments, self.config.window)
         query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
-        return attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps), match
+        found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
+        value = found.value.to(alpha)
+        facts = torch.cat([_guide(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
+        logit, choice = self._judged(own, known, facts, segments.valid[:, None]).split([1, 1 + FILLS], 1)
+        logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
+        return Seen(found, value - alpha, known.colour, logit, choice)
+
+    def _judged(self, own: Encoded, known: Consensus, facts: Tensor, valid: Tensor) -> Tensor:
+        """Logits (B, 2 + fills, H, W) of the confidence and of the choices."""
+        agreed = torch.cat([known.reach / 64, known.facts], 1)
+        told = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
+        rough = torch.cat([avg_pool2d(agreed, 2), avg_pool2d(told, COARSE)], 1)
+        context = self.judge(torch.cat([own.quarter, rough], 1))
+        return self.trust(torch.cat([enlarge(context), own.half, agreed, pixel_unshuffle(facts, 2)], 1))
+
+    def _agreed(self, alpha: Tensor, beta: Tensor, look: Look, segments: Segments) -> Consensus:
+        blocks = _segments(look, hw_of(alpha), FINE, alpha.double())
+        return consensus(alpha, _guide(beta), beta, segments, blocks)
 
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
         return x if self.training else x.double()
 
-    def _first_look(self, own: Encoded, other: Encoded, look: Look, hw: tuple[int, int]) -> Match:
-        query, key = (self._exact(self.coarse_key(f.quarter)) for f in (own, other))
-        value = self._exact(self.coarse_value(other.quarter))
-        segments = _segments(look, hw, COARSE, query)
-        length = segments.length[:, None]
-        valid = segments.valid[:, None]
-        reduced = Segments(_reduced(segments.start), _reduced(segments.end), segments.valid)
-        samples = -(-(look.samples - 1) // COARSE) + 1
-        attended = attend_with_statistics(query, key, value, reduced, samples=samples)
-        fraction = reduced.fraction(attended.position.movedim(1, -1))
-        reach = torch.where(valid & (attended.peak[:, None] > 0), (1 - fraction)[:, None] * length, 0.0)
-        facts = [reach / 64, attended.spread[:, None] / 4, attended.peak[:, None], valid.to(reach).expand_as(reach)]
-        answer = self.judge(torch.cat([own.quarter, *(f.to(own.quarter) for f in (attended.value, *facts))], 1))
-        reach = reach + COARSE * answer[:, :1]
-        position = segments.end + reach[:, 0, :, :, None] * _along(segments)
-        return Match(reach, position.movedim(-1, 1), torch.where(valid, answer[:, 1:], NOWHERE))
+
+def _guide(beta: Tensor) -> Tensor:
+    """What alpha is compared with."""
+    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
+
+
+def hw_of(picture: Tensor) -> tuple[int, int]:
+    """Height and width."""
+    return picture.shape[-2], picture.shape[-1]
+
+
+class Trust(nn.Sequential):
+    """The logits of confidence and choices at full size, worked out at half of it."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__(
+            conv(inputs, width),
+            ResidualBlock(width),
+            nn.Conv2d(width, 4 * (2 + FILLS), 3, padding=1),
+            nn.PixelShuffle(2),
+        )
 
 
 class Carry(nn.Module):
@@ -203,11 +232,11 @@ class Carry(nn.Module):
 
 
 def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
-    """Pieces of segments (B or 1, 4 h, 4 w), `window` pixels to either side of the match at `reach` from their end."""
+    """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `reach` from their end."""
     length = segments.length
-    reach = enlarge(reach, COARSE)[:, 0].clamp(min=0).minimum(length)
+    reach = reach[:, 0].repeat_interleave(FINE, -1).repeat_interleave(FINE, -2).to(length)
     along = _along(segments)
-    middle = segments.end + reach[..., None] * along
+    middle = segments.end + reach.clamp(min=0).minimum(length)[..., None] * along
     return Segments(middle + window * along, middle - window * along, segments.valid.expand(reach.shape))
 
 
@@ -226,10 +255,6 @@ def _along(segments: Segments) -> Tensor:
     """Unit vectors from end to start; zero where a segment is a point."""
     length = segments.length
     return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
-
-
-def _reduced(x: Tensor) -> Tensor:
-    return (x + 0.5) / COARSE - 0.5
 
 
 class Encoder(nn.Module):
@@ -273,15 +298,14 @@ class UNet(nn.Module):
 
 
 class Head(nn.Module):
-    """What to add to alpha, at full size, worked out on blocks of 2x2 pixels."""
+    """What to add to the blend, at full size, worked out on blocks of 2x2 pixels."""
 
-    def __init__(self, width: int, bands: int) -> None:
+    def __init__(self, inputs: int, width: int, bands: int) -> None:
         super().__init__()
-        self.start = nn.Sequential(conv(4 * (1 + 2 * bands) + 2 * width, 24), ResidualBlock(24), ResidualBlock(24))
-        self.last = nn.Conv2d(24, 4 * bands, 3, padding=1)
+        self.start = nn.Sequential(conv(inputs, width), *(ResidualBlock(width) for _ in range(3)))
+        self.last = nn.Conv2d(width, 4 * bands, 3, padding=1)
         nn.init.zeros_(self.last.weight)
 
-    def forward(self, alpha: Tensor, half: Tensor, context: Tensor, colour: Tensor, certain: Tensor) -> Tensor:
-        """(B, bands, H, W), from alpha, its features, the context at 1/4, colour differences and their certainty."""
-        fine = pixel_unshuffle(torch.cat([alpha, colour, certain], 1), 2)
-        return pixel_shuffle(self.last(self.start(torch.cat([fine, half, enlarge(context)], 1))), 2)
+    def forward(self, fine: Tensor, half: Tensor, context: Tensor) -> Tensor:
+        """(B, bands, H, W), from pictures at full size, features at 1/2 and the context at 1/4."""
+        return pixel_shuffle(self.last(self.start(torch.cat([pixel_unshuffle(fine, 2), half, enlarge(context)], 1))), 2)

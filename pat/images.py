@@ -7,6 +7,7 @@ pictures), colours in the order red, green, blue. Files appear whole or not at a
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
+from tifffile import TiffFile
 from torch import Tensor
 
 REC601 = (0.299, 0.587, 0.114)
@@ -25,29 +27,30 @@ REC601 = (0.299, 0.587, 0.114)
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
 
-def read_image(path: str | Path, *, name: str | None = None) -> Float[Tensor, "c h w"]:
+def read_image(path: str | Path, *, name: str | None = None, bits: int | None = None) -> Float[Tensor, "c h w"]:
     """The picture in a PNG, TIFF, JPEG or PNM file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
-    8-bit values are divided by 255 and 16-bit ones by 65535: a 12-bit camera that stores 0..4095 in 16 bits
-    reads as a dark picture. Float files must hold 0..1. A wholly opaque alpha channel is dropped. Rotation
-    tags (EXIF) are ignored: pixels are where the sensor, hence its calibration, has them. `name` (such as a
-    camera's) goes in front of error messages.
+    8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
+    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
+    must hold 0..1. A wholly opaque alpha channel is dropped. Rotation tags (EXIF) are ignored: pixels are where the
+    sensor, hence its calibration, has them. `name` (such as a camera's) goes in front of error messages.
 
     Raises FileNotFoundError for a missing file, ValueError for one that is not a usable picture.
     """
     path = Path(path)
     label = f"{name}: {path}" if name else f"{path}"
-    coded = _opaque(_decode(path, label), label)
+    coded, packed = _decode(path, label)
+    coded = _opaque(coded, label)
     planes = coded[None] if coded.ndim == 2 else coded[..., ::-1].transpose(2, 0, 1)
-    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label)))
+    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
 
 
 def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
-    """Write a grey or RGB picture, whole or not at all, in the format its name ends in (.png, .tif, .jpg).
+    """Write a grey or RGB picture, whole or not at all, in the format its name ends in (.png, .tif, .jpg, .exr).
 
-    8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif only) keep
-    floats as they are. Raises ValueError for a picture with NaN or another number of channels, and for a
-    format that cannot hold it.
+    8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif and .exr only) keep
+    floats as they are. An .exr file needs the extra `synthesis`. Raises ValueError for a picture with NaN or another
+    number of channels, and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
@@ -55,6 +58,8 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
         raise ValueError(f"{path}: a picture has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
     if not np.isfinite(planes).all():
         raise ValueError(f"{path}: the picture to write has NaN or infinite values")
+    if path.suffix.lower() == ".exr":
+        return _write_exr(path, planes, bits)
     content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
@@ -64,17 +69,35 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
 def write_atomically(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path` to write to; it takes `path`'s place when the block ends without error.
 
-    After an error the temporary file is gone and a former `path` is as it was. The temporary name ends as
-    `path` does, so that writers that choose the format by suffix choose the same. Missing folders are made.
+    After an error (a full disk, say) the temporary file is gone and a former `path` is as it was. The temporary name
+    ends as `path` does, so that writers that choose the format by suffix choose the same. Missing folders are made.
+    The content is on the disk before the name is, so that a file that is there after a crash is whole.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.stem}-{uuid4().hex}{path.suffix}")
     try:
         yield temporary
+        _flush(temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove what `write_atomically` left half-written in a folder because its process was killed."""
+    for path in folder.glob(".*"):
+        if re.fullmatch(r"\..*-[0-9a-f]{32}(\.\w+)?", path.name):
+            path.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Wait until the file's content is on the disk."""
+    handle = os.open(path, os.O_RDWR)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -105,14 +128,23 @@ def from_luma_chroma(luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 
     return torch.cat([red, green, blue], -3) + luma
 
 
-def _decode(path: Path, label: str) -> NDArray:
+def _decode(path: Path, label: str) -> tuple[NDArray, int]:
+    """The values, and how many bits a value has in a TIFF file that packs them into less than 16; 0 if none does."""
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such picture: check the path")
     content = np.frombuffer(path.read_bytes(), np.uint8)
     coded = _decode_bytes(content)
     if coded is None:
         raise ValueError(f"{label}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
-    return coded
+    return coded, _packed_bits(path) if coded.dtype == np.uint16 and path.suffix.lower() in (".tif", ".tiff") else 0
+
+
+def _packed_bits(path: Path) -> int:
+    """OpenCV shifts packed values up to 16 bits; the number of bits that they had, or 0 for 16."""
+    with TiffFile(path) as file:
+        bits = file.pages.first.tags.valueof("BitsPerSample", default=16)
+    bits = bits[0] if isinstance(bits, tuple) else bits
+    return 0 if bits == 16 else int(bits)
 
 
 def _decode_bytes(content: NDArray) -> NDArray | None:
@@ -136,9 +168,9 @@ def _opaque(coded: NDArray, label: str) -> NDArray:
     return coded[..., :3]
 
 
-def _unit_range(planes: NDArray, label: str) -> NDArray[np.float32]:
+def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
     if planes.dtype in (np.uint8, np.uint16):
-        return planes.astype(np.float32) / np.float32(np.iinfo(planes.dtype).max)
+        return _counts(planes, label, bits, packed)
     if not np.issubdtype(planes.dtype, np.floating):
         raise ValueError(
             f"{label}: has {planes.dtype} values: save it with 8 or 16 bits without sign, or as float 0..1"
@@ -149,6 +181,36 @@ def _unit_range(planes: NDArray, label: str) -> NDArray[np.float32]:
     if low < 0 or high > 1:
         raise ValueError(f"{label}: has float values from {low:g} to {high:g}: scale them to 0..1")
     return planes.astype(np.float32)
+
+
+def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
+    own = packed or 8 * planes.itemsize
+    white = 2 ** (bits or own) - 1
+    if bits and bits > own:
+        raise ValueError(f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file")
+    planes = planes >> (16 - packed) if packed else planes
+    if planes.max() > white:
+        raise ValueError(
+            f"{label}: has values up to {planes.max()}, the rig says {bits} bits (up to {white}): correct 'bits' "
+            "(16 if the camera shifts its values up)"
+        )
+    return planes.astype(np.float32) / np.float32(white)
+
+
+def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
+    if bits != 32:
+        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ValueError(
+            f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
+        ) from None
+    names = "Y" if planes.shape[0] == 1 else "RGB"
+    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with write_atomically(path) as temporary:
+        OpenEXR.File(header, channels).write(str(temporary))
 
 
 def _encode(path: Path, colours: NDArray, bits: int) -> bytes:

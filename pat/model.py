@@ -19,6 +19,7 @@ from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_g
 
 from .attention import Attended, attend_with_statistics
 from .blocks import ResidualASPP, ResidualBlock
+from .consensus import Consensus
 
 
 @dataclass(frozen=True)
@@ -26,15 +27,18 @@ class Look:
     """Where to look in one beta: `at` maps alpha pixels (n, 2) to segments or positions in beta's pixels.
 
     `at` may answer for one rig (n) or for a batch of rigs (B, n). Segments are looked at in `samples` places.
+    `known` is what a survey of the whole pictures has found, for networks that make one.
     """
 
     at: Callable[[Tensor], Segments | Positions]
     samples: int
+    known: Consensus | None = None
 
     @classmethod
     def along(cls, field: ReceptiveField, pair: Pair) -> Look:
         """The field of a pair, with about one sample for each pixel of beta on the longest segment."""
-        sparse = pixel_grid(pair.alpha.hw)[::4, ::4].reshape(-1, 2)
+        device = pair.cameras[0].K.device if pair.calibrated else None
+        sparse = pixel_grid(pair.alpha.hw, device=device)[::4, ::4].reshape(-1, 2)
         at = lazily(field, pair)
         found = at(sparse)
         if isinstance(found, Positions):
@@ -75,6 +79,10 @@ class FusionNetwork(Protocol):
     """Pictures are padded to multiples of this, and cut at them."""
     equal_pitch: bool
     """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
+
+    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> Consensus | None:
+        """What is to be known of whole pictures (of whole multiples) before pieces of them are fused, if anything."""
+        ...
 
     def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> Fused:
         """Fuse alpha (B, C, H, W) with betas of any sizes."""
@@ -137,6 +145,9 @@ class PAT(nn.Module):
         if self.config.residual:
             image = image + self._enlarged(alpha)
         return Fused(image, *(list(part) for part in list(zip(*attended))[1:]))
+
+    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
+        """Nothing: each piece of a frame is fused by itself."""
 
     def _channels(self, picture: Tensor) -> Tensor:
         wanted = self.config.in_channels

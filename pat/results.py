@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
@@ -13,23 +15,53 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from arraygeom import Rig
+
+from .develop import developed, to_linear
 from .fuse import FusedFrame
 from .images import write_atomically, write_image
 
+PictureKind = Literal["png", "tif", "exr"]
 
-def save_frame(frame: FusedFrame, out: Path, *, bits: int = 8) -> list[Path]:
+
+def save_frame(
+    frame: FusedFrame,
+    out: Path,
+    *,
+    bits: int = 8,
+    kind: PictureKind = "png",
+    view: Rig | None = None,
+    name: str = "",
+) -> list[Path]:
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN as 0) and depth.png (near is bright).
 
-    Each file appears whole or not at all. Without any known depth there are no depth files. Returns what was written.
+    8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
+    rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The picture
+    is written last: where it is, the others are. Each appears whole or not at all. Without any known depth there are
+    no depth files. Returns what was written.
     """
-    written = [out / "fused.png", out / "confidence.png"]
-    write_image(written[0], frame.image, bits=bits)
-    write_image(written[1], frame.confidence[None])
+    prefix = f"{name}_" if name else ""
+    picture, confidence = out / f"{prefix}fused.{kind}", out / f"{prefix}confidence.png"
+    write_image(confidence, frame.confidence[None])
+    written = [confidence]
     if frame.depth.isfinite().any():
-        written += [out / "depth.tif", out / "depth.png"]
-        write_image(written[2], frame.depth.nan_to_num(0.0)[None], bits=32)
-        write_image(written[3], colour_depth(frame.depth))
-    return written
+        depths = [out / f"{prefix}depth.tif", out / f"{prefix}depth.png"]
+        write_image(depths[0], frame.depth.nan_to_num(0.0)[None], bits=32)
+        write_image(depths[1], colour_depth(frame.depth))
+        written += depths
+    if view is not None:
+        view.save(out / "view.yaml")
+        written.append(out / "view.yaml")
+    write_image(picture, to_linear(frame.image) if bits == 32 else frame.image, bits=bits)
+    return [picture, *written]
+
+
+def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
+    """The rig of fused pictures: alpha's camera alone, its values coded as `save_frame` writes them."""
+    coding = "linear" if bits == 32 else "srgb"
+    response = "rgb" if bands == 3 else rig[alpha].sensor.response
+    sensor = dataclasses.replace(developed(rig[alpha].sensor), coding=coding, response=response)
+    return Rig({alpha: rig[alpha].replace(sensor=sensor)}, depth=rig.depth, name=rig.name)
 
 
 def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:

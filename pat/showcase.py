@@ -16,12 +16,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, View, apply_homography, pixel_grid, sample, shift_origin
+from calib.matches import FittedLink, fit_link, line_distance, match_points, near_lines, seen_depths
 
 from .demo import classical, luminance_of
 from .evaluate import METHODS, Row, evaluate_sets, markdown, rectified_fusion, sets_markdown, structure_kept
 from .fuse import fuse, levelled, pitch_ratio
 from .images import read_image, write_text
-from .matches import FittedLink, fit_link, line_distance, match_points, near_lines, seen_depths
 from .metrics import score
 from .model import FusionNetwork
 from .results import colour_depth, save_panels

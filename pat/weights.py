@@ -9,16 +9,22 @@ from pathlib import Path
 
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
+from torch import Tensor, nn
 
+from .bandwise import BandwisePAT, BandwisePATConfig
 from .guided import GuidedPAT, GuidedPATConfig
 from .images import write_atomically
 from .model import PAT, PATConfig
 
 SHIPPED = Path(__file__).parent / "weights"
 FORMAT = "pat-weights 1"
-NETWORKS = {"PAT": (PAT, PATConfig), "GuidedPAT": (GuidedPAT, GuidedPATConfig)}
+NETWORKS = {
+    "PAT": (PAT, PATConfig),
+    "GuidedPAT": (GuidedPAT, GuidedPATConfig),
+    "BandwisePAT": (BandwisePAT, BandwisePATConfig),
+}
 
-Network = PAT | GuidedPAT
+Network = PAT | GuidedPAT | BandwisePAT
 
 
 def save_weights(network: Network, path: str | Path, *, facts: Mapping[str, str] | None = None) -> None:
@@ -50,11 +56,21 @@ def load_weights(name: str | Path) -> Network:
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     network = _network(path, metadata)
-    own = {k: tuple(v.shape) for k, v in network.state_dict().items()}
-    if own != {k: tuple(v.shape) for k, v in state.items()}:
-        raise ValueError(f"{path}: the weights do not fit the {metadata['network']} that the file describes")
+    wrong = misfit(network, state)
+    if wrong:
+        raise ValueError(f"{path}: the weights do not fit the {metadata['network']} that the file describes: {wrong}")
     network.load_state_dict(state)
     return network.eval().requires_grad_(False)
+
+
+def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
+    """The first tensor that is missing, too many, or of another shape than the network's; empty if all fit."""
+    own = {k: tuple(v.shape) for k, v in network.state_dict().items()}
+    given = {k: tuple(v.shape) for k, v in state.items()}
+    for name in [*own, *given]:
+        if own.get(name) != given.get(name):
+            return f"{name} is {given.get(name, 'missing')}, wanted {own.get(name, 'none')}"
+    return ""
 
 
 def shipped() -> tuple[str, ...]:
@@ -71,8 +87,11 @@ def find_weights(name: str | Path) -> Path:
 
 
 def _network(path: Path, metadata: Mapping[str, str]) -> Network:
+    if metadata.get("format", "").startswith("pat-checkpoint"):
+        raise ValueError(f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above")
     if metadata.get("format") != FORMAT or metadata.get("network") not in NETWORKS:
-        raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata)")
+        found = f"it is '{metadata.get('format')}' of a {metadata.get('network')}" if metadata else "it says nothing"
+        raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
     network, config = NETWORKS[metadata["network"]]
     try:
         values = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(metadata["config"]).items()}

@@ -14,6 +14,7 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 from .approximation import approximated, placement_error
 from .curved import Curved
 from .explicit import Dense, Local, NearestVoxels
+from .moved import Moved
 from .protocol import Look, ReceptiveField, lazily, look
 from .straight import (
     Epipolar,
@@ -33,6 +34,7 @@ __all__ = [
     "HomographyDisplacement",
     "Local",
     "Look",
+    "Moved",
     "NearestVoxels",
     "ReceptiveField",
     "Rectified",

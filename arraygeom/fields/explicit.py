@@ -33,8 +33,10 @@ class NearestVoxels:
             line = epipolar_lines(pair.fundamental, x)
             centre, placed = apply_homography(pair.homography, x)
         usable = placed & (line != 0).any(-1)
-        xy, mask = self._nearest(line.reshape(-1, 3), centre.round().reshape(-1, 2), pair)
-        xy, mask = xy.reshape(*x.shape[:-1], -1, 2), mask.reshape(*x.shape[:-1], -1) & usable[..., None]
+        axes = usable.shape
+        line, centre = line.expand(*axes, 3), centre.round().expand(*axes, 2)
+        xy, mask = self._nearest(line.reshape(-1, 3), centre.reshape(-1, 2), pair)
+        xy, mask = xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1) & usable[..., None]
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
     def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:

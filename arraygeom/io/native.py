@@ -18,7 +18,13 @@ Units and the pixel convention stand in the file. Example:
         translation: [-0.1, 0, 0]     # t; or `position`, the optical centre in the world
         distortion: {model: brown-conrady, coefficients: [-0.1, 0.02, 0, 0]}
         response: rgb                 # a name, or {centre: 450, width: 80} in nm
-        frame_rate: 30
+        frame_rate: 30                # a second; `time_offset` in seconds after the rig's clock
+        coding: linear                # or srgb, the default
+        bayer: RGGB                   # raw pictures: the pattern from the top left
+        bits: 12                      # counts run from 0 to 4095; by default as many as the file has
+        black_level: 64               # counts without light
+        exposure: 0.01                # seconds
+        gain: [1.9, 1, 1.4]           # of red, green, blue; or one number
     links:                            # pairs of cameras that have only a size
       - {alpha: mono, beta: colour, F: [[...], [...], [...]], H: [[...], [...], [...]]}
 
@@ -44,7 +50,7 @@ from ..epipolar import shift_origin
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Link, Rig
-from ..sensor import Band, Curve, Sensor
+from ..sensor import PATTERNS, Band, Curve, Sensor
 from .errors import RigFileError
 
 FORMAT = "arraygeom-rig 1"
@@ -52,7 +58,7 @@ UNITS = {"metres": 1.0, "millimetres": 1e-3}
 TOP = ("format", "name", "units", "first_pixel_centre", "depth", "cameras", "links")
 CAMERA = (
     *("size", "focal", "centre", "K", "rotation", "translation", "position", "distortion"),
-    *("response", "frame_rate", "time_offset", "coding", "bayer"),
+    *("response", "frame_rate", "time_offset", "coding", "bayer", "bits", "black_level", "exposure", "gain"),
 )
 CALIBRATION = ("focal", "centre", "K", "rotation", "translation", "position", "distortion")
 
@@ -188,10 +194,47 @@ class _Reader:
         response = fields.get("response")
         if isinstance(response, dict):
             response = self.response(f"{entry}.response", response)
-        known = {k: fields[k] for k in ("frame_rate", "time_offset", "coding", "bayer") if k in fields}
-        if known.get("coding", "srgb") not in {"srgb", "linear"}:
-            raise self.fail(f"{entry}.coding", f"is '{known['coding']}'; wanted 'srgb' or 'linear'")
-        return Sensor(response=response, **known)
+        known: dict[str, Any] = {}
+        for key, choices in (("coding", ("srgb", "linear")), ("bayer", PATTERNS)):
+            if fields.get(key) is not None:
+                known[key] = self.one_of(fields[key], choices, f"{entry}.{key}")
+        for key, above in (("frame_rate", 0.0), ("time_offset", -math.inf), ("exposure", 0.0)):
+            if fields.get(key) is not None:
+                known[key] = self.number(fields[key], f"{entry}.{key}", above=above)
+        return Sensor(response=response, **known, **self.counts(entry, fields))
+
+    def counts(self, entry: str, fields: Mapping[str, Any]) -> dict[str, Any]:
+        """What makes light of a file's values: bits, black level and gain."""
+        known: dict[str, Any] = {}
+        if fields.get("bits") is not None:
+            known["bits"] = bits = self.number(fields["bits"], f"{entry}.bits", above=0)
+            if bits not in range(1, 17):
+                raise self.fail(f"{entry}.bits", f"is {bits:g}; wanted a whole number from 1 to 16")
+            known["bits"] = int(bits)
+        if fields.get("black_level") is not None:
+            known["black_level"] = black = self.number(fields["black_level"], f"{entry}.black_level")
+            if black and "bits" not in known:
+                raise self.fail(f"{entry}.black_level", "needs 'bits', which says how far counts reach: add it")
+            if black < 0 or (black and black >= 2 ** known["bits"] - 1):
+                raise self.fail(f"{entry}.black_level", f"is {black:g}, which is not between 0 and white")
+        if fields.get("gain") is not None:
+            several = isinstance(fields["gain"], list)
+            gain = self.numbers(fields["gain"], (3,) if several else (), f"{entry}.gain")
+            if not (gain > 0).all():
+                raise self.fail(f"{entry}.gain", f"is {fields['gain']}; gains are positive")
+            known["gain"] = tuple(gain.tolist()) if several else float(gain)
+        return known
+
+    def number(self, value: Any, entry: str, *, above: float = -math.inf) -> float:
+        number = float(self.numbers(value, (), entry))
+        if not number > above:
+            raise self.fail(entry, f"is {number:g}; wanted a number above {above:g}")
+        return number
+
+    def one_of(self, value: Any, choices: tuple[str, ...], entry: str) -> str:
+        if value not in choices:
+            raise self.fail(entry, f"is '{value}'; wanted {' or '.join(map(repr, choices))}")
+        return str(value)
 
     def response(self, entry: str, fields: dict[str, Any]) -> Band | Curve:
         if "centre" in fields:
@@ -225,7 +268,8 @@ class _Reader:
                 raise self.fail(f"{entry}.{key}" if entry else str(key), f"unknown key; {hint}")
 
     def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str, *, infinite: bool = False) -> Tensor:
-        wanted = "a list of numbers" if shape is None else " x ".join(map(str, shape)) + " numbers"
+        lengths = " x ".join(map(str, shape or ()))
+        wanted = "a list of numbers" if shape is None else f"{lengths} numbers" if shape else "a number"
         try:
             tensor = torch.tensor(value, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError):
@@ -269,7 +313,7 @@ def _camera_entry(camera: View) -> dict[str, Any]:
     entry: dict[str, Any] = {"size": [w, h]}
     if isinstance(camera, Camera):
         K = camera.K
-        plain = not bool(K[0, 1] or K[1, 0])
+        plain = not bool(K[0, 1] or K[1, 0]) and bool((K.diagonal() > 0).all())
         entry |= {"focal": K.diagonal()[:2].tolist(), "centre": K[:2, 2].tolist()} if plain else {"K": K.tolist()}
         entry |= {"rotation": camera.R.tolist(), "translation": camera.t.tolist()}
         if camera.distortion is not None:
@@ -281,6 +325,8 @@ def _camera_entry(camera: View) -> dict[str, Any]:
 def _sensor_entry(sensor: Sensor) -> dict[str, Any]:
     default = Sensor()
     entry = {k: v for k, v in vars(sensor).items() if v != getattr(default, k)}
+    if isinstance(sensor.gain, tuple):
+        entry["gain"] = list(sensor.gain)
     if isinstance(sensor.response, Band | Curve):
         entry["response"] = {k: list(v) if isinstance(v, tuple) else v for k, v in vars(sensor.response).items()}
     return entry

@@ -8,10 +8,8 @@ thread in an order that the inputs alone give.
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, partial
+from functools import partial
 
 import numpy as np
 import torch
@@ -21,34 +19,27 @@ from torch.nn.functional import pad
 from arraygeom.segments import sample_fractions
 from pat.attention import cpu_kernels as kernels
 from pat.attention.reference import EDGE_SLACK, Look
+from pat.threads import in_parallel
 
-PIECE_SAMPLES = 2**17
-"""Samples of one task: a millisecond or two."""
-SCRATCH_TAPS = 2**19
+PIECE_SAMPLES = 2**15
+"""Samples that a thread takes at a time: a fraction of a millisecond."""
+SCRATCH_TAPS = 2**20
 """Taps that backward holds at a time, 12 bytes each (16 in float64)."""
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
+    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4); log of the sum of exponentials (b,
-    ha, wa)."""
-    b, d, ha, wa = query.shape
-    dv = value.shape[1]
+    """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
+    the sum of exponentials (b, ha, wa)."""
+    b, _, ha, wa = query.shape
     counted = _accumulated(query)
-    out = _new(b, ha, wa, dv, dtype=query.dtype)
-    statistics = query.new_empty(b, ha, wa, 4, dtype=counted)
-    logsum = query.new_empty(b, ha, wa, dtype=counted)
-    call = (
-        *(_flat(_channels_last(t)) for t in (query, key, value)),
-        _geometry(look, query, key, nearest),
-        _flat(_bias(bias, counted)),
-        d,
-        dv,
-    )
+    out = _new(b, ha, wa, value.shape[1], dtype=query.dtype)
+    statistics = _new(*((b, ha, wa, 4) if measured else (0,)), dtype=counted)
+    logsum = _new(b, ha, wa, dtype=counted)
+    call = _call(query, key, value, look, bias, nearest)
     outputs = (_flat(out), _flat(statistics), _flat(logsum))
-    pieces = _pieces(0, b * ha * wa, look)
-    _share([partial(_in_room, kernels.forward, call, (*piece, *outputs)) for piece in pieces])
+    in_parallel([partial(kernels.forward, call, share, *outputs) for share in _shares(0, b * ha * wa, call)])
     return out.permute(0, 3, 1, 2), statistics, logsum
 
 
@@ -70,8 +61,11 @@ def backward(
     the channels are, for the additions to beta's pixels.
     """
     b, d, ha, wa = query.shape
-    dv, counted = value.shape[1], _accumulated(query)
-    q, k, v, upstream = (_flat(_channels_last(t)) for t in (query, key, value, cotangents[0]))
+    counted = _accumulated(query)
+    call = _call(query, key, value, look, bias, nearest)
+    upstream = _flat(_channels_last(cotangents[0]))
+    statistics, pulls = (t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous()))
+    found = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(pulls))
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
     key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
@@ -79,26 +73,18 @@ def backward(
     )
     points_out = query.new_zeros((b, *look.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 0, dtype=counted)
-
-    stride = look.samples * (1 if nearest else 4) + kernels.TAP_BLOCK
-    step = max(64, SCRATCH_TAPS // stride)
-    scratch = _scratch(min(step, b * ha * wa), stride, query)
-    call = (
-        *(q, k, v, _geometry(look, query, key, nearest), _flat(_bias(bias, counted)), d, dv),
-        *(_flat(saved[1]), _flat(saved[0])),
-        *(upstream, _flat(cotangents[1].to(counted).contiguous())),
-    )
-    outputs = tuple(_flat(t) for t in (query_out, points_out, bias_out))
-    additions = [
-        *_channel_tasks(scratch.by_key, scratch, stride, q, d, key_out),
-        *_channel_tasks(scratch.by_value, scratch, stride, upstream, dv, value_out),
-    ]
+    gradients = kernels.Gradients(*(_flat(t) for t in (query_out, points_out, bias_out)))
+    scratch = _scratch(b * ha * wa, call)
+    step = len(scratch.counts)
     for first in range(0, b * ha * wa, step):
-        last = min(first + step, b * ha * wa)
-        rest = (first, stride, scratch, *outputs)
-        pieces = _pieces(first, last, look)
-        _share([partial(_in_room, kernels.backward, call, (*piece, *rest)) for piece in pieces])
-        _share([partial(add, first, last) for add in additions])
+        last, here = min(first + step, b * ha * wa), scratch._replace(first=first)
+        in_parallel([partial(kernels.backward, call, found, s, here, gradients) for s in _shares(first, last, call)])
+        in_parallel(
+            [
+                *_channel_tasks(here, here.by_key, last, call.query, d, key_out),
+                *_channel_tasks(here, here.by_value, last, upstream, call.value_channels, value_out),
+            ]
+        )
     pictures = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
         for out, like, want in zip((query_out, key_out, value_out), (query, key, value), wanted)
@@ -159,70 +145,48 @@ def _number(like: Tensor) -> type:
     return np.float64 if _accumulated(like) == torch.float64 else np.float32
 
 
-def _in_room(kernel: Callable[..., None], call: tuple, rest: tuple) -> None:
-    """Calls a kernel with scratch of its own."""
-    look, channels = call[3], max(call[5:7])
-    integers, numbers = kernels.room(look.samples, channels)
-    kernel(*call, np.empty(integers, np.int32), np.empty(numbers, look.fractions.dtype), *rest)
+def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> kernels.Call:
+    q, k, v = (_flat(_channels_last(t)) for t in (query, key, value))
+    return kernels.Call(
+        *(q, k, v),
+        _geometry(look, query, key, nearest),
+        _flat(_bias(bias, _accumulated(query))),
+        query.shape[1],
+        value.shape[1],
+    )
 
 
-def _scratch(pixels: int, stride: int, like: Tensor) -> kernels.Scratch:
-    taps = pixels * stride + kernels.LANES
-    number = _number(like)
+def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
+    """One for each thread that finds something to do."""
+    size, counter = max(1, PIECE_SAMPLES // call.look.samples), np.zeros(1, np.int64)
+    integers, numbers = kernels.room(call.look.samples, max(call.channels, call.value_channels))
+    number = call.look.fractions.dtype
+    return [
+        kernels.Share(first, last, size, counter, np.empty(integers, np.int32), np.empty(numbers, number))
+        for _ in range(min(torch.get_num_threads(), -(-(last - first) // size)))
+    ]
+
+
+def _scratch(pixels: int, call: kernels.Call) -> kernels.Scratch:
+    """For as many pixels as go into `SCRATCH_TAPS`, or as there are."""
+    stride = (call.look.samples * (1 if call.look.nearest else 4) // kernels.LANES + 2) * kernels.LANES
+    pixels = min(pixels, max(64, SCRATCH_TAPS // stride))
+    taps, number = pixels * stride, call.look.fractions.dtype
     return kernels.Scratch(
-        np.empty(pixels, np.int32), np.empty(taps, np.int32), np.empty(taps, number), np.empty(taps, number)
+        0, stride, np.empty(pixels, np.int32), np.empty(taps, np.int32), np.empty(taps, number), np.empty(taps, number)
     )
 
 
 def _channel_tasks(
-    weights: np.ndarray, scratch: kernels.Scratch, stride: int, x: np.ndarray, channels: int, out: Tensor
-) -> list[Callable[[int, int], None]]:
+    scratch: kernels.Scratch, weights: np.ndarray, last: int, x: np.ndarray, channels: int, out: Tensor
+) -> list[Callable[[], None]]:
     """One task for each block of channels; how wide the blocks are changes no bit of the result."""
     if not out.numel():
         return []
     lanes = kernels.LANES
     width = -(-channels // (lanes * torch.get_num_threads())) * lanes
     flat = _flat(out)
-
-    def task(c: int) -> Callable[[int, int], None]:
-        return lambda first, last: kernels.scatter(
-            scratch.counts,
-            scratch.rows,
-            weights,
-            stride,
-            x,
-            channels,
-            first,
-            last,
-            c,
-            min(c + width, channels),
-            flat,
-        )
-
-    return [task(c) for c in range(0, channels, width)]
-
-
-def _pieces(first: int, last: int, look: Look) -> list[tuple[int, int]]:
-    step = max(1, PIECE_SAMPLES // look.samples)
-    return [(p, min(p + step, last)) for p in range(first, last, step)]
-
-
-def _share(tasks: list[Callable[[], None]]) -> None:
-    """Runs tasks on the threads that torch may use, this one included; raises what any of them raises."""
-    left = iter(tasks)
-
-    def work() -> None:
-        for task in left:
-            task()
-
-    helpers = min(torch.get_num_threads(), len(tasks)) - 1
-    waiting = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
-    work()
-    for future in waiting:
-        future.result()
-
-
-@lru_cache(maxsize=4)
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Threads of this process: those of a parent do not live on in its forks."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="pat-attention")
+    return [
+        partial(kernels.scatter, scratch, weights, last, x, channels, c, min(c + width, channels), flat)
+        for c in range(0, channels, width)
+    ]

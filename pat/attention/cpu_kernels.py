@@ -4,8 +4,9 @@ point.
 The work on one alpha pixel is done on *taps*, the pixels of beta that its samples touch. Neighbouring
 samples share them (a bilinear look-up has four, of which the next sample usually needs two again), so all
 work along the channels is done once a tap: inner products of the query with its taps, sums of taps with
-weights, and in backward the addition of the query to the taps' gradients. Everything else is scalar work on
-samples.
+weights, and in backward the addition of the query to the taps' gradients. Some neighbouring alpha pixels do so
+in turn, a few taps at a time, since they share most of them. Everything else is work on samples, eight at a
+time.
 
 Pictures come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
 integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the
@@ -25,9 +26,13 @@ from numba.core import cgutils
 from numba.extending import intrinsic, models, overload, register_model
 
 LANES = 8
+WIDE = 8 * LANES
+"""Channels that are worked off at once."""
 TAP_BLOCK = 4
-BLOCK = 8
-"""Alpha pixels that are worked off together, step by step, as long as what they look up is still at hand."""
+BLOCK = 16
+"""Alpha pixels that are worked off together, step by step."""
+CHUNK = 48
+"""Taps that the pixels of a block have in turn, while these lie in the first cache: 16 KiB."""
 LEAST_SPREAD = np.float32(1e-4)
 ONE, HALF = np.float32(1), np.float32(0.5)
 """In float32, so that they make a float64 of nothing that is not."""
@@ -42,7 +47,7 @@ def compiled(function=None, **options):
 
 
 class Vector(types.Type):
-    """`LANES` numbers of the accumulation type in one register (or two)."""
+    """`LANES` numbers of the accumulation type, or of int32, in one register (or two)."""
 
     def __init__(self, scalar):
         self.scalar = scalar
@@ -52,8 +57,7 @@ class Vector(types.Type):
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        lane = ir.DoubleType() if kind.scalar == types.float64 else ir.FloatType()
-        super().__init__(manager, kind, ir.VectorType(lane, LANES))
+        super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), LANES))
 
 
 def _accumulated(dtype):
@@ -83,6 +87,16 @@ def pointer(typing, array):
         return context.make_array(array)(context, builder, args[0]).data
 
     return types.CPointer(array.dtype)(array), code
+
+
+@intrinsic
+def take(typing, counter):
+    """The number at a pointer, which is one more for whoever asks next."""
+
+    def code(context, builder, signature, args):
+        return builder.atomic_rmw("add", args[0], ir.Constant(args[0].type.pointee, 1), "monotonic")
+
+    return counter.dtype(counter), code
 
 
 @intrinsic
@@ -188,6 +202,38 @@ def _arithmetic(instruction):
 
 
 add, sub, mul = _arithmetic("fadd"), _arithmetic("fsub"), _arithmetic("fmul")
+add_whole, mul_whole = _arithmetic("add"), _arithmetic("mul")
+
+
+@intrinsic
+def truncated(typing, a):
+    """A vector's numbers towards 0, as int32."""
+    whole = Vector(types.int32)
+
+    def code(context, builder, signature, args):
+        return builder.fptosi(args[0], context.get_value_type(whole))
+
+    return whole(a), code
+
+
+@intrinsic
+def numbers_of(typing, whole, like):
+    """A vector of int32 in the type of another."""
+
+    def code(context, builder, signature, args):
+        return builder.sitofp(args[0], args[1].type)
+
+    return like(whole, like), code
+
+
+@intrinsic
+def lesser_whole(typing, a, b):
+    """The smaller of the numbers of two vectors of int32."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.icmp_signed("<", *args), *args)
+
+    return a(a, b), code
 
 
 @intrinsic
@@ -196,6 +242,16 @@ def larger(typing, a, b):
 
     def code(context, builder, signature, args):
         return builder.select(builder.fcmp_ordered(">", *args), *args)
+
+    return a(a, b), code
+
+
+@intrinsic
+def lesser(typing, a, b):
+    """The smaller of the numbers of two vectors; that of b if either is NaN."""
+
+    def code(context, builder, signature, args):
+        return builder.select(builder.fcmp_ordered("<", *args), *args)
 
     return a(a, b), code
 
@@ -250,8 +306,8 @@ def _reduction(name, start):
 
 
 @intrinsic
-def store_totals(typing, array, index, a, b, c, d):
-    """Puts the sums of four vectors side by side."""
+def add_totals(typing, array, index, a, b, c, d):
+    """Adds the sums of four vectors to four numbers side by side."""
 
     def code(context, builder, signature, args):
         def pairs(p, q):
@@ -263,7 +319,8 @@ def store_totals(typing, array, index, a, b, c, d):
         low, high = (builder.shuffle_vector(v, v, _mask(half)) for half in ([0, 1, 2, 3], [4, 5, 6, 7]))
         lane = ir.VectorType(args[2].type.element, TAP_BLOCK)
         place = _at(builder, args[0], args[1], lane)
-        builder.store(builder.fadd(low, high), place, align=array.dtype.bitwidth // 8)
+        stored = builder.load(place, align=array.dtype.bitwidth // 8)
+        builder.store(builder.fadd(stored, builder.fadd(low, high)), place, align=array.dtype.bitwidth // 8)
         return context.get_dummy_value()
 
     return types.void(array, types.intp, a, b, c, d), code
@@ -271,6 +328,76 @@ def store_totals(typing, array, index, a, b, c, d):
 
 def _mask(lanes):
     return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
+
+
+FOURS = [[0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]]
+PAIRS = [[0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]]
+"""Shuffles that transpose a 4 by 4 block in each half of four vectors."""
+
+
+def _transpose(builder, a, b, c, d):
+    def shuffle(p, q, how):
+        return [builder.shuffle_vector(p, q, _mask(lanes)) for lanes in how]
+
+    (ab_low, ab_high), (cd_low, cd_high) = shuffle(a, b, FOURS), shuffle(c, d, FOURS)
+    return *shuffle(ab_low, cd_low, PAIRS), *shuffle(ab_high, cd_high, PAIRS)
+
+
+@intrinsic
+def load_fours(typing, array, starts, index):
+    """Four vectors, the k-th of array[start + k] for the `LANES` starts at an index."""
+    kind = types.UniTuple(Vector(array.dtype), 4)
+
+    def code(context, builder, signature, args):
+        lane = ir.VectorType(context.get_data_type(array.dtype), 4)
+
+        def four(k):
+            start = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(args[2].type, k))]))
+            return builder.load(_at(builder, args[0], start, lane), align=array.dtype.bitwidth // 8)
+
+        halves = [builder.shuffle_vector(four(k), four(k + 4), _mask([*range(LANES)])) for k in range(4)]
+        return context.make_tuple(builder, kind, _transpose(builder, *halves))
+
+    return kind(array, starts, types.intp), code
+
+
+@intrinsic
+def add_fours(typing, array, starts, index, a, b, c, d):
+    """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
+    in their order. By twos: what the next start touches is the second two of this one."""
+
+    def code(context, builder, signature, args):
+        two = ir.VectorType(context.get_data_type(array.dtype), 2)
+        fours = _transpose(builder, *args[3:])
+        for k in range(LANES):
+            start = builder.load(builder.gep(args[1], [builder.add(args[2], ir.Constant(args[2].type, k))]))
+            for half in range(2):
+                lanes = [2 * half + k // 4 * 4, 2 * half + k // 4 * 4 + 1]
+                number = builder.shuffle_vector(fours[k % 4], fours[k % 4], _mask(lanes))
+                place = _at(builder, args[0], builder.add(start, ir.Constant(start.type, 2 * half)), two)
+                stored = builder.load(place, align=array.dtype.bitwidth // 8)
+                builder.store(builder.fadd(stored, number), place, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, starts, types.intp, a, b, c, d), code
+
+
+@intrinsic
+def store_four(typing, array, index, number, offsets):
+    """array[index + k] = number + offsets[k], k from 0 to 3."""
+
+    def code(context, builder, signature, args):
+        lane = context.get_data_type(array.dtype)
+        numbers = shifts = ir.Constant(ir.VectorType(lane, 4), ir.Undefined)
+        for k in range(4):
+            shift = context.cast(builder, builder.extract_value(args[3], k), offsets.dtype, array.dtype)
+            numbers = builder.insert_element(numbers, args[2], ir.IntType(32)(k))
+            shifts = builder.insert_element(shifts, shift, ir.IntType(32)(k))
+        place = _at(builder, args[0], args[1], numbers.type)
+        builder.store(builder.add(numbers, shifts), place, align=array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, array.dtype, offsets), code
 
 
 @intrinsic
@@ -345,25 +472,64 @@ def _exponentials32(x):
 
 
 @compiled
-def inner_products(x, rows, n, picture, channels, out):
-    """out[t] = x . picture[rows[t]], for t < n; rows is padded to a multiple of TAP_BLOCK."""
-    whole = channels // LANES * LANES
-    nothing = splat(zero(x))
-    for t in range(0, n, TAP_BLOCK):
+def inner_products(x, rows, first, last, picture, channels, out):
+    """out[t] = x . picture[rows[t]], for first <= t < last; rows is padded to a multiple of TAP_BLOCK."""
+    c = 0
+    for t in range(first, last, LANES):
+        store(out, t, splat(zero(x)))
+    while c + WIDE <= channels:
+        _inner_products_64(x, rows, first, last, picture, channels, c, out)
+        c += WIDE
+    if c < channels:
+        _inner_products_of_rest(x, rows, first, last, picture, channels, c, out)
+
+
+@compiled
+def _inner_products_64(x, rows, first, last, picture, channels, c, out):
+    """The 64 channels from c on, with x in registers."""
+    x0, x1, x2, x3 = load(x, c), load(x, c + 8), load(x, c + 16), load(x, c + 24)
+    x4, x5, x6, x7 = load(x, c + 32), load(x, c + 40), load(x, c + 48), load(x, c + 56)
+    for t in range(first, last, TAP_BLOCK):
+        add_totals(
+            out,
+            t,
+            _inner_product_64(picture, rows[t] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(picture, rows[t + 1] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(picture, rows[t + 2] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(picture, rows[t + 3] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+        )
+
+
+@compiled
+def _inner_product_64(picture, at, x0, x1, x2, x3, x4, x5, x6, x7):
+    a = mul(x0, load(picture, at))
+    a = fma(x1, load(picture, at + 8), a)
+    a = fma(x2, load(picture, at + 16), a)
+    a = fma(x3, load(picture, at + 24), a)
+    a = fma(x4, load(picture, at + 32), a)
+    a = fma(x5, load(picture, at + 40), a)
+    a = fma(x6, load(picture, at + 48), a)
+    return fma(x7, load(picture, at + 56), a)
+
+
+@compiled
+def _inner_products_of_rest(x, rows, first, last, picture, channels, first_channel, out):
+    whole = first_channel + (channels - first_channel) // LANES * LANES
+    for t in range(first, last, TAP_BLOCK):
         r0, r1, r2, r3 = (
             rows[t] * channels,
             rows[t + 1] * channels,
             rows[t + 2] * channels,
             rows[t + 3] * channels,
         )
-        a0 = a1 = a2 = a3 = nothing
-        for c in range(0, whole, LANES):
+        a0 = a1 = a2 = a3 = splat(zero(x))
+        for c in range(first_channel, whole, LANES):
             q = load(x, c)
             a0 = fma(q, load(picture, r0 + c), a0)
             a1 = fma(q, load(picture, r1 + c), a1)
             a2 = fma(q, load(picture, r2 + c), a2)
             a3 = fma(q, load(picture, r3 + c), a3)
-        store_totals(out, t, a0, a1, a2, a3)
+        add_totals(out, t, a0, a1, a2, a3)
         for c in range(whole, channels):
             out[t] += x[c] * load_one(picture, r0 + c)
             out[t + 1] += x[c] * load_one(picture, r1 + c)
@@ -372,32 +538,49 @@ def inner_products(x, rows, n, picture, channels, out):
 
 
 @compiled
-def weighted_sum(weights, rows, n, picture, channels, width, out):
-    """out[c] = sum over t < n of weights[t] picture[rows[t], c], for c < width.
+def weighted_sum(weights, rows, first, last, picture, channels, begin, end, out):
+    """out[c] += weights[t] picture[rows[t], c] for first <= t < last and the channels begin <= c < end.
 
     Weights and rows are padded to a multiple of TAP_BLOCK.
     """
-    c = 0
-    while c + 4 * LANES <= width:
-        _weighted_sum_32(weights, rows, n, picture, channels, c, out)
+    c = begin
+    while c + WIDE <= end:
+        _weighted_sum_64(weights, rows, first, last, picture, channels, c, out)
+        c += WIDE
+    while c + 4 * LANES <= end:
+        _weighted_sum_32(weights, rows, first, last, picture, channels, c, out)
         c += 4 * LANES
-    while c + 2 * LANES <= width:
-        _weighted_sum_16(weights, rows, n, picture, channels, c, out)
-        c += 2 * LANES
-    while c + LANES <= width:
-        _weighted_sum_8(weights, rows, n, picture, channels, c, out)
+    while c + LANES <= end:
+        _weighted_sum_8(weights, rows, first, last, picture, channels, c, out)
         c += LANES
-    for tail in range(c, width):
-        s = zero(weights)
-        for t in range(n):
-            s += weights[t] * load_one(picture, rows[t] * channels + tail)
-        out[tail] = s
+    for tail in range(c, end):
+        for t in range(first, last):
+            out[tail] += weights[t] * load_one(picture, rows[t] * channels + tail)
 
 
 @compiled
-def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
-    for t in range(0, n, 2):
+def _weighted_sum_64(weights, rows, first, last, picture, channels, c, out):
+    a0, a1, a2, a3 = load(out, c), load(out, c + 8), load(out, c + 16), load(out, c + 24)
+    a4, a5, a6, a7 = load(out, c + 32), load(out, c + 40), load(out, c + 48), load(out, c + 56)
+    for t in range(first, last):
+        w, r = splat(weights[t]), rows[t] * channels + c
+        a0 = fma(w, load(picture, r), a0)
+        a1 = fma(w, load(picture, r + 8), a1)
+        a2 = fma(w, load(picture, r + 16), a2)
+        a3 = fma(w, load(picture, r + 24), a3)
+        a4 = fma(w, load(picture, r + 32), a4)
+        a5 = fma(w, load(picture, r + 40), a5)
+        a6 = fma(w, load(picture, r + 48), a6)
+        a7 = fma(w, load(picture, r + 56), a7)
+    _store_32(out, c, a0, a1, a2, a3)
+    _store_32(out, c + 32, a4, a5, a6, a7)
+
+
+@compiled
+def _weighted_sum_32(weights, rows, first, last, picture, channels, c, out):
+    a0, a1, a2, a3 = load(out, c), load(out, c + 8), load(out, c + 16), load(out, c + 24)
+    b0 = b1 = b2 = b3 = splat(zero(weights))
+    for t in range(first, last, 2):
         w, r = splat(weights[t]), rows[t] * channels + c
         a0 = fma(w, load(picture, r), a0)
         a1 = fma(w, load(picture, r + 8), a1)
@@ -408,32 +591,22 @@ def _weighted_sum_32(weights, rows, n, picture, channels, c, out):
         b1 = fma(w, load(picture, r + 8), b1)
         b2 = fma(w, load(picture, r + 16), b2)
         b3 = fma(w, load(picture, r + 24), b3)
-    store(out, c, add(a0, b0))
-    store(out, c + 8, add(a1, b1))
-    store(out, c + 16, add(a2, b2))
-    store(out, c + 24, add(a3, b3))
+    _store_32(out, c, add(a0, b0), add(a1, b1), add(a2, b2), add(a3, b3))
 
 
 @compiled
-def _weighted_sum_16(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = b0 = b1 = b2 = b3 = splat(zero(weights))
-    for t in range(0, n, TAP_BLOCK):
-        w0, r0 = splat(weights[t]), rows[t] * channels + c
-        w1, r1 = splat(weights[t + 1]), rows[t + 1] * channels + c
-        w2, r2 = splat(weights[t + 2]), rows[t + 2] * channels + c
-        w3, r3 = splat(weights[t + 3]), rows[t + 3] * channels + c
-        a0, b0 = fma(w0, load(picture, r0), a0), fma(w0, load(picture, r0 + 8), b0)
-        a1, b1 = fma(w1, load(picture, r1), a1), fma(w1, load(picture, r1 + 8), b1)
-        a2, b2 = fma(w2, load(picture, r2), a2), fma(w2, load(picture, r2 + 8), b2)
-        a3, b3 = fma(w3, load(picture, r3), a3), fma(w3, load(picture, r3 + 8), b3)
-    store(out, c, add(add(a0, a1), add(a2, a3)))
-    store(out, c + 8, add(add(b0, b1), add(b2, b3)))
+def _store_32(out, c, a, b, d, e):
+    store(out, c, a)
+    store(out, c + 8, b)
+    store(out, c + 16, d)
+    store(out, c + 24, e)
 
 
 @compiled
-def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
-    a0 = a1 = a2 = a3 = splat(zero(weights))
-    for t in range(0, n, TAP_BLOCK):
+def _weighted_sum_8(weights, rows, first, last, picture, channels, c, out):
+    a0, a1 = load(out, c), splat(zero(weights))
+    a2 = a3 = a1
+    for t in range(first, last, TAP_BLOCK):
         a0 = fma(splat(weights[t]), load(picture, rows[t] * channels + c), a0)
         a1 = fma(splat(weights[t + 1]), load(picture, rows[t + 1] * channels + c), a1)
         a2 = fma(splat(weights[t + 2]), load(picture, rows[t + 2] * channels + c), a2)
@@ -441,38 +614,78 @@ def _weighted_sum_8(weights, rows, n, picture, channels, c, out):
     store(out, c, add(add(a0, a1), add(a2, a3)))
 
 
-@compiled(nogil=True, cache=True)
-def scatter(counts, rows, weights, stride, x, channels, first, last, first_channel, last_channel, out):
-    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels first .. last, in their order.
-
-    `counts` says how many taps each of the pixels has; theirs start at multiples of `stride`. One caller owns
-    the channels first_channel .. last_channel, so the order of additions, and with it every bit, is the same
-    however many callers share the work.
-    """
-    counts, rows, weights, x, out = pointer(counts), pointer(rows), pointer(weights), pointer(x), pointer(out)
-    for p in range(first, last):
-        begin = (p - first) * stride
-        end = begin + counts[p - first]
-        c = first_channel
-        while c + 4 * LANES <= last_channel:
-            _scatter_32(rows, weights, begin, end, x, p * channels + c, channels, c, out)
-            c += 4 * LANES
-        while c + LANES <= last_channel:
-            q = load(x, p * channels + c)
-            for t in range(begin, end):
-                r = rows[t] * channels + c
-                store(out, r, fma(splat(weights[t]), q, load(out, r)))
-            c += LANES
-        for tail in range(c, last_channel):
-            one = load_one(x, p * channels + tail)
-            for t in range(begin, end):
-                out[rows[t] * channels + tail] += weights[t] * one
+@compiled
+def _block_products(pixels, counts, x, rows, picture, channels, out):
+    """`inner_products` for the pixels of a block. Neighbours look at much the same pixels of beta: at a few of
+    those in turn, which then lie in the first cache."""
+    for t in range(0, _most(counts, pixels), CHUNK):
+        for i in range(pixels):
+            inner_products(_of(x, i), _of(rows, i), t, min(t + CHUNK, counts[i]), picture, channels, _of(out, i))
 
 
 @compiled
-def _scatter_32(rows, weights, begin, end, x, at, channels, c, out):
-    q0, q1, q2, q3 = load(x, at), load(x, at + 8), load(x, at + 16), load(x, at + 24)
-    for t in range(begin, end):
+def _block_sums(pixels, counts, weights, rows, picture, channels, out):
+    """`weighted_sum` likewise, from 0."""
+    for i in range(pixels):
+        _fill(_of(out, i), 0, channels, zero(out.first))
+    for c in range(0, channels, WIDE):
+        end = min(c + WIDE, channels)
+        for t in range(0, _most(counts, pixels), CHUNK):
+            for i in range(pixels):
+                last = min(t + CHUNK, counts[i])
+                weighted_sum(_of(weights, i), _of(rows, i), t, last, picture, channels, c, end, _of(out, i))
+
+
+@compiled
+def _most(counts, n):
+    most = 0
+    for i in range(n):
+        most = max(most, counts[i])
+    return most
+
+
+@compiled(nogil=True, cache=True)
+def scatter(scratch, weights, last, x, channels, first_channel, last_channel, out):
+    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels scratch.first .. last: those of a block
+    in turn, as in `_block_products`.
+
+    `weights` is one of scratch's. One caller owns the channels first_channel .. last_channel, so the order of
+    additions, and with it every bit, is the same however many callers share the work.
+    """
+    counts, rows = pointer(scratch.counts), pointer(scratch.rows)
+    weights, x, out = pointer(weights), pointer(x), pointer(out)
+    for first in range(0, last - scratch.first, BLOCK):
+        end = min(first + BLOCK, last - scratch.first)
+        for t in range(0, _most(from_index(counts, first), end - first), CHUNK):
+            for i in range(first, end):
+                at = i * scratch.stride
+                taps = at + t, at + min(t + CHUNK, counts[i])
+                pixel = from_index(x, (scratch.first + i) * channels)
+                _scatter(rows, weights, taps, pixel, channels, first_channel, last_channel, out)
+
+
+@compiled
+def _scatter(rows, weights, taps, x, channels, first_channel, last_channel, out):
+    c = first_channel
+    while c + 4 * LANES <= last_channel:
+        _scatter_32(rows, weights, taps, x, channels, c, out)
+        c += 4 * LANES
+    while c + LANES <= last_channel:
+        q = load(x, c)
+        for t in range(taps[0], taps[1]):
+            r = rows[t] * channels + c
+            store(out, r, fma(splat(weights[t]), q, load(out, r)))
+        c += LANES
+    for tail in range(c, last_channel):
+        one = load_one(x, tail)
+        for t in range(taps[0], taps[1]):
+            out[rows[t] * channels + tail] += weights[t] * one
+
+
+@compiled
+def _scatter_32(rows, weights, taps, x, channels, c, out):
+    q0, q1, q2, q3 = load(x, c), load(x, c + 8), load(x, c + 16), load(x, c + 24)
+    for t in range(taps[0], taps[1]):
         w = splat(weights[t])
         r = rows[t] * channels + c
         store(out, r, fma(w, q0, load(out, r)))
@@ -502,30 +715,97 @@ class Look(NamedTuple):
     slack: Any
 
 
+class Call(NamedTuple):
+    """The inputs of a call: pictures, where to look, bias (of no length if there is none), and the numbers of
+    channels of the query and the value."""
+
+    query: Any
+    key: Any
+    value: Any
+    look: Look
+    bias: Any
+    channels: int
+    value_channels: int
+
+
+class Share(NamedTuple):
+    """What one of several callers works on, and with: pieces of `size` of the alpha pixels first .. last, for
+    which all of them ask one counter, and scratch of its own."""
+
+    first: int
+    last: int
+    size: int
+    counter: Any
+    integers: Any
+    numbers: Any
+
+
+class Saved(NamedTuple):
+    """What forward found, and the gradients by what it gave. Statistics may be of one pixel, for all."""
+
+    statistics: Any
+    logsum: Any
+    value_upstream: Any
+    statistics_upstream: Any
+
+
+class Gradients(NamedTuple):
+    """Those that belong to alpha's pixels; of no length where not wanted. points and bias come zeroed."""
+
+    query: Any
+    points: Any
+    bias: Any
+
+
+class Scratch(NamedTuple):
+    """What backward leaves for `scatter`: for each of the alpha pixels from `first` on how many taps it has;
+    their rows and weights, which start at multiples of `stride`."""
+
+    first: int
+    stride: int
+    counts: Any
+    rows: Any
+    by_key: Any
+    by_value: Any
+
+
 class Samples(NamedTuple):
-    """Room for the samples of one pixel that count: which they are, where, in which cell, with what
-    weight."""
+    """Room for the samples of one pixel that count: which they are, where, in which cell, where in that
+    cell, and numbers for each."""
 
     index: Any
     cell: Any
     tap: Any
     x: Any
     y: Any
-    right: Any
-    down: Any
+    ahead: Any
+    aside: Any
     score: Any
     weight: Any
     slope: Any
     score_slope: Any
 
 
-class Taps(NamedTuple):
-    """Room for the taps of one pixel: their pixels in beta, and numbers for each."""
+class Column(NamedTuple):
+    """A list for each pixel of a block: where the first one's begins, and how far it is to the next."""
 
-    row: Any
-    by_key: Any
-    by_value: Any
-    weight: Any
+    first: Any
+    step: Any
+
+
+class Block(NamedTuple):
+    """Room for some neighbouring alpha pixels: for each the number of its samples and taps, its samples, its
+    taps' rows (pixels in beta), numbers for each tap, and for each channel."""
+
+    sample_counts: Any
+    tap_counts: Any
+    integers: Column
+    numbers: Column
+    rows: Column
+    by_key: Column
+    by_value: Column
+    query: Column
+    upstream: Column
 
 
 @compiled
@@ -547,20 +827,64 @@ def _look(look):
     )
 
 
-def room(samples, channels):
-    """How many integers and how many numbers of scratch a task needs."""
-    n, m = samples + LANES, 4 * samples + LANES
-    return 6 * n + BLOCK * (m + 1), 8 * n + (BLOCK + 2) * m + channels
+@compiled
+def _call(call):
+    """With pointers for arrays."""
+    return Call(
+        pointer(call.query),
+        pointer(call.key),
+        pointer(call.value),
+        _look(call.look),
+        pointer(call.bias),
+        call.channels,
+        call.value_channels,
+    )
 
 
 @compiled
-def _room(n, integers, numbers):
-    """Scratch, cut up: for samples, taps, channels. Taps' rows and weights are there for BLOCK pixels, the
-    numbers of taps behind those."""
-    n, m = n + LANES, 4 * n + LANES
-    i, f = pointer(integers), pointer(numbers)
-    t = from_index(f, 8 * n)
-    samples = Samples(
+def _lengths(samples):
+    """Room for a pixel's samples and for its taps."""
+    return samples + LANES, 4 * samples + 2 * LANES
+
+
+def room(samples, channels):
+    """How many integers and how many numbers of scratch a task needs."""
+    n, m = _lengths.py_func(samples)
+    return BLOCK * (3 * n + m + 2), BLOCK * (8 * n + 2 * m + 2 * channels)
+
+
+@compiled
+def _block(call, share):
+    """Scratch, cut up."""
+    n, m = _lengths(call.look.samples)
+    i, f = from_index(pointer(share.integers), 2 * BLOCK), pointer(share.numbers)
+    channels = max(call.channels, call.value_channels)
+    i_step, f_step = 3 * n + m, 8 * n + 2 * m + 2 * channels
+    return Block(
+        pointer(share.integers),
+        from_index(pointer(share.integers), BLOCK),
+        Column(i, i_step),
+        Column(f, f_step),
+        Column(from_index(i, 3 * n), i_step),
+        Column(from_index(f, 8 * n), f_step),
+        Column(from_index(f, 8 * n + m), f_step),
+        Column(from_index(f, 8 * n + 2 * m), f_step),
+        Column(from_index(f, 8 * n + 2 * m + channels), f_step),
+    )
+
+
+@compiled
+def _of(column, slot):
+    """The list of one pixel of a block."""
+    return from_index(column.first, slot * column.step)
+
+
+@compiled
+def _samples(block, slot, n):
+    """The samples of one pixel of a block."""
+    n, _ = _lengths(n)
+    i, f = _of(block.integers, slot), _of(block.numbers, slot)
+    return Samples(
         i,
         from_index(i, n),
         from_index(i, 2 * n),
@@ -573,15 +897,6 @@ def _room(n, integers, numbers):
         from_index(f, 6 * n),
         from_index(f, 7 * n),
     )
-    taps = Taps(from_index(i, 6 * n), t, from_index(t, m), from_index(t, 2 * m))
-    return samples, taps, from_index(t, (BLOCK + 2) * m), from_index(i, 6 * n + BLOCK * m)
-
-
-@compiled
-def _slot(taps, slot, n):
-    """The taps of a pixel of a block."""
-    m = slot * (4 * n + LANES)
-    return Taps(from_index(taps.row, m), taps.by_key, taps.by_value, from_index(taps.weight, m))
 
 
 @compiled
@@ -599,10 +914,19 @@ def _walk(start, along, look, out):
 
 @compiled
 def _collect(p, look, samples):
-    """Positions of the samples of pixel p that count; how many."""
+    """Positions of the samples of pixel p that count, padded with 0; how many."""
     place = p % look.alpha_pixels if look.shared else p
     if look.straight:
-        return _collect_segment(place, look, samples) if look.mask[place] else 0
+        n = _collect_segment(place, look, samples) if look.mask[place] else 0
+    else:
+        n = _collect_positions(place, look, samples)
+    store(samples.x, n, splat(zero(samples.x)))
+    store(samples.y, n, splat(zero(samples.y)))
+    return n
+
+
+@compiled
+def _collect_positions(place, look, samples):
     points, mask = (
         from_index(look.points, 2 * place * look.samples),
         from_index(look.mask, place * look.samples),
@@ -635,82 +959,97 @@ def _collect_segment(place, look, samples):
 
 
 @compiled
-def _tap(n, first, look, samples, taps):
+def _tap(n, first, look, samples, rows):
     """Finds the taps of n samples; how many. `first` is the index of the first pixel of this beta."""
     if look.nearest:
-        m = _tap_nearest(n, np.int32(first), look, samples, taps)
+        m = _tap_nearest(n, np.int32(first), look, samples, rows)
     else:
-        m = _tap_cells(n, np.int32(first), look, samples, taps)
+        m = _tap_cells(n, np.int32(first), look, samples, rows)
     for t in range(m, m + TAP_BLOCK):
-        taps.row[t] = taps.row[m - 1]
+        rows[t] = rows[m - 1]
     return m
 
 
 @compiled
-def _tap_nearest(n, first, look, samples, taps):
+def _tap_nearest(n, first, look, samples, rows):
     """The pixels that samples lie on, those of neighbours once. As many as samples: each has its own."""
-    last_x, last_y, width = np.int32(look.width - 1), np.int32(look.height - 1), np.int32(look.width)
-    for j in range(n):
-        x = min(np.int32(samples.x[j] + HALF), last_x)
-        y = min(np.int32(samples.y[j] + HALF), last_y)
-        taps.row[j] = first + y * width + x
+    half, width, first = splat(HALF + zero(samples.x)), splat(np.int32(look.width)), splat(first)
+    last_x, last_y = splat(np.int32(look.width - 1)), splat(np.int32(look.height - 1))
+    for j in range(0, n, LANES):
+        x = lesser_whole(truncated(add(load(samples.x, j), half)), last_x)
+        y = lesser_whole(truncated(add(load(samples.y, j), half)), last_y)
+        store(rows, j, add_whole(add_whole(mul_whole(y, width), x), first))
     if look.straight and n > 1 and max(abs(samples.x[1] - samples.x[0]), abs(samples.y[1] - samples.y[0])) >= ONE:
         return n
     m = 0
     row = np.int32(-1)
     for j in range(n):
-        here = taps.row[j]
+        here = rows[j]
         m += here != row
         row = here
-        taps.row[m - 1] = row
+        rows[m - 1] = row
         samples.tap[j] = m - 1
     return m
 
 
+class Course(NamedTuple):
+    """Which way the samples of a pixel run on the whole: along y or x, backward or forward."""
+
+    steep: Any
+    backward: Any
+
+
 @compiled
-def _tap_cells(n, first, look, samples, taps):
-    """Each cell has four taps, of which those that the cell before had, too, are taken from there."""
-    nothing = zero(samples.x)
+def _course(n, samples):
+    along_x, along_y = samples.x[n - 1] - samples.x[0], samples.y[n - 1] - samples.y[0]
+    steep = abs(along_y) > abs(along_x)
+    return Course(steep, along_y < 0 if steep else along_x < 0)
+
+
+@compiled
+def _tap_cells(n, first, look, samples, rows):
+    """A cell's taps are four in a row: two behind, then the two ahead, as the samples run. A sample one cell
+    further has for its first two the last two of the sample before."""
+    course = _course(n, samples)
     width = np.int32(look.width)
-    cell_x, cell_y = np.int32(max(look.width - 2, 0)), np.int32(max(look.height - 2, 0))
     right, down = np.int32(min(1, look.width - 1)), np.int32(min(1, look.height - 1)) * width
+    ahead, aside = (down, right) if course.steep else (right, down)
+    _find_cells(n, first, look, samples, course)
+    if course.backward:
+        first_tap, ahead = ahead, -ahead
+    else:
+        first_tap = np.int32(0)
+    offsets = first_tap, first_tap + aside, first_tap + ahead, first_tap + ahead + aside
+    tap, before = np.int32(0), samples.cell[0]
     for j in range(n):
-        x, y = min(max(samples.x[j], nothing), look.last_x), min(max(samples.y[j], nothing), look.last_y)
-        cx, cy = min(np.int32(x), cell_x), min(np.int32(y), cell_y)
-        samples.right[j], samples.down[j] = x - np.float32(cx), y - np.float32(cy)
-        samples.cell[j] = first + cy * width + cx
-    t00 = t10 = t01 = t11 = m = np.int32(0)
-    cell = np.int32(0)
-    for j in range(n):
-        step, cell = samples.cell[j] - cell, samples.cell[j]
-        if j == 0 or step != 0:
-            if j == 0:
-                t00, t10, m = _fresh(cell, cell + right, m, taps)
-                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
-            elif step == right and right != 0:
-                t00, t01 = t10, t11
-                t10, t11, m = _fresh(cell + right, cell + right + down, m, taps)
-            elif step == -right and right != 0:
-                t10, t11 = t00, t01
-                t00, t01, m = _fresh(cell, cell + down, m, taps)
-            elif step == down and down != 0:
-                t00, t10 = t01, t11
-                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
-            elif step == -down and down != 0:
-                t01, t11 = t00, t10
-                t00, t10, m = _fresh(cell, cell + right, m, taps)
-            else:
-                t00, t10, m = _fresh(cell, cell + right, m, taps)
-                t01, t11, m = _fresh(cell + down, cell + right + down, m, taps)
-        samples.tap[4 * j], samples.tap[4 * j + 1] = t00, t10
-        samples.tap[4 * j + 2], samples.tap[4 * j + 3] = t01, t11
-    return np.int64(m)
+        cell = samples.cell[j]
+        tap += np.int32(0) if cell == before else np.int32(2) if cell - before == ahead else np.int32(4)
+        before = cell
+        store_four(rows, tap, cell, offsets)
+        samples.tap[j] = tap
+    for j in range(n, n + LANES):
+        samples.tap[j] = tap
+    return np.int64(tap) + 4
 
 
 @compiled
-def _fresh(row, other, m, taps):
-    taps.row[m], taps.row[m + 1] = row, other
-    return m, np.int32(m + 1), np.int32(m + 2)
+def _find_cells(n, first, look, samples, course):
+    """The cell of each sample, as the index of its upper left pixel, and how far ahead and aside in it."""
+    nothing, one = splat(zero(samples.x)), splat(ONE + zero(samples.x))
+    last_x, last_y = splat(look.last_x), splat(look.last_y)
+    cell_x, cell_y = splat(np.int32(max(look.width - 2, 0))), splat(np.int32(max(look.height - 2, 0)))
+    width, first = splat(np.int32(look.width)), splat(first)
+    across, down = (samples.aside, samples.ahead) if course.steep else (samples.ahead, samples.aside)
+    for j in range(0, n, LANES):
+        x = lesser(larger(load(samples.x, j), nothing), last_x)
+        y = lesser(larger(load(samples.y, j), nothing), last_y)
+        cx, cy = lesser_whole(truncated(x), cell_x), lesser_whole(truncated(y), cell_y)
+        store(across, j, sub(x, numbers_of(cx, x)))
+        store(down, j, sub(y, numbers_of(cy, y)))
+        store(samples.cell, j, add_whole(add_whole(mul_whole(cy, width), cx), first))
+    if course.backward:
+        for j in range(0, n, LANES):
+            store(samples.ahead, j, sub(one, load(samples.ahead, j)))
 
 
 @compiled
@@ -724,35 +1063,33 @@ def _interpolate(n, m, look, samples, by_tap, out):
             for j in range(n):
                 out[j] = by_tap[samples.tap[j]]
         return
-    for j in range(n):
-        u, v = samples.right[j], samples.down[j]
-        a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
-        c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
-        upper, lower = a + u * (b - a), c + u * (d - c)
-        out[j] = upper + v * (lower - upper)
+    for j in range(0, n, LANES):
+        ahead, aside = load(samples.ahead, j), load(samples.aside, j)
+        a, b, c, d = load_fours(by_tap, samples.tap, j)
+        behind, before = fma(aside, sub(b, a), a), fma(aside, sub(d, c), c)
+        store(out, j, fma(ahead, sub(before, behind), behind))
 
 
 @compiled
 def _distribute(n, m, look, samples, numbers, by_tap):
-    """From numbers on samples to numbers on taps: the transpose of `_interpolate`."""
+    """From numbers on samples, padded with 0, to numbers on taps: the transpose of `_interpolate`."""
     if look.nearest and m == n:
         for j in range(0, n, LANES):
             store(by_tap, j, load(numbers, j))
         _fill(by_tap, n, n + TAP_BLOCK, zero(by_tap))
         return
-    _fill(by_tap, 0, m + TAP_BLOCK, zero(by_tap))
+    for t in range(0, m + TAP_BLOCK, LANES):
+        store(by_tap, t, splat(zero(by_tap)))
     if look.nearest:
         for j in range(n):
             by_tap[samples.tap[j]] += numbers[j]
         return
-    for j in range(n):
-        u, v = samples.right[j], samples.down[j]
-        lower = v * numbers[j]
-        upper = numbers[j] - lower
-        by_tap[samples.tap[4 * j]] += upper - u * upper
-        by_tap[samples.tap[4 * j + 1]] += u * upper
-        by_tap[samples.tap[4 * j + 2]] += lower - u * lower
-        by_tap[samples.tap[4 * j + 3]] += u * lower
+    for j in range(0, n, LANES):
+        number, ahead, aside = load(numbers, j), load(samples.ahead, j), load(samples.aside, j)
+        before = mul(ahead, number)
+        behind = sub(number, before)
+        b, d = mul(aside, behind), mul(aside, before)
+        add_fours(by_tap, samples.tap, j, sub(behind, b), b, sub(before, d), d)
 
 
 @compiled
@@ -762,12 +1099,13 @@ def _fill(numbers, first, last, filler):
 
 
 @compiled
-def _slopes(j, samples, by_tap):
+def _slopes(j, course, samples, by_tap):
     """How the interpolated number changes with x and with y, at sample j."""
-    u, v = samples.right[j], samples.down[j]
-    a, b = by_tap[samples.tap[4 * j]], by_tap[samples.tap[4 * j + 1]]
-    c, d = by_tap[samples.tap[4 * j + 2]], by_tap[samples.tap[4 * j + 3]]
-    return (ONE - v) * (b - a) + v * (d - c), (ONE - u) * (c - a) + u * (d - b)
+    u, v, t = samples.ahead[j], samples.aside[j], samples.tap[j]
+    a, b, c, d = by_tap[t], by_tap[t + 1], by_tap[t + 2], by_tap[t + 3]
+    ahead, aside = (ONE - v) * (c - a) + v * (d - b), (ONE - u) * (b - a) + u * (d - c)
+    ahead = -ahead if course.backward else ahead
+    return (aside, ahead) if course.steep else (ahead, aside)
 
 
 # ---- forward and backward ------------------------------------------------------------------------
@@ -786,19 +1124,24 @@ def _pack(numbers, n, array, at):
 
 
 @compiled
-def _score(p, q, key, channels, look, bias, biased, samples, taps):
-    """Collects pixel p's samples and scores them: how many samples, how many taps."""
-    n = _collect(p, look, samples)
-    if n == 0:
-        return 0, 0
-    m = _tap(n, p // look.alpha_pixels * (look.height * look.width), look, samples, taps)
-    inner_products(q, taps.row, m, key, channels, taps.by_key)
-    _interpolate(n, m, look, samples, taps.by_key, samples.score)
+def _find(p, slot, look, block):
+    """The samples and taps of pixel p."""
+    samples = _samples(block, slot, look.samples)
+    block.sample_counts[slot] = n = _collect(p, look, samples)
+    first = p // look.alpha_pixels * (look.height * look.width)
+    block.tap_counts[slot] = _tap(n, first, look, samples, _of(block.rows, slot)) if n > 0 else 0
+
+
+@compiled
+def _score(p, slot, call, biased, block):
+    """The scores of pixel p's samples."""
+    look, bias = call.look, call.bias
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
+    _interpolate(n, block.tap_counts[slot], look, samples, _of(block.by_key, slot), samples.score)
     if biased:
         for j in range(n):
             samples.score[j] += bias[p * look.samples + samples.index[j]]
-    _fill(samples.score, n, n + LANES, zero(q) - np.float32(np.inf))
-    return n, m
+    _fill(samples.score, n, n + LANES, zero(samples.score) - np.float32(np.inf))
 
 
 @compiled
@@ -839,11 +1182,13 @@ def _exponentiate(n, samples, top):
 
 
 @compiled
-def _measure(n, samples, statistics):
-    """Expected position, spread and largest of the weights, which are padded with 0."""
+def _measure(slot, look, block, statistics):
+    """Expected position, spread and largest of the weights, which are padded with 0; all 0 without taps."""
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
     nothing = zero(samples.x)
-    _fill(samples.x, n, n + LANES, nothing)
-    _fill(samples.y, n, n + LANES, nothing)
+    if block.tap_counts[slot] == 0:
+        _fill(statistics, 0, 4, nothing)
+        return
     x = y = squared = peak = splat(nothing)
     for j in range(0, n, LANES):
         w = load(samples.weight, j)
@@ -862,57 +1207,54 @@ def _measure(n, samples, statistics):
 
 
 @compiled(nogil=True, cache=True)
-def forward(
-    query,
-    key,
-    value,
-    look,
-    bias,
-    channels,
-    value_channels,
-    integers,
-    numbers,
-    first,
-    last,
-    out,
-    statistics,
-    logsum,
-):
-    """The alpha pixels first .. last: values out, statistics (pixel, 4) and log of the sum of
-    exponentials."""
-    biased = len(bias) > 0
-    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
-    out, statistics = pointer(out), pointer(statistics)
-    samples, taps, q, counts = _room(look.samples, integers, numbers)
-    for begin in range(first, last, BLOCK):
-        end = min(begin + BLOCK, last)
-        for p in range(begin, end):
-            _unpack(query, p * channels, channels, q)
-            own = _slot(taps, p - begin, look.samples)
-            n, m = _score(p, q, key, channels, look, bias, biased, samples, own)
-            logsum[p] = _softmax(n, samples) if n > 0 else -np.inf
-            if logsum[p] == -np.inf:
-                counts[p - begin] = 0
-                _fill(statistics, 4 * p, 4 * p + 4, zero(q))
-            else:
-                counts[p - begin] = m
-                _distribute(n, m, look, samples, samples.weight, own.weight)
-                _measure(n, samples, from_index(statistics, 4 * p))
-        for c in range(0, value_channels, 4 * LANES):
-            width = min(4 * LANES, value_channels - c)
-            for p in range(begin, end):
-                own = _slot(taps, p - begin, look.samples)
-                weighted_sum(own.weight, own.row, counts[p - begin], from_index(value, c), value_channels, width, q)
-                _pack(q, width, out, p * value_channels + c)
+def forward(call, share, out, statistics, logsum):
+    """Values, statistics (pixel, 4; if it has a length) and logarithm of the sum of exponentials of a share of
+    alpha's pixels."""
+    measured = len(statistics) > 0
+    biased = len(call.bias) > 0
+    block, counter, call = _block(call, share), pointer(share.counter), _call(call)
+    out, statistics, logsum = pointer(out), pointer(statistics), pointer(logsum)
+    begin = share.first + take(counter) * share.size
+    while begin < share.last:
+        end = min(begin + share.size, share.last)
+        for first in range(begin, end, BLOCK):
+            _forward(first, min(BLOCK, end - first), call, biased, measured, block, out, statistics, logsum)
+        begin = share.first + take(counter) * share.size
 
 
-class Scratch(NamedTuple):
-    """What backward leaves for `scatter`: for each pixel of a piece of alpha its taps and their weights."""
+@compiled
+def _forward(first, pixels, call, biased, measured, block, out, statistics, logsum):
+    """A block of alpha's pixels."""
+    d, dv, counts = call.channels, call.value_channels, block.tap_counts
+    for i in range(pixels):
+        _unpack(call.query, (first + i) * d, d, _of(block.query, i))
+        _find(first + i, i, call.look, block)
+    _block_products(pixels, counts, block.query, block.rows, call.key, d, block.by_key)
+    for i in range(pixels):
+        p = first + i
+        logsum[p] = _weigh(p, i, call, biased, block)
+        if measured:
+            _measure(i, call.look, block, from_index(statistics, 4 * p))
+    _block_sums(pixels, counts, block.by_key, block.rows, call.value, dv, block.query)
+    for i in range(pixels):
+        _pack(_of(block.query, i), dv, out, (first + i) * dv)
 
-    counts: np.ndarray
-    rows: np.ndarray
-    by_key: np.ndarray
-    by_value: np.ndarray
+
+@compiled
+def _weigh(p, slot, call, biased, block):
+    """From the inner products of pixel p's taps to their weights, in the same place; gives the logarithm of
+    the sum of exponentials."""
+    look, by_tap = call.look, _of(block.by_key, slot)
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
+    logsum = zero(by_tap) - np.float32(np.inf)
+    if n > 0:
+        _score(p, slot, call, biased, block)
+        logsum = _softmax(n, samples)
+    if logsum == -np.inf:
+        block.tap_counts[slot] = 0
+    else:
+        _distribute(n, block.tap_counts[slot], look, samples, samples.weight, by_tap)
+    return logsum
 
 
 @compiled
@@ -945,18 +1287,21 @@ def _six(statistics, upstream):
 
 
 @compiled
-def _move(n, p, look, samples, taps, statistics, upstream, out):
+def _move(p, slot, look, block, statistics, upstream, out):
     """Gradients by the positions of the samples, and by the points that made them."""
+    samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
+    by_key, by_value = _of(block.by_key, slot), _of(block.by_value, slot)
     nothing = zero(upstream)
     centre_x, centre_y, spread, gx, gy, gspread = _six(statistics, upstream)
     pull = gspread / spread if spread > 0 else nothing
     x0 = y0 = x1 = y1 = nothing
+    course = _course(n, samples)
     for j in range(n):
         x, y, w = samples.x[j], samples.y[j], samples.weight[j]
         dx, dy = w * (gx + pull * (x - centre_x)), w * (gy + pull * (y - centre_y))
         if not look.nearest:
-            kx, ky = _slopes(j, samples, taps.by_key)
-            vx, vy = _slopes(j, samples, taps.by_value)
+            kx, ky = _slopes(j, course, samples, by_key)
+            vx, vy = _slopes(j, course, samples, by_value)
             dx += samples.score_slope[j] * kx + w * vx if (x >= nothing) & (x <= look.last_x) else nothing
             dy += samples.score_slope[j] * ky + w * vy if (y >= nothing) & (y <= look.last_y) else nothing
         i = samples.index[j]
@@ -971,80 +1316,87 @@ def _move(n, p, look, samples, taps, statistics, upstream, out):
 
 
 @compiled(nogil=True, cache=True)
-def backward(
-    query,
-    key,
-    value,
-    look,
-    bias,
-    channels,
-    value_channels,
-    logsum,
-    statistics,
-    value_upstream,
-    statistics_upstream,
-    integers,
-    numbers,
-    first,
-    last,
-    scratch_first,
-    stride,
-    scratch,
-    query_out,
-    points_out,
-    bias_out,
-):
-    """The alpha pixels first .. last: gradients by query, points and bias, and what `scatter` needs for the
-    rest.
-
-    Outputs that are not wanted have length 0; points_out and bias_out come zeroed.
-    """
-    biased, wants_query, wants_points = len(bias) > 0, len(query_out) > 0, len(points_out) > 0
-    look, query, key, value, bias = _look(look), pointer(query), pointer(key), pointer(value), pointer(bias)
-    statistics, value_upstream = pointer(statistics), pointer(value_upstream)
-    statistics_upstream, query_out, points_out = (
-        pointer(statistics_upstream),
-        pointer(query_out),
-        pointer(points_out),
+def backward(call, saved, share, scratch, gradients):
+    """Gradients of a share of alpha's pixels, and what `scatter` needs for those of beta's."""
+    biased = len(call.bias) > 0
+    block, counter, call = _block(call, share), pointer(share.counter), _call(call)
+    step = 4 if len(saved.statistics) > 4 else 0
+    saved = Saved(
+        pointer(saved.statistics),
+        pointer(saved.logsum),
+        pointer(saved.value_upstream),
+        pointer(saved.statistics_upstream),
     )
-    counts, rows = pointer(scratch.counts), pointer(scratch.rows)
-    by_key, by_value = pointer(scratch.by_key), pointer(scratch.by_value)
-    samples, taps, q, _ = _room(look.samples, integers, numbers)
-    for p in range(first, last):
-        slot = p - scratch_first
-        _unpack(query, p * channels, channels, q)
-        n, m = 0, 0
-        if logsum[p] > -np.inf:
-            n, m = _score(p, q, key, channels, look, bias, biased, samples, taps)
-        counts[slot] = m
-        if n == 0:
-            if wants_query:
-                _fill(q, 0, channels, zero(q))
-                _pack(q, channels, query_out, p * channels)
-            continue
-        _exponentiate(n, samples, logsum[p])
-        _unpack(value_upstream, p * value_channels, value_channels, q)
-        inner_products(q, taps.row, m, value, value_channels, taps.by_value)
-        _interpolate(n, m, look, samples, taps.by_value, samples.slope)
-        _blame(n, samples, from_index(statistics, 4 * p), from_index(statistics_upstream, 4 * p))
-        if wants_points:
-            _move(
-                n,
-                p,
-                look,
-                samples,
-                taps,
-                from_index(statistics, 4 * p),
-                from_index(statistics_upstream, 4 * p),
-                points_out,
-            )
-        if len(bias_out) > 0:
-            for j in range(n):
-                bias_out[p * look.samples + samples.index[j]] = samples.score_slope[j]
-        _distribute(n, m, look, samples, samples.weight, from_index(by_value, slot * stride))
-        _distribute(n, m, look, samples, samples.score_slope, from_index(by_key, slot * stride))
-        for t in range(m):
-            rows[slot * stride + t] = taps.row[t]
-        if wants_query:
-            weighted_sum(from_index(by_key, slot * stride), taps.row, m, key, channels, channels, q)
-            _pack(q, channels, query_out, p * channels)
+    begin = share.first + take(counter) * share.size
+    while begin < share.last:
+        end = min(begin + share.size, share.last)
+        for first in range(begin, end, BLOCK):
+            _backward(first, min(BLOCK, end - first), call, biased, saved, step, block, scratch, gradients)
+        begin = share.first + take(counter) * share.size
+
+
+@compiled
+def _backward(first, pixels, call, biased, saved, step, block, scratch, gradients):
+    """A block of alpha's pixels."""
+    d, dv = call.channels, call.value_channels
+    block, by_key, by_value = _left(first, block, scratch)
+    for i in range(pixels):
+        p = first + i
+        _unpack(call.query, p * d, d, _of(block.query, i))
+        _unpack(saved.value_upstream, p * dv, dv, _of(block.upstream, i))
+        block.tap_counts[i] = 0
+        if saved.logsum[p] > -np.inf:
+            _find(p, i, call.look, block)
+    _block_products(pixels, block.tap_counts, block.query, block.rows, call.key, d, block.by_key)
+    _block_products(pixels, block.tap_counts, block.upstream, block.rows, call.value, dv, block.by_value)
+    for i in range(pixels):
+        if block.tap_counts[i] > 0:
+            _blame_pixel(first + i, i, call, biased, saved, step, block, gradients)
+            _leave(i, call.look, block, _of(by_key, i), _of(by_value, i))
+    if len(gradients.query) > 0:
+        _block_sums(pixels, block.tap_counts, by_key, block.rows, call.key, d, block.query)
+        for i in range(pixels):
+            _pack(_of(block.query, i), d, pointer(gradients.query), (first + i) * d)
+
+
+@compiled
+def _left(first, block, scratch):
+    """A block whose taps are put where `scatter` finds them, and where their weights go."""
+    i, stride = first - scratch.first, scratch.stride
+    block = Block(
+        block.sample_counts,
+        from_index(pointer(scratch.counts), i),
+        block.integers,
+        block.numbers,
+        Column(from_index(pointer(scratch.rows), i * stride), stride),
+        block.by_key,
+        block.by_value,
+        block.query,
+        block.upstream,
+    )
+    by_key = Column(from_index(pointer(scratch.by_key), i * stride), stride)
+    return block, by_key, Column(from_index(pointer(scratch.by_value), i * stride), stride)
+
+
+@compiled
+def _blame_pixel(p, slot, call, biased, saved, step, block, gradients):
+    """Pixel p's weights again, and the gradients by them, by the scores, by points and bias."""
+    samples, n = _samples(block, slot, call.look.samples), block.sample_counts[slot]
+    statistics, upstream = from_index(saved.statistics, step * p), from_index(saved.statistics_upstream, step * p)
+    _score(p, slot, call, biased, block)
+    _exponentiate(n, samples, saved.logsum[p])
+    _interpolate(n, block.tap_counts[slot], call.look, samples, _of(block.by_value, slot), samples.slope)
+    _blame(n, samples, statistics, upstream)
+    if len(gradients.points) > 0:
+        _move(p, slot, call.look, block, statistics, upstream, pointer(gradients.points))
+    if len(gradients.bias) > 0:
+        for j in range(n):
+            gradients.bias[p * call.look.samples + samples.index[j]] = samples.score_slope[j]
+
+
+@compiled
+def _leave(slot, look, block, by_key, by_value):
+    """What `scatter` needs of a pixel."""
+    samples, n, m = _samples(block, slot, look.samples), block.sample_counts[slot], block.tap_counts[slot]
+    _distribute(n, m, look, samples, samples.weight, by_value)
+    _distribute(n, m, look, samples, samples.score_slope, by_key)

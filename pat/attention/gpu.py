@@ -29,7 +29,7 @@ FIXED_BITS = 61
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool
+    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `cpu.forward`."""
     b, _, ha, wa = query.shape
@@ -39,7 +39,7 @@ def forward(
     logsum = query.new_empty(b, ha, wa, dtype=counted)
     inputs, options = _call(query, key, value, look, bias, nearest)
     _forward[_programs(query)](*inputs, out, statistics, logsum, **options)
-    return out.permute(0, 3, 1, 2), statistics, logsum
+    return out.permute(0, 3, 1, 2), statistics if measured else statistics.new_empty(0), logsum
 
 
 def backward(
@@ -56,7 +56,10 @@ def backward(
     """As `cpu.backward`."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
-    upstream, statistics_upstream = _channels_last(cotangents[0]), cotangents[1].to(counted).contiguous()
+    upstream = _channels_last(cotangents[0])
+    statistics, statistics_upstream = (
+        t.contiguous() if t.numel() else t.new_zeros(b, ha, wa, 4) for t in (saved[0], cotangents[1].to(counted))
+    )
     fixed = torch.are_deterministic_algorithms_enabled()
     scales = _scales(query, key, value, upstream, statistics_upstream) if fixed else query.new_ones(2, dtype=counted)
     sums = torch.int64 if fixed else counted
@@ -67,7 +70,7 @@ def backward(
     inputs, options = _call(query, key, value, look, bias, nearest)
     _backward[_programs(query)](
         *inputs,
-        *(saved[0], saved[1], upstream, statistics_upstream, scales),
+        *(statistics, saved[1], upstream, statistics_upstream, scales),
         *(query_out, *pictures, points_out, bias_out),
         **options,
         WANTS_BIAS=wanted[4],
@@ -319,6 +322,87 @@ def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, sc
 
 
 @compiled
+def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
+    """Of some pixels: mean x and y, and the gradients by them, by the peak, and by the spread over the spread."""
+    mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
+    mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
+    spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)
+    gx = tl.load(statistics_upstream + 4 * p, mask=alive, other=0)
+    gy = tl.load(statistics_upstream + 4 * p + 1, mask=alive, other=0)
+    pull = tl.load(statistics_upstream + 4 * p + 2, mask=alive, other=0)
+    pull = tl.where(spread > 0, pull / tl.where(spread > 0, spread, 1.0), 0.0).to(NUMBER)
+    gpeak = tl.load(statistics_upstream + 4 * p + 3, mask=alive, other=0)
+    return mean_x, mean_y, gx, gy, gpeak, pull
+
+
+@compiled
+def _weight(q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER):
+    """Sample i's inner products with the key around, its score, and its weight."""
+    live = counts[:, None] & (c < D)[None, :]
+    s0, s1, s2, s3 = _dots(q, key, pixel, across, below, c, D, live, NEAREST, NUMBER)
+    score = _blend(s0, s1, s2, s3, u, v)
+    if BIASED:
+        score += tl.load(bias + p * samples + i, mask=alive, other=0)
+    w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
+    return s0, s1, s2, s3, score, w
+
+
+@compiled
+def _slope(v0, v1, v2, v3, u, v, x, y, mean_x, mean_y, gx, gy, pull):
+    """The gradient by a sample's weight, the peak's part left out."""
+    away = (x - mean_x) * (x - mean_x) + (y - mean_y) * (y - mean_y)
+    return _blend(v0, v1, v2, v3, u, v) + gx * x + gy * y + 0.5 * pull * away
+
+
+@compiled
+def _by_position(s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height, width):
+    """The gradient by a bilinear sample's x and y, that of the statistics left out."""
+    across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)
+    across_v = (1 - v) * (v1 - v0) + v * (v3 - v2)
+    below_s = (1 - u) * (s2 - s0) + u * (s3 - s1)
+    below_v = (1 - u) * (v2 - v0) + u * (v3 - v1)
+    dx = tl.where((x >= 0) & (x <= width - 1), by_score * across_s + w * across_v, 0.0)
+    dy = tl.where((y >= 0) & (y <= height - 1), by_score * below_s + w * below_v, 0.0)
+    return dx, dy
+
+
+@compiled
+def _mean_slope(
+    q, g, key, value, points, mask, fractions, bias, statistics, statistics_upstream, p, place, first, alive, lse,
+    height, width, samples, c, cv, D, DV, PIXELS: tl.constexpr, STRAIGHT, NEAREST, BIASED, NUMBER: tl.constexpr,
+):  # fmt: skip
+    """The first walk: the mean of the gradients by the weights, and which sample weighs most."""
+    mean_x, mean_y, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
+    best = tl.zeros([PIXELS], tl.int32)
+    most = tl.full([PIXELS], float("-inf"), NUMBER)
+    at_best = tl.zeros([PIXELS], NUMBER)
+    mean = tl.zeros([PIXELS], NUMBER)
+    for i in range(samples):
+        x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
+        pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
+        pixel += first
+        _, _, _, _, score, w = _weight(
+            q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
+        )
+        live = counts[:, None] & (cv < DV)[None, :]
+        v0, v1, v2, v3 = _dots(g, value, pixel, across, below, cv, DV, live, NEAREST, NUMBER)
+        mean += w * _slope(v0, v1, v2, v3, u, v, x, y, mean_x, mean_y, gx, gy, pull)
+        better = counts & (score > most)
+        best = tl.where(better, i, best)
+        most = tl.where(better, score, most)
+        at_best = tl.where(better, w, at_best)
+    return mean + gpeak * at_best, best
+
+
+@compiled
+def _store_points(out, p, alive, x_start, y_start, x_end, y_end):
+    tl.store(out + 4 * p, x_start, mask=alive)
+    tl.store(out + 4 * p + 1, y_start, mask=alive)
+    tl.store(out + 4 * p + 2, x_end, mask=alive)
+    tl.store(out + 4 * p + 3, y_end, mask=alive)
+
+
+@compiled
 def _backward(
     query,
     key,
@@ -365,84 +449,43 @@ def _backward(
     lse = tl.load(logsum + p, mask=alive, other=float("-inf"))
     alive = alive & (lse > float("-inf"))
     lse = tl.where(alive, lse, 0.0)
-    mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
-    mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
-    spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)
-    gx = tl.load(statistics_upstream + 4 * p, mask=alive, other=0)
-    gy = tl.load(statistics_upstream + 4 * p + 1, mask=alive, other=0)
-    gpeak = tl.load(statistics_upstream + 4 * p + 3, mask=alive, other=0)
-    pull = tl.load(statistics_upstream + 4 * p + 2, mask=alive, other=0)
-    pull = tl.where(spread > 0, pull / tl.where(spread > 0, spread, 1.0), 0.0).to(NUMBER)
-    best = tl.zeros([PIXELS], tl.int32)
-    most = tl.full([PIXELS], float("-inf"), NUMBER)
-    at_best = tl.zeros([PIXELS], NUMBER)
-    mean = tl.zeros([PIXELS], NUMBER)
+    mean, best = _mean_slope(
+        q, g, key, value, points, mask, fractions, bias, statistics, statistics_upstream, p, place, first, alive, lse,
+        height, width, samples, c, cv, D, DV, PIXELS, STRAIGHT, NEAREST, BIASED, NUMBER,
+    )  # fmt: skip
+    mean_x, mean_y, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
     key_scale, value_scale = tl.load(scales).to(tl.float64), tl.load(scales + 1).to(tl.float64)
-    for i in range(samples):
-        x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
-        pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
-        live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
-        s0, s1, s2, s3 = _dots(q, key, first + pixel, across, below, c, D, live, NEAREST, NUMBER)
-        v0, v1, v2, v3 = _dots(g, value, first + pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
-        score = _blend(s0, s1, s2, s3, u, v)
-        if BIASED:
-            score += tl.load(bias + p * samples + i, mask=alive, other=0)
-        w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
-        away = (x - mean_x) * (x - mean_x) + (y - mean_y) * (y - mean_y)
-        mean += w * (_blend(v0, v1, v2, v3, u, v) + gx * x + gy * y + 0.5 * pull * away)
-        better = counts & (score > most)
-        best = tl.where(better, i, best)
-        most = tl.where(better, score, most)
-        at_best = tl.where(better, w, at_best)
-    mean += gpeak * at_best
     by_query = tl.zeros([PIXELS, D_BLOCK], NUMBER)
-    x_start, y_start, x_end, y_end = (
-        tl.zeros([PIXELS], NUMBER),
-        tl.zeros([PIXELS], NUMBER),
-        tl.zeros([PIXELS], NUMBER),
-        tl.zeros([PIXELS], NUMBER),
-    )
+    x_start, y_start = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
+    x_end, y_end = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
     for i in range(samples):
         x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
         pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
+        pixel += first
         live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
-        s0, s1, s2, s3 = _dots(q, key, first + pixel, across, below, c, D, live, NEAREST, NUMBER)
-        v0, v1, v2, v3 = _dots(g, value, first + pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
-        score = _blend(s0, s1, s2, s3, u, v)
-        if BIASED:
-            score += tl.load(bias + p * samples + i, mask=alive, other=0)
-        w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
-        away = (x - mean_x) * (x - mean_x) + (y - mean_y) * (y - mean_y)
-        slope = _blend(v0, v1, v2, v3, u, v) + gx * x + gy * y + 0.5 * pull * away
-        slope += tl.where(best == i, gpeak, 0.0)
+        s0, s1, s2, s3, _, w = _weight(
+            q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
+        )
+        v0, v1, v2, v3 = _dots(g, value, pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
+        slope = _slope(v0, v1, v2, v3, u, v, x, y, mean_x, mean_y, gx, gy, pull) + tl.where(best == i, gpeak, 0.0)
         by_score = w * (slope - mean)
-        row = _blended(key, first + pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
-        by_query += by_score[:, None] * row
-        _add_around(key_out, first + pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED)
-        _add_around(value_out, first + pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)
+        by_query += by_score[:, None] * _blended(key, pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
+        _add_around(key_out, pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED)
+        _add_around(value_out, pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)
         dx, dy = w * (gx + pull * (x - mean_x)), w * (gy + pull * (y - mean_y))
         if not NEAREST:
-            across_s = (1 - v) * (s1 - s0) + v * (s3 - s2)
-            across_v = (1 - v) * (v1 - v0) + v * (v3 - v2)
-            below_s = (1 - u) * (s2 - s0) + u * (s3 - s1)
-            below_v = (1 - u) * (v2 - v0) + u * (v3 - v1)
-            dx += tl.where((x >= 0) & (x <= width - 1), by_score * across_s + w * across_v, 0.0)
-            dy += tl.where((y >= 0) & (y <= height - 1), by_score * below_s + w * below_v, 0.0)
+            more_x, more_y = _by_position(s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height, width)
+            dx, dy = dx + more_x, dy + more_y
         if WANTS_BIAS:
             tl.store(bias_out + p * samples + i, by_score, mask=counts)
         if STRAIGHT:
             f = tl.load(fractions + i)
-            x_start += (1 - f) * dx
-            y_start += (1 - f) * dy
-            x_end += f * dx
-            y_end += f * dy
+            x_start, y_start = x_start + (1 - f) * dx, y_start + (1 - f) * dy
+            x_end, y_end = x_end + f * dx, y_end + f * dy
         else:
             tl.store(points_out + 2 * (p * samples + i), dx, mask=counts)
             tl.store(points_out + 2 * (p * samples + i) + 1, dy, mask=counts)
     if STRAIGHT:
-        tl.store(points_out + 4 * p, x_start, mask=alive)
-        tl.store(points_out + 4 * p + 1, y_start, mask=alive)
-        tl.store(points_out + 4 * p + 2, x_end, mask=alive)
-        tl.store(points_out + 4 * p + 3, y_end, mask=alive)
+        _store_points(points_out, p, alive, x_start, y_start, x_end, y_end)
     live = (p < pixels)[:, None] & (c < D)[None, :]
     tl.store(query_out + p[:, None] * D + c[None, :], by_query.to(query_out.dtype.element_ty), mask=live)

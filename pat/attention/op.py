@@ -1,7 +1,7 @@
 """The compiled backends as one operator of torch, `pat::attend`, with its gradient, `pat::attend_backward`.
 
 Both are registered with shapes and derivatives, so that torch.compile and autograd see through them. Saved
-for backward are the inputs, four statistics and one log of a sum of exponentials per alpha pixel. The
+for backward are the inputs, one log of a sum of exponentials per alpha pixel, and four statistics if asked. The
 gradient of the gradient is the reference's.
 """
 
@@ -17,7 +17,7 @@ from pat.attention.reference import Attended, Look
 
 INPUTS = "Tensor query, Tensor key, Tensor value, Tensor points, Tensor mask, Tensor? bias"
 SAVED = "Tensor statistics, Tensor logsum, Tensor value_cotangent, Tensor statistics_cotangent"
-OPTIONS = "int samples, bool straight, bool nearest, str backend, bool strict"
+OPTIONS = "int samples, bool straight, bool nearest, bool measured, str backend, bool strict"
 
 
 def attend(
@@ -28,14 +28,18 @@ def attend(
     bias: Tensor | None,
     nearest: bool,
     *,
+    measured: bool,
     backend: str,
     strict: bool,
 ) -> Attended:
-    """As `reference.attend`, by the `cpu` or the `triton` backend. `strict`: no second order by the
-    reference."""
+    """As `reference.attend`, by the `cpu` or the `triton` backend; without statistics if not `measured`.
+    `strict`: no second order by the reference."""
     out, statistics, _ = _attend(
-        query, key, value, look.points, look.mask, bias, look.samples, look.straight, nearest, backend, strict
+        *(query, key, value, look.points, look.mask, bias),
+        *(look.samples, look.straight, nearest, measured, backend, strict),
     )
+    if not measured:
+        return Attended(out, statistics, statistics, statistics)
     return Attended(out, statistics[..., :2].permute(0, 3, 1, 2), statistics[..., 2], statistics[..., 3])
 
 
@@ -61,18 +65,19 @@ def _attend(
     samples: int,
     straight: bool,
     nearest: bool,
+    measured: bool,
     backend: str,
     strict: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     look = Look(points, mask, samples, straight)
-    return _kernels(backend).forward(query, key, value, look, bias, nearest)
+    return _kernels(backend).forward(query, key, value, look, bias, nearest, measured)
 
 
 @_attend.register_fake
-def _(query, key, value, points, mask, bias, samples, straight, nearest, backend, strict):
+def _(query, key, value, points, mask, bias, samples, straight, nearest, measured, backend, strict):
     b, _, ha, wa = query.shape
     out = query.new_empty(b, ha, wa, value.shape[1]).permute(0, 3, 1, 2)
-    return out, points.new_empty(b, ha, wa, 4), points.new_empty(b, ha, wa)
+    return out, points.new_empty((b, ha, wa, 4) if measured else 0), points.new_empty(b, ha, wa)
 
 
 @torch.library.custom_op(
@@ -94,6 +99,7 @@ def _attend_backward(
     samples: int,
     straight: bool,
     nearest: bool,
+    measured: bool,
     backend: str,
     strict: bool,
     wanted: list[bool],
@@ -156,7 +162,7 @@ def _keep_again(ctx, inputs, output) -> None:
 
 def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: of the reference's gradient, made anew with a graph."""
-    samples, straight, nearest, backend, strict, wanted = ctx.options
+    samples, straight, nearest, measured, backend, strict, wanted = ctx.options
     if strict:
         raise RuntimeError(f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'")
     query, key, value, points, mask, bias, _, _, *upstream = (
@@ -165,8 +171,9 @@ def _differentiate_again(ctx, *cotangents):
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
     with torch.enable_grad():
         out = reference.attend(query, key, value, Look(points, mask, samples, straight), bias, nearest)
-        outputs = [out.value, _side_by_side(out)]
-        first = torch.autograd.grad(outputs, inputs, upstream, create_graph=True, materialize_grads=True)
+        outputs = [out.value, _side_by_side(out)] if measured else [out.value]
+        given = upstream[: len(outputs)]
+        first = torch.autograd.grad(outputs, inputs, given, create_graph=True, materialize_grads=True)
         cotangents = [c for c, want in zip(cotangents, wanted) if want]
         leaves = [t for t in (query, key, value, points, bias, *upstream) if t is not None]
         outputs, cotangents = zip(*[(f, c) for f, c in zip(first, cotangents) if f.requires_grad])

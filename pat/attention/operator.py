@@ -58,9 +58,9 @@ def attend(
         key: features of beta that the query is compared with.
         value: features of beta that are returned.
         look: where to look in beta, for each alpha pixel: Segments or Positions with the leading axes (Ha,
-            Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to either, which is called on
-            one piece of alpha at a time and again in backward, so that not all explicit positions exist at
-            once.
+            Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to either, with the leading axes
+            (n) or (B, n), which is called on one piece of alpha at a time and again in backward, so that not
+            all explicit positions exist at once.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
@@ -73,9 +73,7 @@ def attend(
         TypeError: not Segments or Positions; dtypes that differ or are not supported.
         RuntimeError: an explicit backend that cannot serve.
     """
-    return attend_with_statistics(
-        query, key, value, look, samples=samples, interpolation=interpolation, bias=bias, backend=backend
-    ).value
+    return _attend(query, key, value, look, samples, interpolation, bias, backend, measured=False).value
 
 
 def attend_with_statistics(
@@ -93,17 +91,33 @@ def attend_with_statistics(
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
+    return _attend(query, key, value, look, samples, interpolation, bias, backend, measured=True)
+
+
+def _attend(
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    look: Where | Callable[[Tensor], Where],
+    samples: int | None,
+    interpolation: Interpolation,
+    bias: Tensor | None,
+    backend: Backend,
+    *,
+    measured: bool,
+) -> Attended:
+    """The statistics are of no length if not `measured`, but for the reference's."""
     query, key, value = _autocast(query, key, value)
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
 
     def run(q: Tensor, k: Tensor, v: Tensor, where: Where, part: Tensor | None) -> Attended:
         form = _form(where, q, samples)
-        return _run(q, k, v, form, _bias(part, q, form.samples), nearest, backend)
+        return _run(q, k, v, form, _bias(part, q, form.samples), nearest, backend, measured)
 
     if not callable(look):
         return run(query, key, value, look, bias)
-    return _attend_chunks(query, key, value, look, bias, run)
+    return _attend_chunks(query, key, value, look, bias, run, measured)
 
 
 def _autocast(*tensors: Tensor) -> list[Tensor]:
@@ -175,11 +189,13 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
         raise ValueError(f"bias {tuple(bias.shape)} does not broadcast to {(b, ha, wa, samples)}") from None
 
 
-def _run(q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend) -> Attended:
+def _run(
+    q: Tensor, k: Tensor, v: Tensor, look: Look, bias: Tensor | None, nearest: bool, backend: Backend, measured: bool
+) -> Attended:
     chosen = _choose(backend, q.device.type)
     if chosen == "reference":
         return reference.attend(q, k, v, look, bias, nearest)
-    return op.attend(q, k, v, look, bias, nearest, backend=chosen, strict=backend != "auto")
+    return op.attend(q, k, v, look, bias, nearest, measured=measured, backend=chosen, strict=backend != "auto")
 
 
 def _choose(backend: Backend, device: str) -> str:
@@ -203,6 +219,7 @@ def _attend_chunks(
     look: Callable[[Tensor], Where],
     bias: Tensor | None,
     run: Callable[..., Attended],
+    measured: bool,
 ) -> Attended:
     """Asks `look` for a piece of alpha at a time.
 
@@ -220,10 +237,10 @@ def _attend_chunks(
         where = look(_pixel_rows(top, top + q.shape[2], wa, q))
         if not isinstance(where, Positions):
             raise TypeError(f"look returned Positions for some pixels and {type(where)} for others")
-        where = Positions(where.xy.unflatten(0, (-1, wa)), where.mask.unflatten(0, (-1, wa)))
+        where = Positions(where.xy.unflatten(-3, (-1, wa)), where.mask.unflatten(-2, (-1, wa)))
         return run(q, k, v, where, part)
 
-    step = max(1, CHUNK_SAMPLES // (wa * first.xy.shape[-2]))
+    step = max(1, CHUNK_SAMPLES // (first.xy.numel() // 2))
     chunks = [
         checkpoint(
             chunk,
@@ -237,6 +254,8 @@ def _attend_chunks(
         for top in range(0, ha, step)
     ]
     values, positions, spreads, peaks = zip(*chunks)
+    if not measured:
+        return chunks[0]._replace(value=torch.cat(values, 2))
     return Attended(torch.cat(values, 2), torch.cat(positions, 2), torch.cat(spreads, 1), torch.cat(peaks, 1))
 
 
@@ -255,8 +274,9 @@ def _all_segments(look: Callable[[Tensor], Where], query: Tensor) -> Segments:
     ha, wa = query.shape[2:]
     step = max(1, CHUNK_PIXELS // wa)
     parts = [look(_pixel_rows(top, min(top + step, ha), wa, query)) for top in range(0, ha, step)]
-    start, end, valid = (torch.cat([getattr(p, name) for p in parts]) for name in ("start", "end", "valid"))
-    return Segments(start.unflatten(0, (ha, wa)), end.unflatten(0, (ha, wa)), valid.unflatten(0, (ha, wa)))
+    axes = {"start": -2, "end": -2, "valid": -1}
+    whole = {name: torch.cat([getattr(p, name) for p in parts], axis) for name, axis in axes.items()}
+    return Segments(**{name: t.unflatten(axes[name], (ha, wa)) for name, t in whole.items()})
 
 
 def _bias_rows(bias: Tensor | None, top: int, step: int) -> Tensor | None:

@@ -1,5 +1,6 @@
 """Pairs and arrays on disk."""
 
+from pat.data.indices import agreement, index_files, read_indices, write_indices
 from pat.data.pairs import (
     PAPER_DISPARITY,
     Calibration,
@@ -11,19 +12,33 @@ from pat.data.pairs import (
     middlebury_pairs,
     syntim_pairs,
 )
+from pat.data.patches import Patches, scene_folders
 from pat.data.protocol import MonoColourTask, mono_colour_task, reduce_by
+from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
 
 __all__ = [
     "PAPER_DISPARITY",
     "Calibration",
     "Disparity",
     "MonoColourTask",
+    "Patch",
+    "Patches",
+    "RenderedScenes",
+    "ScenePatches",
+    "SceneShuffle",
     "StereoPair",
+    "agreement",
+    "collate",
+    "default_chains",
     "flickr_pairs",
     "folder_pairs",
+    "index_files",
     "kitti_pairs",
     "middlebury_pairs",
     "mono_colour_task",
+    "read_indices",
     "reduce_by",
+    "scene_folders",
     "syntim_pairs",
+    "write_indices",
 ]

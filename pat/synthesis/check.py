@@ -1,17 +1,25 @@
-"""Is a rendered array true? Depth and cameras of one view must foretell what the others see."""
+"""Is a rendered array true, and worth having? Depth and cameras of one view must foretell what the others see."""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from itertools import permutations
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
+from arraygeom.camera import Camera, Projected
 from arraygeom.pixels import pixel_grid
+from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
 from .layered import ArrayBatch
+from .rendered import Frame
+from .surfaces import depth_between
 
 
 class Across(NamedTuple):
@@ -30,10 +38,195 @@ def look_across(batch: ArrayBatch, alpha: int = 0, beta: int = 1, *, tolerance: 
     """
     a, b = batch.cameras[alpha], batch.cameras[beta]
     grid = pixel_grid(a.hw, device=batch.images[alpha].device).flatten(0, 1).expand(len(a.K), -1, 2)
-    X = a.unproject(grid, batch.depth[alpha].flatten(1))
-    x, depth, in_front = b.project(X)
+    x, depth, in_front = foretell(a, grid, batch.depth[alpha].flatten(1), b)
     seen = sample(torch.cat([batch.images[beta], 1 / batch.depth[beta][:, None]], 1), x)
     same = (seen.values[:, 3] * depth - 1).abs() < tolerance
     visible = in_front & seen.valid & same
     h, w = a.hw
     return Across(x.unflatten(1, (h, w)), visible.unflatten(1, (h, w)), seen.values[:, :3].unflatten(2, (h, w)))
+
+
+def foretell(alpha: Camera, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"], beta: Camera) -> Projected:
+    """Where and how far away beta must see what alpha sees at pixels x at a depth."""
+    return beta.project(alpha.unproject(x, depth))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Limits:
+    """What a rendered scene must keep to.
+
+    `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its pixel on
+    the way there and back by both depths; `shift` bounds the displacement, in pixels, of the colours that are
+    foretold; `contradicted` the share of points where a view looks through a surface
+    that another one sees. `dark` and `bright` bound the share of pixels below 0.004 and above 1 in all colours.
+    `texture` is the least share of 8x8 patches with contrast above 2 %, `overlap` the least share of a view's
+    pixels that some other view sees.
+    """
+
+    error: float = 0.02
+    shift: float = 0.25
+    contradicted: float = 0.01
+    dark: float = 0.5
+    bright: float = 0.25
+    texture: float = 0.3
+    overlap: float = 0.1
+
+
+@dataclass(frozen=True, kw_only=True)
+class Report:
+    """Figures by view and by "alpha > beta", and what is wrong (nothing if accepted)."""
+
+    views: dict[str, dict[str, float]] = field(default_factory=dict)
+    pairs: dict[str, dict[str, float]] = field(default_factory=dict)
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def accepted(self) -> bool:
+        """Whether nothing is wrong."""
+        return not self.reasons
+
+    def to_document(self) -> dict[str, Any]:
+        """For a file: `accepted`, `reasons`, `views`, `pairs`."""
+        return {"accepted": self.accepted, "reasons": list(self.reasons), "views": self.views, "pairs": self.pairs}
+
+
+def check_views(rig: Rig, frames: Mapping[str, Frame], limits: Limits | None = None) -> Report:
+    """Check one frame of every camera against each other and against the limits.
+
+    Pairs of frames of different times are left out.
+    """
+    limits = limits or Limits()
+    views = {name: view_figures(frame) for name, frame in frames.items()}
+    together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
+    pairs = {f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b]) for a, b in together}
+    reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
+    reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
+    reasons += _overlap_reasons(pairs, {a for a, _ in together}, limits)
+    return Report(views=views, pairs=pairs, reasons=tuple(reasons))
+
+
+def view_figures(frame: Frame) -> dict[str, float]:
+    """Brightness, texture and depths of one picture."""
+    there = frame.depth.isfinite()
+    depths = frame.depth[there] if there.any() else frame.depth.new_tensor([torch.inf])
+    figures = {
+        "mean": frame.rgb.mean(),
+        "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
+        "bright": (frame.rgb.amin(0) > 1).float().mean(),
+        "texture": texture(frame.rgb),
+        "covered": there.float().mean(),
+        "near": depths.min(),
+        "far": depths.max(),
+    }
+    return _rounded(figures)
+
+
+def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
+    """The share of patches whose luminance deviates by more than 2 % of its mean."""
+    luminance = rgb.mean(0)[None, None].clamp(0, 1)
+    mean = avg_pool2d(luminance, min(patch, *rgb.shape[1:]))
+    square = avg_pool2d(luminance**2, min(patch, *rgb.shape[1:]))
+    deviation = (square - mean**2).clamp(min=0).sqrt()
+    return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
+
+
+def pair_figures(alpha: Camera, here: Frame, beta: Camera, there: Frame, *, most: int = 200_000) -> dict[str, float]:
+    """How well alpha's depth foretells beta's view, at up to `most` pixels.
+
+    `inside` is the share of alpha's pixels whose points are on beta's picture; of all, `visible` are seen there,
+    `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside an edge in beta
+    are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's pixels. `colour` is the
+    median difference of their colours, relative to their brightness, `shift` how many pixels one picture is displaced
+    against the other by all of these differences together.
+    """
+    alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
+    x, depth, index = _chosen(here, most)
+    ahead = foretell(alpha, x, depth, beta)
+    inside = ahead.valid & beta.contains(ahead.x.nan_to_num(-1e9))
+    if not inside.any():
+        return {"inside": 0.0, "visible": 0.0, "hidden": 0.0, "contradicted": 0.0}
+    total, x, index = len(depth), x[inside], index[inside]
+    target, foretold = ahead.x[inside], ahead.depth[inside]
+    recorded, clean = depth_between(there.depth, there.index, target)
+    clean = clean & recorded.isfinite()
+    recorded = torch.where(clean, recorded, foretold)
+    back = foretell(beta, target, recorded, alpha)
+    error = (back.x - x).norm(dim=-1)
+    visible = clean & back.valid & (error < 1)
+    nearer = recorded < foretold
+    figures = {
+        "inside": inside.double().mean(),
+        "visible": visible.sum() / total,
+        "hidden": (clean & ~visible & nearer).sum() / total,
+        "contradicted": (clean & ~visible & ~nearer).sum() / total,
+    }
+    if visible.any():
+        figures |= dict(zip(("median", "p95", "p99"), error[visible].quantile(error.new_tensor([0.5, 0.95, 0.99]))))
+        figures["colour"], figures["shift"] = _compared(here, x[visible], there, target[visible])
+    return _rounded(figures)
+
+
+def _chosen(frame: Frame, most: int) -> tuple[Tensor, Tensor, Tensor]:
+    """Pixels that see something, evenly thinned: x (n, 2), depth and index."""
+    grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
+    there = frame.depth.isfinite()
+    step = max(1, int(there.sum()) // most)
+    return grid[there][::step], frame.depth[there][::step].double(), frame.index[there][::step]
+
+
+def _compared(
+    here: Frame, x: Float[Tensor, "n 2"], there: Frame, target: Float[Tensor, "n 2"]
+) -> tuple[Tensor, Tensor]:
+    """Median difference of colours, and the shift of one picture against the other that explains most of it."""
+    slopes = torch.cat(torch.gradient(here.rgb, dim=(-1, -2)))[None]
+    mine, dx, dy = sample(torch.cat([here.rgb[None], slopes], 1).double(), x[None]).values[0].split(3)
+    difference = sample(there.rgb[None].double(), target[None]).values[0] - mine
+    size = difference.abs().mean(0)
+    keep = size <= 3 * size.median()
+    A = torch.stack([dx[:, keep], dy[:, keep]], -1).flatten(0, 1)
+    normal = A.T @ A + 1e-9 * torch.eye(2, dtype=A.dtype)
+    shift = torch.linalg.solve(normal, A.T @ difference[:, keep].flatten())
+    return (size / mine.mean(0).clamp(min=0.01)).median(), shift.norm()
+
+
+def _camera(rig: Rig, name: str) -> Camera:
+    camera = rig[name]
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera '{name}' is not calibrated: the check needs its K, R and t")
+    return camera
+
+
+def _view_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
+    found = []
+    if figures["dark"] > limits.dark:
+        found.append(f"{name}: {figures['dark']:.0%} of the picture is black (at most {limits.dark:.0%})")
+    if figures["bright"] > limits.bright:
+        found.append(f"{name}: {figures['bright']:.0%} of the picture is saturated (at most {limits.bright:.0%})")
+    if figures["texture"] < limits.texture:
+        found.append(f"{name}: {figures['texture']:.0%} of the picture has texture (at least {limits.texture:.0%})")
+    return found
+
+
+def _pair_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
+    found = []
+    if figures.get("p95", 0.0) > limits.error:
+        found.append(f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})")
+    if figures.get("shift", 0.0) > limits.shift:
+        found.append(f"{name}: colours are displaced by {figures['shift']:.2f} pixels (at most {limits.shift:g})")
+    if figures["contradicted"] > limits.contradicted:
+        found.append(f"{name}: {figures['contradicted']:.1%} of the points are seen through")
+    return found
+
+
+def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: Limits) -> list[str]:
+    """Views of which no other view sees enough."""
+    best = {n: max(f["visible"] for p, f in pairs.items() if p.startswith(f"{n} > ")) for n in sorted(names)}
+    return [
+        f"{name}: the other cameras see {share:.0%} of what it sees (at least {limits.overlap:.0%})"
+        for name, share in best.items()
+        if share < limits.overlap
+    ]
+
+
+def _rounded(figures: Mapping[str, Tensor]) -> dict[str, float]:
+    return {name: float(f"{float(value):.4g}") for name, value in figures.items()}

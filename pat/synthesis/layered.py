@@ -8,10 +8,10 @@ occlusion are exact, and no geometry is approximated. All surfaces are opaque an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -35,7 +35,8 @@ class ArrayBatch:
     """Pictures and truth, one entry a camera, alpha first.
 
     `images` 0..1 (sRGB as the photographs have it); `depth` in metres along each camera's own axis at the
-    pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths.
+    pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths;
+    `index` says which layer is seen there, counted from 1.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
@@ -45,6 +46,7 @@ class ArrayBatch:
     t: list[Float[Tensor, "b 3"]]
     hw: list[HW]
     depth_range: Float[Tensor, "b 2"]
+    index: list[Int[Tensor, "b _ _"]] = field(default_factory=list)
 
     @property
     def cameras(self) -> list[Camera]:
@@ -92,20 +94,20 @@ class LayeredScenes:
         """
         layers = draw_layers(rigs, self.layers, self.photos, len(self.outlines), generator)
         factors = [oversampling * _oversampling(rigs.cameras[0], v) for v in rigs.cameras]
-        images, depth = zip(*(self._seen(layers, v, f) for v, f in zip(rigs.cameras, factors)))
+        images, depth, index = zip(*(self._seen(layers, v, f) for v, f in zip(rigs.cameras, factors)))
         bounds = torch.stack(depth[0].flatten(1).aminmax(dim=1), -1)
         cameras = [c.to(device=self.device, dtype=torch.float32) for c in rigs.cameras]
         K, R, t, hw = ([getattr(c, k) for c in cameras] for k in ("K", "R", "t", "hw"))
-        return ArrayBatch(list(images), list(depth), K, R, t, hw, bounds)
+        return ArrayBatch(list(images), list(depth), K, R, t, hw, bounds, list(index))
 
-    def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor]:
-        """Picture, and depth at the pixels' centres of the surface that covers most of each pixel."""
+    def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Picture, and depth at the pixels' centres and index of the surface that covers most of each pixel."""
         front = self._front(layers, camera)
-        depth = (1 / front.inverse_depth).view(-1, *camera.hw)
+        depth, index = ((v.view(-1, *camera.hw)) for v in (1 / front.inverse_depth, front.main + 1))
         if factor == 1:
-            return self._shade(layers, camera, front), depth
+            return self._shade(layers, camera, front), depth, index
         fine = camera.resize((camera.hw[0] * factor, camera.hw[1] * factor))
-        return avg_pool2d(self._shade(layers, fine, self._front(layers, fine)), factor), depth
+        return avg_pool2d(self._shade(layers, fine, self._front(layers, fine)), factor), depth, index
 
     def _front(self, layers: Layers, camera: Camera) -> _Front:
         homogeneous, opacity = self._cover(layers, camera)
@@ -114,7 +116,8 @@ class LayeredScenes:
         a1 = opacity.gather(1, first[:, None])[:, 0]
         q2, second = inverse_depth.scatter(1, first[:, None], 0.0).max(1)
         a1 = torch.where(q2 > 0, a1, 1.0)
-        return _Front(first, second, a1, torch.where(a1 >= 0.5, q1, q2))
+        most = a1 >= 0.5
+        return _Front(first, second, a1, torch.where(most, q1, q2), torch.where(most, first, second))
 
     def _cover(self, layers: Layers, camera: Camera) -> tuple[Tensor, Tensor]:
         """Inverse depth and opacity (B, L, N) of every layer at every pixel."""
@@ -175,12 +178,13 @@ _CHUNK = 1 << 16
 
 @dataclass(frozen=True)
 class _Front:
-    """At each pixel the two foremost layers, the opacity of the first, and the inverse depth of the main one."""
+    """At each pixel the two foremost layers, the opacity of the first, and the main one with its inverse depth."""
 
     first: Tensor
     second: Tensor
     opacity: Tensor
     inverse_depth: Tensor
+    main: Tensor
 
 
 def plane_from_camera(layers: Layers, camera: Camera) -> Float[Tensor, "b l 3 3"]:

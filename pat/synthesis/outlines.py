@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import cv2
 import numpy as np
 import torch
@@ -13,10 +15,12 @@ SIDE = 96
 _BORDER = 2 * _FINE // SIDE
 
 
+@functools.cache
 def outlines(count: int, seed: int) -> Float[Tensor, "count 1 side side"]:
     """Signed distance to the outline, positive inside, on the square [-1, 1]^2 (whose side has length 2).
 
-    The outer border is always outside, so that clamping positions to the square is safe.
+    The outer border is always outside, so that clamping positions to the square is safe. Made once a process: not to
+    be written to.
     """
     rng = np.random.default_rng(seed)
     makers = (_blob, _polygon, _cloud, _rods, _fence, _branches, _box)

@@ -504,6 +504,37 @@ def test_colmap_models_that_lost_entries(tmp_path):
     assert message.endswith("announces 2 images and holds 1; was it cut off?")
 
 
+def test_what_cameras_record_comes_back(tmp_path):
+    raw = Sensor(
+        response="rgb", coding="linear", bayer="GBRG", bits=12, black_level=64.0, exposure=0.0018, gain=(1.9, 1.0, 1.4)
+    )
+    slow = Sensor(frame_rate=30.0, time_offset=-0.004, gain=2.5)
+    rig = Rig({"raw": View(hw=(4, 6), sensor=raw), "slow": View(hw=(4, 6), sensor=slow)})
+    rig.save(tmp_path / "rig.yaml")
+    again = Rig.load(tmp_path / "rig.yaml")
+    assert [again[name].sensor for name in again.names] == [raw, slow]
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("bayer: RGBG", r"cameras.a.bayer: .*'RGBG'; wanted 'RGGB' or"),
+        ("coding: gamma", "wanted 'srgb' or 'linear'"),
+        ("bits: 12.5", "wanted a whole number from 1 to 16"),
+        ("black_level: 64", "needs 'bits'"),
+        ("bits: 6, black_level: 64", "not between 0 and white"),
+        ("exposure: 0", "wanted a number above 0"),
+        ("gain: [1, 2]", "3 numbers"),
+        ("gain: [1, 2, -1]", "gains are positive"),
+        ("frame_rate: fast", "a number"),
+    ],
+)
+def test_wrong_facts_of_a_sensor_are_named(tmp_path, entry, message):
+    (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], " + entry + "}\n")
+    with pytest.raises(RigFileError, match=message):
+        Rig.load(tmp_path / "rig.yaml")
+
+
 def test_a_size_that_is_missing_is_called_missing(tmp_path):
     (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
     with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):

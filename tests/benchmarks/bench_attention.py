@@ -1,17 +1,18 @@
 """Measures attention: `python -m tests.benchmarks.bench_attention` prints a table and writes RESULTS.md
-beside this file.
+beside this file, whole or not at all.
 
-Every backend that this machine has runs against two usual ways to do the same: (a) index keys and values at
-every position, matmul, softmax, matmul; (b) the same with `grid_sample`. Each measurement is a process of
-its own, so that its peak memory is its own; the machine's float32 matmul rate and copy bandwidth are
-measured in the same run. All repeat a few times; the table has medians with the spread (fastest to slowest).
-`--quick` leaves the large sizes out.
+The compiled backend of each device runs against two usual ways to do the same: (a) index keys and values at
+every position, matmul, softmax, matmul; (b) the same with `grid_sample`. Each measurement is a process of its
+own, so that its peak memory is its own; the machine's float32 matmul rate and copy bandwidth are measured in
+the same run. All repeat while it takes little time; the table has medians with the spread (fastest to
+slowest). `--device cuda` measures a GPU only, `--quick` leaves the large sizes out; neither writes RESULTS.md.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
 import statistics
@@ -27,9 +28,13 @@ from torch.nn.functional import grid_sample
 
 from arraygeom.segments import Segments
 from pat.attention import attend
+from pat.images import write_text
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
-REPEATS = 5
+REPEATS, ENOUGH = 9, 6.0
+"""A measurement ends after so many repetitions or seconds, whichever comes first."""
+GIB = 2**30
+ONE_THREAD = "cpu, one thread"
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
@@ -87,46 +92,54 @@ METHODS = {
     "index": index_everything,
     "index, channels last": index_channels_last,
     "grid_sample": grid_sampled,
-} | {name: fused(name) for name in ("reference", "cpu", "triton")}
+} | {name: fused(name.split(",")[0]) for name in ("reference", "cpu", ONE_THREAD, "triton")}
 
 
 def measure(job: dict) -> dict:
-    """Times one job in this process, and its peak memory beyond inputs."""
+    """Times one job in this process, and its peak memory: beyond inputs, and of all the process."""
     device, dtype = job["device"], DTYPES[job["dtype"]]
     ha, wa, d, samples = job["ha"], job["wa"], job["d"], job["samples"]
     torch.manual_seed(0)
-    q, k, v = (
-        torch.randn(1, d, ha, wa, dtype=dtype, device=device).to(memory_format=torch.channels_last).requires_grad_()
-        for _ in range(3)
-    )
+    if job["method"] == ONE_THREAD:
+        torch.set_num_threads(1)
+    q, k, v = (features(ha, wa, d, dtype, device).requires_grad_(job["backward"]) for _ in range(3))
     look, run = field(ha, wa, samples, device), METHODS[job["method"]]
     cotangent = torch.ones_like(q) if job["backward"] else None
 
     def once() -> float:
         _wait(device)
         begin = time.perf_counter()
+        out = run(q, k, v, look, samples, job["interpolation"])
         if job["backward"]:
-            torch.autograd.grad(run(q, k, v, look, samples, job["interpolation"]), (q, k, v), cotangent)
-        else:
-            with torch.no_grad():
-                run(q, k, v, look, samples, job["interpolation"])
+            torch.autograd.grad(out, (q, k, v), cotangent)
         _wait(device)
         return time.perf_counter() - begin
 
     if job["warm"]:
         _warm(run, device, dtype, job)
     before = _peak(device, reset=True)
-    first = once()
-    extra = _peak(device) - before
-    times = [first] if first > 20 else [once() for _ in range(REPEATS)]
-    unit = 4 * d * ha * wa * q.element_size()
+    times = [once()]
+    peak = _peak(device)
+    while len(times) < job["repeats"] and sum(times) < ENOUGH:
+        times.append(once())
     return {
         "time": statistics.median(times),
         "low": min(times),
         "high": max(times),
-        "extra": extra,
-        "unit": unit,
+        "extra": peak - before,
+        "peak": peak,
+        "unit": 4 * q.numel() * q.element_size(),
     }
+
+
+def features(ha: int, wa: int, d: int, dtype: torch.dtype, device: str) -> Tensor:
+    """Random ones, channels last; rows repeat every 256, or making them would take longer than what is
+    measured."""
+    some = torch.randn(min(ha, 256), wa, d, dtype=dtype, device=device)
+    out = torch.empty(1, ha, wa, d, dtype=dtype, device=device)
+    for top in range(0, ha, len(some)):
+        out[0, top : top + len(some)] = some[: ha - top]
+    return out.permute(0, 3, 1, 2)
 
 
 def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
@@ -171,6 +184,17 @@ def matmul_rate(device: str) -> float:
     return 2 * n**3 / _best(lambda: a @ a, device)
 
 
+def _rates(device: str) -> dict[bool, float]:
+    """Of all threads, and of one."""
+    threads = torch.get_num_threads()
+    every = matmul_rate(device)
+    torch.set_num_threads(1)
+    try:
+        return {False: every, True: matmul_rate(device)}
+    finally:
+        torch.set_num_threads(threads)
+
+
 def copy_bandwidth(device: str) -> float:
     """Bytes read and written a second."""
     a = torch.zeros(2**26 if device == "cpu" else 2**29, device=device)
@@ -189,26 +213,40 @@ def _best(act, device: str) -> float:
     return min(times)
 
 
+BASELINES = (
+    ("index", "nearest"),
+    ("index, channels last", "nearest"),
+    ("grid_sample", "nearest"),
+    ("grid_sample", "bilinear"),
+)
+SMALL, LARGE, WHOLE = (128, 256), (256, 512), (3036, 4024)
+
+
 def jobs(device: str, quick: bool) -> list[dict]:
-    """What is measured; of (a) and (b) only what fits into 16 GiB."""
+    """What is measured; (a) and (b) where they fit."""
     fast = "cpu" if device == "cpu" else "triton"
-    sizes = [(128, 256, 80), (256, 512, 40), (256, 512, 80)]
-    sizes += [] if quick else [(256, 512, 160), (256, 512, 640), (800, 1280, 80)]
-    found = []
-    for ha, wa, samples in sizes:
-        for backward in (False, True):
-            gathered = ha * wa * samples * 64 * 4 * (2 + 3 * backward)
-            for method in ("index", "index, channels last", "grid_sample", "reference", fast):
-                for interpolation in ("nearest", "bilinear"):
-                    skip = method.startswith("index") and interpolation == "bilinear"
-                    skip |= method != fast and gathered > 16 * 2**30
-                    skip |= method == "reference" and ha * wa * samples * (1 + backward) > 2 * 10**7
-                    if not skip:
-                        found.append(job(device, method, interpolation, ha, wa, samples, backward))
-    if not quick:
-        found.append(job(device, fast, "nearest", 3036, 4024, 80, False, dtype="bfloat16"))
-        found.append(job(device, fast, "bilinear", 3036, 4024, 80, False, dtype="bfloat16"))
-    return found
+    own, plain = [(fast, "nearest"), (fast, "bilinear")], [("reference", "nearest"), ("reference", "bilinear")]
+    both = (False, True)
+    if device == "cuda":
+        methods = [*BASELINES, *own] if torch.cuda.is_available() else own[:1]
+        plan = [((800, 1280), 80, dtype, methods, both) for dtype in DTYPES]
+        plan += [] if quick else [(WHOLE, 80, dtype, methods, both) for dtype in DTYPES]
+    else:
+        plan = [
+            (SMALL, 80, "float32", plain, both[:1]),
+            (SMALL, 80, "float32", [*BASELINES, *own], both),
+            (LARGE, 80, "float32", [*BASELINES, *own], both),
+            (LARGE, 80, "float32", [(ONE_THREAD, "nearest"), (ONE_THREAD, "bilinear")], both[:1]),
+        ]
+        more = [(LARGE, 40), (LARGE, 640), ((800, 1280), 80)]
+        plan += [] if quick else [(hw, samples, "float32", own, both) for hw, samples in more]
+        plan += [] if quick else [(WHOLE, 80, "bfloat16", own, both[:1])]
+    return [
+        job(device, method, interpolation, *hw, samples, backward, dtype=dtype)
+        for hw, samples, dtype, methods, directions in plan
+        for backward in directions
+        for method, interpolation in methods
+    ]
 
 
 def job(device, method, interpolation, ha, wa, samples, backward, *, dtype="float32") -> dict:
@@ -222,33 +260,60 @@ def job(device, method, interpolation, ha, wa, samples, backward, *, dtype="floa
         "backward": backward,
         "dtype": dtype,
         "d": 64,
-        "warm": method in ("cpu", "triton"),
+        "warm": method in ("cpu", ONE_THREAD, "triton"),
+        "repeats": REPEATS,
     }
 
 
-def row(entry: dict, result: dict, baselines: dict, rate: float, bandwidth: float) -> str:
+def obstacle(entry: dict) -> str | None:
+    """Why an entry cannot be measured here, if so."""
+    if entry["device"] == "cuda" and not torch.cuda.is_available():
+        return "no GPU on this machine: not measured"
+    if entry["method"] in ("cpu", ONE_THREAD, "triton", "reference"):
+        return None
+    gathered = entry["ha"] * entry["wa"] * entry["samples"] * entry["d"] * DTYPES[entry["dtype"]].itemsize
+    needed, free = gathered * (2 + 3 * entry["backward"]), _free(entry["device"])
+    return f"needs {needed / GIB:.0f} GiB, {free / GIB:.0f} are free: not measured" if needed > 0.9 * free else None
+
+
+def _free(device: str) -> int:
+    """Bytes."""
+    if device == "cuda":
+        return torch.cuda.mem_get_info()[0]
+    lines = dict(line.split(":", 1) for line in Path("/proc/meminfo").read_text().splitlines())
+    return int(lines["MemAvailable"].split()[0]) * 1024
+
+
+def name(entry: dict) -> tuple[str, str, str, str]:
+    """By which an entry is known in the table."""
+    shape = f"{entry['wa']}x{entry['ha']}, {entry['samples']}, {entry['dtype']}"
+    return shape, "forward + backward" if entry["backward"] else "forward", entry["method"], entry["interpolation"]
+
+
+def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
     """One line of the table."""
-    shape = f"{entry['wa']}x{entry['ha']} {entry['samples']} {entry['dtype']}"
-    work = "forward + backward" if entry["backward"] else "forward"
-    start = f"| {shape} | {work} | {entry['method']} | {entry['interpolation']} |"
+    rate = rates[entry["method"] == ONE_THREAD]
+    result, (shape, work, *_) = done[name(entry)], name(entry)
+    start = f"| {' | '.join(name(entry))} |"
     if "failed" in result:
-        return f"{start} {result['failed'][:60]} | | | | | |"
+        return f"{start} {result['failed'][:80]} |" + " |" * (len(COLUMNS) - 5)
     flops = (3 if entry["backward"] else 1) * 4 * entry["ha"] * entry["wa"] * entry["samples"] * entry["d"]
     least = (2 if entry["backward"] else 1) * result["unit"]
-    key = (shape, work)
     against = [
-        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x" if base else "-"
+        f"{base['time'] / result['time']:.1f}x, {base['extra'] / max(result['extra'], 1):.1f}x"
+        if "time" in base
+        else "-"
         for base in (
-            baselines.get((*key, "index", "nearest")),
-            baselines.get((*key, "grid_sample", entry["interpolation"])),
+            done.get((shape, work, "index", "nearest"), {}),
+            done.get((shape, work, "grid_sample", entry["interpolation"]), {}),
         )
     ]
     cells = [
         f"{result['time']:.3f} ({result['low']:.3f} to {result['high']:.3f})",
         *against,
         f"{result['extra'] / result['unit']:.2f}",
-        f"{flops / result['time'] / rate:.0%}",
-        f"{least / result['time'] / bandwidth:.0%}",
+        f"{flops / result['time'] / 1e12:.2g} ({flops / result['time'] / rate:.0%})",
+        f"{least / result['time'] / 1e9:.2g} ({least / result['time'] / bandwidth:.0%})",
     ]
     return f"{start} {' | '.join(cells)} |"
 
@@ -262,58 +327,115 @@ COLUMNS = (
     "faster, leaner than (a)",
     "faster, leaner than (b)",
     "extra memory / (Q + K + V + out)",
-    "of the matmul rate",
-    "of the copy bandwidth",
+    "TFLOP/s (of the matmul rate)",
+    "GB/s (of the copy bandwidth)",
 )
+
+
+def table(device: str, *, quick: bool) -> list[str]:
+    """Measures everything on a device, printing as it goes."""
+    here = device == "cpu" or torch.cuda.is_available()
+    rates, bandwidth = (_rates(device), copy_bandwidth(device)) if here else ({False: 1.0, True: 1.0}, 1.0)
+    machine = f"{torch.get_num_threads()} threads" if device == "cpu" else torch.cuda.get_device_name() if here else ""
+    limits = (
+        f"{machine}: float32 matmul {rates[False] / 1e12:.3f} TFLOP/s (one thread {rates[True] / 1e12:.3f}), "
+        f"copy {bandwidth / 1e9:.1f} GB/s (read and written)."
+    )
+    lines = [
+        *("", f"## {device}", "", limits if here else "No GPU on this machine.", ""),
+        *(f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"),
+    ]
+    print("\n".join(lines), flush=True)
+    done: dict = {}
+    for entry in jobs(device, quick):
+        reason = obstacle(entry)
+        done[name(entry)] = {"failed": reason} if reason else in_own_process(entry)
+        lines.append(row(entry, done, rates, bandwidth))
+        print(lines[-1], flush=True)
+    found = bars(done, rates) if device == "cpu" else []
+    print("\n".join(found), flush=True)
+    return lines + found
+
+
+def bars(done: dict, rates: dict) -> list[str]:
+    """What was asked for, of the CPU, against what was measured."""
+
+    def get(
+        what: str, backward: bool, method: str, interpolation: str = "nearest", hw=LARGE, samples=80, dtype="float32"
+    ):
+        entry = job("cpu", method, interpolation, *hw, samples, backward, dtype=dtype)
+        return done.get(name(entry), {}).get(what, math.nan)
+
+    own = {(b, i): get("time", b, "cpu", i) for b in (False, True) for i in ("nearest", "bilinear")}
+    one = {i: get("time", False, ONE_THREAD, i) for i in ("nearest", "bilinear")}
+    memory = {(b, n): get("extra", b, "cpu", samples=n) for b in (False, True) for n in (40, 80, 640)}
+    unit = get("unit", False, "cpu")
+    flops = 4 * LARGE[0] * LARGE[1] * 80 * 64
+    whole = [get(what, False, "cpu", hw=WHOLE, dtype="bfloat16") for what in ("peak", "unit", "time")]
+    asked = [
+        ("nearest forward, times faster than (a)", get("time", False, "index") / own[False, "nearest"], ">=", 80),
+        ("nearest forward + backward, times faster", get("time", True, "index") / own[True, "nearest"], ">=", 45),
+        ("nearest forward, of the matmul rate", flops / own[False, "nearest"] / rates[False], ">=", 0.3),
+        ("the same with one thread, of one thread's rate", flops / one["nearest"] / rates[True], ">=", 0.3),
+        ("bilinear forward, times nearest", own[False, "bilinear"] / own[False, "nearest"], "<=", 2),
+        ("the same with one thread", one["bilinear"] / one["nearest"], "<=", 2),
+        ("extra memory, forward", memory[False, 80] / unit, "<=", 1.2),
+        ("extra memory, forward + backward", memory[True, 80] / unit, "<=", 3),
+        ("extra memory, forward, 640 over 40 samples", memory[False, 640] / memory[False, 40], "<=", 1.1),
+        ("extra memory, forward + backward, 640 over 40", memory[True, 640] / memory[True, 40], "<=", 1.1),
+        ("4024x3036 bfloat16, peak beyond Q + K + V + out, GiB", (whole[0] - whole[1]) / GIB, "<=", 1),
+    ]
+    lines = [
+        "",
+        "512x256, 80 samples, D = 64, float32, if not said otherwise:",
+        "",
+        "| asked | | measured | |",
+        "|---" * 4 + "|",
+    ]
+    for what, value, sign, bar in asked:
+        reached = value >= bar if sign == ">=" else value <= bar
+        verdict = "not measured" if math.isnan(value) else "reached" if reached else "missed"
+        lines.append(f"| {what} | {sign} {bar} | {value:.2f} | {verdict} |")
+    return lines
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--job", help=argparse.SUPPRESS)
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="this one only")
     parser.add_argument("--quick", action="store_true", help="small sizes only")
     options = parser.parse_args()
     if options.job:
         print(json.dumps(measure(json.loads(options.job))))
         return
+    if options.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("no GPU on this machine: nothing to measure with --device cuda")
+    begin, load = time.perf_counter(), os.getloadavg()[0]
     lines = [
+        line
+        for device in ("cpu", "cuda")
+        if options.device in (None, device)
+        for line in table(device, quick=options.quick)
+    ]
+    minutes, after = (time.perf_counter() - begin) / 60, os.getloadavg()[0]
+    end = f"{minutes:.1f} minutes in all; load of the machine {load:.1f} before, {after:.1f} after."
+    print(end)
+    if options.device is None and not options.quick:
+        write(RESULTS, lines, end)
+
+
+def write(path: Path, lines: list[str], end: str) -> None:
+    """Puts the last run beside this file."""
+    text = [
         "# Attention, measured",
         "",
-        f"{date.today()}, torch {torch.__version__}, {platform.machine()}, "
-        f"{torch.get_num_threads()} threads; "
-        f"load of the machine before {os.getloadavg()[0]:.1f}. D = 64, channels last. (a) is `index`, (b) is "
-        "`grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory. "
-        "Written by `python -m tests.benchmarks.bench_attention`.",
+        f"{date.today()}, torch {torch.__version__}, {platform.machine()}. {end} D = 64, channels last. "
+        "(a) is `index`, (b) is `grid_sample`; 'faster' and 'leaner' are ratios of time and of extra peak memory; "
+        "4 floating-point operations a sample and channel in forward, 12 with backward; least traffic is Q, K, V and "
+        "out once, twice with backward. Written by `make bench`.",
+        *lines,
     ]
-    for device in ("cpu", "cuda"):
-        lines += ["", f"## {device}", ""]
-        if device == "cuda" and not torch.cuda.is_available():
-            lines.append("No GPU at hand: the Triton backend was not measured. Where there is one, this command does.")
-            continue
-        lines += table(device, quick=options.quick)
-    RESULTS.write_text("\n".join(lines) + "\n")
-    print("\n".join(lines[-1:]))
-
-
-def table(device: str, *, quick: bool) -> list[str]:
-    """Measures everything on a device, printing as it goes."""
-    rate, bandwidth = matmul_rate(device), copy_bandwidth(device)
-    lines = [
-        f"float32 matmul {rate / 1e9:.0f} GFLOP/s, copy {bandwidth / 1e9:.1f} GB/s (read and written).",
-        "",
-        f"| {' | '.join(COLUMNS)} |",
-        "|---" * len(COLUMNS) + "|",
-    ]
-    print("\n".join(lines), flush=True)
-    done: dict = {}
-    for entry in jobs(device, quick):
-        result = in_own_process(entry)
-        shape = f"{entry['wa']}x{entry['ha']} {entry['samples']} {entry['dtype']}"
-        work = "forward + backward" if entry["backward"] else "forward"
-        if "failed" not in result:
-            done[(shape, work, entry["method"], entry["interpolation"])] = result
-        lines.append(row(entry, result, done, rate, bandwidth))
-        print(lines[-1], flush=True)
-    return lines
+    write_text(path, "\n".join(text) + "\n")
 
 
 if __name__ == "__main__":

@@ -50,7 +50,11 @@ def test_fuse_writes_everything(small):
         "depth.png",
         "depth.tif",
         "fused.png",
+        "view.yaml",
     ]
+    view = Rig.load(small / "out" / "view.yaml")
+    assert view.names == ("mono",)
+    assert view["mono"].hw == (96, 128)
     assert read_image(small / "out" / "fused.png").shape == (3, 96, 128)
 
 
@@ -84,7 +88,7 @@ def test_help_names_the_commands(capsys):
         ({"extra": ["--max-memory", "lots"]}, "max_memory is 'lots'"),
         ({"extra": ["--image", "tele=x.png"]}, "no camera 'tele'"),
         ({"extra": ["--weights", "mono-color"]}, "no weights 'mono-color'"),
-        ({"mono": SAMPLE / "mono.png"}, "'mono' is 640x400, the rig says 128x96"),
+        ({"mono": SAMPLE / "mono.png"}, "mono.png: is 640x400, the rig says 128x96"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(changes, message, small, capsys):

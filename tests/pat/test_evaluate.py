@@ -1,15 +1,20 @@
 import csv
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
-from pat.data import StereoPair
+from arraygeom import pixel_grid
+from pat.data import Disparity, StereoPair, middlebury_pairs
 from pat.evaluate import (
     BASELINES,
     Row,
+    controls,
+    depth_markdown,
     evaluate_pairs,
     evaluate_sets,
+    falls,
     markdown,
     rectified_fusion,
     sets_markdown,
@@ -21,6 +26,7 @@ from pat.evaluate import (
 from pat.images import read_image, write_image
 from pat.metrics import score
 from pat.model import Fused
+from pat.weights import load_weights
 
 
 def pairs(count=2):
@@ -33,7 +39,8 @@ def test_rows_are_the_scores_of_what_the_method_returns():
     rows = evaluate_pairs([first, second], {"grey": lambda alpha, beta, d: alpha.expand(3, -1, -1) + 2}, [2])
     assert [(row.pair, row.rate, row.method) for row in rows] == [("set/0", 2, "grey"), ("set/1", 2, "grey")]
     white = torch.ones(3, 16, 24)
-    assert rows[0][3:] == score(white, first.left)
+    assert rows[0][3:5] == score(white, first.left)
+    assert rows[0][5:] == (None, None)
 
 
 def test_a_method_gets_the_protocols_inputs():
@@ -76,11 +83,15 @@ def test_summaries_are_means_by_rate_and_method():
     assert (four.psnr, four.pairs) == (28, 1)
 
 
+def depth_errors(cells):
+    return [float(cells[name]) if cells[name] else None for name in ("end_point_error", "within_one")]
+
+
 def test_tables_hold_every_row(tmp_path):
     write_csv(tmp_path / "t.csv", ROWS)
     with (tmp_path / "t.csv").open() as file:
         again = [
-            Row(r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]))
+            Row(r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]), *depth_errors(r))
             for r in csv.DictReader(file)
         ]
     assert again == ROWS
@@ -98,6 +109,97 @@ def test_tables_hold_every_row(tmp_path):
         "| a | 28.00 / 0.8000 |",
         "| **mean** | **28.00** / **0.8000** |",
     ]
+
+
+class Matcher:
+    """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
+
+    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch = 0, 2, 1, 1.0, True
+
+    def __init__(self, disparity):
+        self.disparity, self.betas = disparity, []
+
+    def __call__(self, alpha, betas, looks):
+        self.betas.append([(b.shape[1], float(b.mean())) for b in betas])
+        self.looks = looks
+        grid = (
+            pixel_grid(tuple(alpha.shape[-2:])).movedim(-1, 0)[None]
+            - torch.tensor([self.disparity, 0.0])[:, None, None]
+        )
+        sure = torch.ones_like(alpha[:, 0])
+        return Fused(alpha.expand(-1, 3, -1, -1), [grid] * len(betas), [sure] * len(betas), [sure] * len(betas))
+
+
+def test_depth_is_compared_where_it_is_known():
+    """A constant disparity of 5 against a truth of 5 on the left half, 8 on the right, unknown in the first row."""
+    (pair,) = pairs(1)
+    value = torch.full((16, 24), 5.0)
+    value[:, 12:] = 8
+    valid = torch.ones(16, 24, dtype=torch.bool)
+    valid[0] = False
+    pair = replace(pair, disparity=Disparity(value, valid))
+    (row,) = evaluate_pairs([pair], {"fusion": rectified_fusion(Matcher(5.0))}, [2], max_disparity=9)
+    assert row.end_point_error == pytest.approx(1.5, abs=1e-4)
+    assert row.within_one == pytest.approx(0.5)
+    assert "| set/0 | 1.50 px / 50.0% |" in depth_markdown([row])
+    assert depth_markdown(ROWS) == ""
+
+
+def test_three_bands_are_three_cameras():
+    network, (pair,) = Matcher(3.0), pairs(1)
+    evaluate_pairs([pair], {"fusion": rectified_fusion(network, bands=True)}, [2], max_disparity=9)
+    (given,) = network.betas
+    assert [channels for channels, _ in given] == [1, 1, 1]
+    assert [mean for _, mean in given] == pytest.approx(pair.right.mean((1, 2)).tolist(), abs=0.01)
+
+
+def test_controls_take_the_reference_away():
+    (pair,) = pairs(1)
+    network = Matcher(3.0)
+    evaluate_pairs([pair], {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=9)
+    right, none, foreign, shuffled = (mean for ((_, mean),) in network.betas)
+    assert none == 0
+    assert abs(foreign - right) > 0.02
+    assert shuffled == right
+    x = pixel_grid((16, 24)).reshape(-1, 2)
+    looked = network.looks[0].at(x)
+    assert sorted(looked.end.round().tolist()) == sorted(x.tolist())
+    assert (looked.end - x).norm(dim=-1).mean() > 5
+
+
+def test_falls_are_means_and_the_least():
+    rows = [
+        Row(p, 2, m, v, 0.9) for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
+    ]
+    assert falls(rows, names=["no"]) == "- no: 4.00 dB below fusion, at least 3.00 dB\n"
+
+
+def test_the_papers_figures_stand_beside_the_mean_and_are_marked():
+    text = sets_markdown({"kitti": ROWS}, protocol="table2")
+    assert "| beta reduced 2x | ours | the paper, printed, on its own data |" in text
+    assert "| **mean** | **32.00** (30.00 to 34.00) / **0.9300** | 28.77 / 0.8955 |" in text
+    assert "printed" not in sets_markdown({"middlebury": ROWS}, protocol="table2")
+
+
+def without_reference(pairs):
+    """How much each control costs, by the weights of the package, at the least of some pairs; dB."""
+    network = load_weights("mono-colour")
+    rows = evaluate_pairs(pairs, {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=80)
+    psnr = {(row.pair, row.method): row.psnr for row in rows}
+    return {name: min(psnr[p.name, "fusion"] - psnr[p.name, name] for p in pairs) for name in controls(network)}
+
+
+def test_controls_fall_on_a_real_pair(shared_data):
+    pair = next(p for p in middlebury_pairs(shared_data / "middlebury") if p.name.endswith("Flowerpots"))
+    crop = replace(pair, left=pair.left[:, 80:240, 100:340], right=pair.right[:, 80:240, 100:340], disparity=None)
+    assert min(without_reference([crop]).values()) > 2
+
+
+@pytest.mark.slow
+def test_controls_fall_on_real_pairs(shared_data):
+    wanted = ("Bowling1", "Midd1", "teddy", "Cloth1")
+    pairs = [p for p in middlebury_pairs(shared_data / "middlebury") if p.name.endswith(wanted)]
+    assert min(without_reference(pairs).values()) > 2
 
 
 class Onlooker:
@@ -119,7 +221,7 @@ def test_fusion_looks_along_the_row_in_alphas_pixels():
         [pair], {"fusion": rectified_fusion(network), "alpha": BASELINES["alpha"]}, [2], max_disparity=9
     )
     assert (network.start, network.end, network.beta) == ([11.0, 7.0], [20.0, 7.0], (1, 3, 16, 24))
-    assert rows[0][3:] == rows[1][3:]
+    assert rows[0][3:5] == rows[1][3:5]
 
 
 def test_sets_are_read_by_their_own_rules_and_shown_apart(tmp_path):

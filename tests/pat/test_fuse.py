@@ -4,12 +4,17 @@ import math
 
 import pytest
 import torch
+from pat.matches import match_points, seen_depths
 
 import pat.fuse
-from arraygeom import Camera, Epipolar, Link, Pose, Rig, View, intrinsics, rotation_from_vector
-from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, tiles_of
+from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
+from pat.demo import load_sample
+from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, quarter_turns, tiles_of, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
+from pat.images import luminance, read_image
+from pat.metrics import score
 from pat.model import PAT, PATConfig
+from pat.weights import load_weights
 
 
 def rig_of(hw, beta_hw, focal=300.0, beta_focal=200.0) -> Rig:
@@ -28,7 +33,7 @@ def network_of(kind: str):
     torch.manual_seed(1)
     if kind == "PAT":
         return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4)).eval()
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
     torch.nn.init.normal_(network.head.last.weight, std=0.2)
     return network
 
@@ -72,6 +77,67 @@ def test_memory_decides_the_tiles():
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
     with pytest.raises(ValueError, match="needs at least"):
         pat.fuse.plan(network, hw, [], 2.0**20)
+
+
+def test_tiles_are_those_with_the_least_work():
+    """No square tiles under the same limit make less; and a halo nearly as wide as the frame makes strips of it."""
+    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), 3.0 * 2**30
+
+    def work(tiles):
+        return sum((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
+
+    ours = pat.fuse.plan(network, hw, [], limit)
+    side = int(math.sqrt(limit / network.bytes_per_pixel)) - 2 * network.halo
+    assert work(ours) < 0.8 * work(tiles_of(hw, side, network.halo))
+    assert all(pat.fuse.working_memory(network, t, []) <= limit for t in ours)
+
+
+def test_the_plan_is_told_before_the_work():
+    told, rig = [], rig_of((50, 70), (40, 60))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
+    fuse(network_of("PAT"), rig, images, alpha="mono", announce=told.append)
+    assert str(told[0]).startswith("1 piece, 0.0")
+    assert told[0].seconds is None
+
+
+def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
+    """Beta sees ten times alpha's field: what fusing gives is the same, and what is worked on is small."""
+    hw, wide = (64, 96), (300, 440)
+    rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
+    pair = rig.pair("mono", "colour")
+    beta = pat.fuse._prepare(network, pair, texture(3, wide)[None], None, None, "colour")
+    assert beta.picture.shape[-1] * beta.picture.shape[-2] < 0.6 * 9 * math.prod(wide)
+    images = {"mono": texture(1, hw), "colour": texture(3, wide)}
+    cut = fuse(network, rig, images, alpha="mono")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pat.fuse, "_common_part", lambda pair, picture, field, network: (pair, picture))
+        whole = fuse(network, rig, images, alpha="mono")
+    assert (cut.image - whole.image).abs().mean() < 2e-3
+
+
+def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
+    hw, beta_hw = (34, 300), (30, 210)
+    network, rig = network_of("PAT"), rig_of(hw, beta_hw)
+    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    monkeypatch.setattr(pat.fuse, "plan", lambda *_: list(tiles_of(hw, 64, network.halo)))
+    whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fuse._fuse_tile
+
+    def counted(network, own, betas, tile):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(tile)
+        return fuse_tile(network, own, betas, tile)
+
+    monkeypatch.setattr(pat.fuse, "_fuse_tile", counted)
+    with pytest.raises(KeyboardInterrupt):
+        fuse(network, rig, images, alpha="mono", store=tmp_path)
+    made.clear()
+    resumed = fuse(network, rig, images, alpha="mono", store=tmp_path)
+    assert len(made) == 2
+    assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(resumed, whole))
+    made.clear()
+    with pytest.raises(KeyboardInterrupt):
+        fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
 
 
 def test_bytes_are_read():
@@ -144,3 +210,73 @@ def test_views_must_overlap():
         fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))
     with pytest.raises(ValueError, match="at least one beta"):
         fuse(network_of("PAT"), rig, {"mono": images["mono"]}, alpha="mono")
+
+
+def bent(lens_of, rig, images):
+    """The rig with lenses, and the pictures those would have taken."""
+    for name, coefficients in lens_of.items():
+        lens = Distortion("brown-conrady", torch.tensor(coefficients, dtype=torch.float64))
+        camera = rig[name].replace(distortion=lens)
+        images = images | {name: retaken(images[name], rig[name], camera).values[0]}
+        rig = rig.with_camera(name, camera)
+    return rig, images
+
+
+LENSES = {"mono": [0.9, 0.0, 0.0, 0.0], "colour": [-0.6, 0.2, 0.005, 0.0]}
+
+
+@pytest.mark.parametrize("with_lens", [("colour",), ("mono", "colour")])
+def test_lenses_are_seen_through(with_lens):
+    """The sample array behind lenses: the same colours at alpha's own, bent pixels, and alpha's detail untouched."""
+    sample = load_sample()
+    rig, images, network = (
+        sample.rig.crop("mono", 80, 160, (240, 320)),
+        dict(sample.images),
+        load_weights("mono-colour"),
+    )
+    images["mono"], truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.truth))
+    lensed, taken = bent({name: LENSES[name] for name in with_lens}, rig, images)
+    clean = (fuse(network, rig, images, alpha="mono").image - truth).square().mean()
+    frame = fuse(network, lensed, taken, alpha="mono")
+    if "mono" in with_lens:
+        truth = retaken(truth, rig["mono"], lensed["mono"]).values[0]
+    seen = truth.sum(0) > 0
+    error = (frame.image - truth)[:, seen].square().mean()
+    assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
+    blind = fuse(network, rig, taken, alpha="mono")
+    assert error < 1.1 * clean
+    assert error < 0.85 * (blind.image - truth)[:, seen].square().mean()
+    assert torch.isfinite(frame.image).all()
+    assert 0.7 < float((frame.depth.isfinite() & seen).float().sum() / seen.float().sum()) <= 1
+
+
+def test_a_turned_beta_is_turned_upright():
+    rig = rig_of((60, 80), (60, 80))
+    for turns in range(4):
+        assert quarter_turns(rig.turn("colour", turns).pair("mono", "colour")) == -turns % 4
+    images = {"mono": texture(1, (60, 80)), "colour": texture(3, (60, 80))}
+    network = network_of("GuidedPAT")
+    upright = fuse(network, rig, images, alpha="mono")
+    turned = fuse(network, rig.turn("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono")
+    assert (upright.image - turned.image).abs().max() < 1e-4
+
+
+@pytest.mark.slow
+def test_real_lenses(shared_data):
+    """A real pair with barrel distortion of some 30 pixels: colour lands at alpha's own pixels."""
+    folder, network = shared_data / "bumblebee2_scenes", load_weights("mono-colour")
+    rig = Rig.load(folder / "stereo.yaml")
+    left, right = (read_image(folder / f"chair01_{side}.jpg") for side in ("left", "right"))
+    straight_rig, straight = without_lenses(rig, {"left": left, "right": right})
+    depth = seen_depths(straight_rig.pair("left", "right"), match_points(*straight.values()))
+    images = {"left": luminance(left), "right": right}
+    frame = fuse(network, rig, images, alpha="left", depth=depth)
+    no_lens = rig
+    for name in rig.names:
+        no_lens = no_lens.with_camera(name, rig[name].replace(distortion=None))
+    ignored = fuse(network, no_lens, images, alpha="left", depth=depth)
+    grey, seen, blind = (
+        score(p.clamp(0, 1), left).psnr for p in (luminance(left).expand(3, -1, -1), frame.image, ignored.image)
+    )
+    assert seen > grey + 4
+    assert seen > blind + 1

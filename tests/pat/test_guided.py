@@ -8,7 +8,7 @@ from pat.guided import GuidedPAT, GuidedPATConfig, window_around
 from pat.images import luminance
 from pat.model import Look
 
-SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4)
+SMALL = GuidedPATConfig(widths=(8, 8, 8, 8))
 HW = (32, 48)
 
 
@@ -52,7 +52,7 @@ def test_the_window_stays_around_the_match():
     end = torch.tensor([20.0, 3.0]).expand(1, 8, 8, 2)
     segments = Segments(end - torch.tensor([12.0, 0.0]), end, torch.ones(1, 8, 8, dtype=torch.bool))
     for reach, middle in ((5.0, 15.0), (-3.0, 20.0), (50.0, 8.0)):
-        window = window_around(torch.full((1, 1, 2, 2), reach), segments, 4.0)
+        window = window_around(torch.full((1, 1, 4, 4), reach), segments, 4.0)
         assert torch.allclose(window.start[..., 0], torch.tensor(middle - 4))
         assert torch.allclose(window.end[..., 0], torch.tensor(middle + 4))
 

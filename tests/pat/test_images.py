@@ -9,6 +9,7 @@ from pat.images import (
     from_luma_chroma,
     luminance,
     read_image,
+    sweep,
     to_luma_chroma,
     write_atomically,
     write_image,
@@ -160,3 +161,14 @@ def test_luma_and_chroma_come_back():
 def test_the_luminance_of_a_recoloured_picture_is_the_given_one():
     luma, chroma = torch.rand(1, 5, 6, dtype=torch.float64), torch.randn(2, 5, 6, dtype=torch.float64)
     torch.testing.assert_close(luminance(from_luma_chroma(luma, chroma)), luma, atol=1e-14, rtol=0)
+
+
+def test_what_a_killed_process_left_is_swept_away_and_nothing_else(tmp_path):
+    with write_atomically(tmp_path / "a-b.png") as temporary:
+        temporary.write_text("half")
+        left = tmp_path / temporary.name.replace("a-b", "c")
+        left.write_text("half")
+    (tmp_path / ".hidden-file.png").write_text("mine")
+    sweep(tmp_path)
+    sweep(tmp_path / "none")
+    assert sorted(os.listdir(tmp_path)) == [".hidden-file.png", "a-b.png"]

@@ -117,9 +117,7 @@ def data(tmp_path_factory):
     write_syntim(root / "syntim")
     write_fast_slow(root / "hfr_lfr")
     torch.manual_seed(0)
-    save_weights(
-        GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4)), root / "small.safetensors"
-    )
+    save_weights(GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))), root / "small.safetensors")
     return root
 
 

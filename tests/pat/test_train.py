@@ -12,7 +12,7 @@ from pat.images import luminance, write_image
 from pat.train import TrainConfig, degraded, picture_loss, scenes, train
 from pat.weights import load_weights
 
-SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4, taps=5)
+SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
 
 
 @pytest.fixture(scope="module")

@@ -53,3 +53,22 @@ def test_weights_of_another_architecture_are_refused(tmp_path):
     save_weights(network, path)
     with pytest.raises(ValueError, match="do not fit the PAT"):
         load_weights(path)
+
+
+def test_another_version_or_a_checkpoint_is_named(tmp_path):
+    path = tmp_path / "w.safetensors"
+    for version, message in (
+        ("pat-weights 2", "it is 'pat-weights 2'"),
+        ("pat-checkpoint 1", "a checkpoint of training"),
+    ):
+        save_file({"a": torch.zeros(1)}, path, {"format": version, "network": "PAT"})
+        with pytest.raises(ValueError, match=message):
+            load_weights(path)
+
+
+def test_the_tensor_that_does_not_fit_is_named(tmp_path):
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))
+    network.config = GuidedPATConfig(widths=(8, 8, 8, 16))
+    save_weights(network, tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match=r"do not fit .*: \S+ is \(.*\), wanted \("):
+        load_weights(tmp_path / "w.safetensors")

@@ -37,6 +37,26 @@ def test_random_cases_in_float32(seeds):
         assert max(worst.values()) < 1e-5, (seed, worst)
 
 
+@pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
+@pytest.mark.parametrize(("d", "dv"), [(64, 130), (107, 64)])
+def test_more_samples_and_channels_than_are_worked_off_at_once(interpolation, d, dv):
+    torch.manual_seed(d)
+    tensors = {
+        name: torch.randn(1, *shape, dtype=torch.float64)
+        for name, shape in (("query", (d, 3, 37)), ("key", (d, 30, 40)), ("value", (dv, 30, 40)))
+    }
+    tensors["query"] /= d**0.5
+    tensors |= {name: torch.rand(3, 37, 2, dtype=torch.float64) * 42 - 1.5 for name in ("start", "end")}
+    tensors = {name: t.requires_grad_() for name, t in tensors.items()}
+    options = {"samples": 120, "mask": torch.rand(3, 37) > 0.1, "interpolation": interpolation}
+    found, expected = (
+        call(attend_with_statistics, tensors, options, backend=backend) for backend in ("cpu", "reference")
+    )
+    assert all(relative(a, b) < 1e-10 for a, b in zip(found, expected))
+    here, there = gradients(found, tensors, seed=1), gradients(expected, tensors, seed=1)
+    assert all(relative(here[name], there[name]) < 1e-10 for name in tensors)
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = random_case(3, dtype=torch.float32)
@@ -93,6 +113,16 @@ def test_any_number_of_threads_gives_the_same_bits(interpolation):
         assert all(torch.equal(a, b) for a, b in zip(result, results[0]))
 
 
+@pytest.mark.parametrize("seed", range(8))
+def test_without_statistics_the_values_and_their_gradients_are_the_same(seed):
+    tensors, options = random_case(seed, dtype=torch.float32)
+    alone = call(attend, tensors, options, backend="cpu")
+    measured = call(attend_with_statistics, tensors, options, backend="cpu").value
+    assert torch.equal(alone, measured)
+    here, there = gradients([alone], tensors, seed=seed), gradients([measured], tensors, seed=seed)
+    assert all(torch.equal(here[name], there[name]) for name in tensors)
+
+
 def test_gradcheck_also_twice():
     tensors, options = random_case(21)
     options["interpolation"] = "bilinear"
@@ -103,6 +133,9 @@ def test_gradcheck_also_twice():
 
     assert gradcheck(run, tuple(small.values()), fast_mode=True)
     assert gradgradcheck(run, tuple(small.values()), fast_mode=True)
+    assert gradgradcheck(
+        lambda *values: call(attend, dict(zip(small, values)), options), tuple(small.values()), fast_mode=True
+    )
     with pytest.raises(RuntimeError, match="second-order"):
         gradgradcheck(lambda *values: run(*values, backend="cpu"), tuple(small.values()), fast_mode=True)
 
@@ -161,10 +194,11 @@ def test_whole_graph_compilation_and_autocast():
     subprocess.run([sys.executable, "-c", COMPILED], check=True)
 
 
-def test_the_operator_passes_torchs_own_checks():
+@pytest.mark.parametrize("measured", [True, False])
+def test_the_operator_passes_torchs_own_checks(measured):
     q, key, value = (torch.randn(2, 8, h, 5, requires_grad=True) for h in (3, 4, 4))
     points = (torch.rand(2, 3, 5, 2, 2) * 4).requires_grad_()
     mask = torch.rand(2, 3, 5, 1) > 0.3
     torch.library.opcheck(
-        torch.ops.pat.attend.default, (q, key, value, points, mask, None, 4, True, False, "cpu", False)
+        torch.ops.pat.attend.default, (q, key, value, points, mask, None, 4, True, False, measured, "cpu", False)
     )

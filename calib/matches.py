@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import combinations
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from kornia.color import rgb_to_grayscale
 from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
 from arraygeom.pixels import shift_matrix
 
-from .images import luminance
-
 RATIO = 0.75
 """The best match must be this much nearer than the second best (Lowe 2004, section 7.1)."""
 FEATURES = 6000
 ENOUGH = 20
 """Matches that must agree before anything is concluded from them."""
+MANY = 60
+"""With fewer matches that agree, the pictures may be mirrored."""
+AGREE = 5.0
+"""How far from its line, in pixels, a match may be that agrees: lenses bend lines."""
+STILL = 0.05
+"""Pictures whose points move less than this are one picture."""
 
 
 class Matches(NamedTuple):
@@ -36,13 +43,84 @@ class Matches(NamedTuple):
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
     """SIFT features of both pictures' luminance, contrast evened, that choose each other and pass the ratio test."""
-    (points_a, a), (points_b, b) = _features(alpha), _features(beta)
-    if len(points_a) < 2 or len(points_b) < 2:
+    return choose(detect(alpha), detect(beta))
+
+
+class Features(NamedTuple):
+    """SIFT features of one picture: points (x, y) and their descriptors."""
+
+    points: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+
+
+def detect(picture: Float[Tensor, "_ h w"]) -> Features:
+    """SIFT features of a picture's luminance, its contrast evened."""
+    grey = rgb_to_grayscale(picture)[0] if picture.shape[0] == 3 else picture[0]
+    even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
+    points, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
+    if not points:
+        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
+    return Features(np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.float32))
+
+
+def choose(a: Features, b: Features) -> Matches:
+    """The features that choose each other and pass the ratio test."""
+    if len(a.points) < 2 or len(b.points) < 2:
         return Matches(*torch.zeros(2, 0, 2, dtype=torch.float64))
-    there, back = _nearest(a, b), _nearest(b, a)
+    there, back = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
     chosen = [(i, j) for i, j in there.items() if back.get(j) == i]
     first, second = ([pair[k] for pair in chosen] for k in (0, 1))
-    return Matches(torch.from_numpy(points_a[first]), torch.from_numpy(points_b[second]))
+    return Matches(torch.from_numpy(a.points[first]), torch.from_numpy(b.points[second]))
+
+
+def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:
+    """Points seen in both pictures of every two cameras, those alone that some fundamental matrix agrees with.
+
+    Where few agree, the second picture is tried mirrored: features do not survive that. Pairs with fewer than 20
+    are left out. Raises ValueError, one line, if no pair is left, for fewer than two pictures, and for equal ones.
+    """
+    if len(images) < 2:
+        raise ValueError("matching needs the pictures of two cameras or more: give --image NAME=FILE for each")
+    features = {name: detect(picture) for name, picture in images.items()}
+    found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
+    kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
+    for (a, b), matches in kept.items():
+        if images[a].shape[1:] == images[b].shape[1:] and float(_movement(matches)) < STILL:
+            raise ValueError(f"the pictures of '{a}' and '{b}' are the same picture: give each camera its own")
+    if not kept:
+        (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
+        raise ValueError(
+            f"only {len(most.alpha)} points seen in both '{a}' and '{b}' agree, {ENOUGH} are needed: do the cameras "
+            "see the same things, at the same time and in focus?"
+        )
+    return kept
+
+
+def _agreeing(a: Features, b: Features, picture: Tensor) -> Matches:
+    """Matches that some F puts within `AGREE` pixels of their lines; of the mirrored picture if those are more."""
+    straight = agreeing(choose(a, b))
+    if len(straight.alpha) >= MANY:
+        return straight
+    x, y = agreeing(choose(a, detect(picture.flip(-1))))
+    mirrored = Matches(x, torch.stack([picture.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
+    return max(straight, mirrored, key=lambda m: len(m.alpha))
+
+
+def agreeing(matches: Matches, *, within: float = AGREE) -> Matches:
+    """The matches that some fundamental matrix puts within some pixels of their lines; none if there are few."""
+    if len(matches.alpha) < ENOUGH:
+        return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
+    try:
+        F = fit_fundamental(matches)
+    except ValueError:
+        return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
+    return near_lines(matches, F, within=within)
+
+
+def _movement(matches: Matches) -> Tensor:
+    """How far most points are from one picture to the other: the 90th percentile, pixels."""
+    return (matches.alpha - matches.beta).norm(dim=-1).quantile(0.9)
 
 
 def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> Matches:
@@ -75,7 +153,7 @@ def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) 
     ValueError for fewer than 20 matches that agree.
     """
     near = near_lines(matches, F, within=within)
-    fitted = _fundamental(near) if len(near.alpha) >= ENOUGH else F
+    fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
     kept = near_lines(near, fitted, within=3)
     if len(kept.alpha) < ENOUGH:
         raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
@@ -102,10 +180,14 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
     return 0.9 * low, 1.25 * high
 
 
-def _fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
+def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
+    """F by MAGSAC++ (Barath et al. 2020) to 1 px. Raises ValueError if none fits."""
     x, y = (points.numpy() for points in matches)
-    found, _ = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 1.0, 0.999, 10_000)
-    if found is None:
+    try:
+        found, _ = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 1.0, 0.999, 10_000)
+    except cv2.error:
+        found = None
+    if found is None or found.shape != (3, 3):
         raise ValueError("no fundamental matrix fits the points seen in both pictures")
     return torch.from_numpy(found)
 
@@ -129,15 +211,6 @@ def _along_lines(matches: Matches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 
 def _percentiles(values: Tensor, share: float) -> tuple[float, float]:
     low, high = values.quantile(values.new_tensor([share, 1 - share])).tolist()
     return low, high
-
-
-def _features(picture: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    grey = luminance(picture)[0] if picture.shape[0] == 3 else picture[0]
-    even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
-    points, descriptors = cv2.SIFT.create(FEATURES).detectAndCompute(even, np.empty(0, np.uint8))
-    if not points:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    return np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.float32)
 
 
 def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> dict[int, int]:

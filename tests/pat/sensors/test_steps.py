@@ -5,7 +5,7 @@ import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
-from arraygeom.sensor import Band
+from arraygeom.sensor import Band, Curve
 from pat.sensors import (
     BoxBlur,
     Case,
@@ -13,6 +13,7 @@ from pat.sensors import (
     Coded,
     DiscBlur,
     Exposure,
+    Gamma,
     GaussianBlur,
     Jitter,
     Linear,
@@ -44,14 +45,24 @@ def test_linear_and_coded_are_inverses_and_match_the_standard():
     assert run(torch.full((1, 1, 1, 1), 0.5), Linear()).item() == pytest.approx(0.214041, abs=1e-6)
 
 
-def test_noise_follows_the_mean_variance_line():
+@pytest.mark.parametrize("counts", ["gaussian", "poisson"])
+def test_noise_follows_the_mean_variance_line(counts):
     full_well, read = 1000.0, 8.0
     signal = torch.linspace(0.05, 0.95, 10, dtype=torch.float64).view(10, 1, 1, 1).expand(10, 1, 300, 300)
-    noisy = run(signal, Noise(full_well, read))
+    noisy = run(signal, Noise(full_well, read, counts))
     electrons = noisy.flatten(1) * full_well
     slope, offset = np.polyfit(electrons.mean(1).numpy(), electrons.var(1).numpy(), 1)
     assert slope == pytest.approx(1, abs=0.03)
     assert offset == pytest.approx(read**2, abs=10)
+
+
+def test_poisson_counts_whole_electrons_and_passes_the_gradient_of_the_mean():
+    image = torch.full((1, 1, 100, 100), 0.003, dtype=torch.float64, requires_grad=True)
+    electrons = run(image, Noise(1000, 0, "poisson")) * 1000
+    torch.testing.assert_close(electrons, electrons.round())
+    assert (electrons == 0).float().mean().item() == pytest.approx(np.exp(-3), abs=0.01)
+    electrons.sum().backward()
+    assert (image.grad == 1000).all()
 
 
 def test_noise_is_seeded_and_differs_between_pictures():
@@ -138,6 +149,28 @@ def test_spectral_responses():
     assert run(red, Spectral(Band(620, 20))).item() > 0.85 > 0.1 > run(red, Spectral(Band(450, 20))).item()
 
 
+def test_responses_of_a_picture_with_near_infrared():
+    image = noise_picture(2, 4, 4, 5)
+    assert torch.equal(run(image, Spectral("rgb")), image[:, :3])
+    assert torch.equal(run(image, Spectral("nir")), image[:, 3:])
+    torch.testing.assert_close(run(image, Spectral("luminance")), run(image[:, :3], Spectral("luminance")))
+    torch.testing.assert_close(run(image, Spectral(Band(850, 20))), image[:, 3:], atol=2e-3, rtol=0)
+    between = run(torch.tensor([1.0, 0, 0, 0]).view(1, 4, 1, 1), Spectral(Band(700, 200))).item()
+    assert 0.2 < between < 0.8
+
+
+def test_a_curve_that_samples_a_band_weighs_as_the_band():
+    band = Band(560, 50)
+    nm = np.linspace(350, 1000, 651)
+    curve = Curve(tuple(nm), tuple(np.exp(-4 * np.log(2) * ((nm - band.centre) / band.width) ** 2)))
+    image = noise_picture(2, 4, 4, 5)
+    torch.testing.assert_close(run(image, Spectral(curve)), run(image, Spectral(band)), atol=1e-6, rtol=0)
+
+
+def test_gamma_is_a_power():
+    assert run(torch.full((1, 1, 1, 1), 0.25), Gamma(2.0)).item() == pytest.approx(0.5)
+
+
 def test_quantise_rounds_to_levels():
     image = noise_picture(1, 1, 8, 8) * 1.2 - 0.1
     levels = run(image, Quantise(4)) * 15
@@ -196,7 +229,13 @@ def test_mistakes_are_told():
     with pytest.raises(ValueError, match="odd"):
         BoxBlur(4)
     with pytest.raises(ValueError, match="900 nm"):
-        Spectral(Band(900, 20))
+        run(noise_picture(1, 3, 4, 4), Spectral(Band(900, 20)))
+    with pytest.raises(ValueError, match="NIR channel"):
+        run(noise_picture(1, 3, 4, 4), Spectral("nir"))
+    with pytest.raises(ValueError, match="collects no light"):
+        run(noise_picture(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
+    with pytest.raises(ValueError, match="full_well > 0"):
+        Noise(0)
     with pytest.raises(ValueError, match="must keep the size"):
         augment(
             noise_picture(1, 1, 8, 8), noise_picture(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator()

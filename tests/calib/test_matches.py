@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
-from pat.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
+from calib.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
 
 HW = (240, 320)
 

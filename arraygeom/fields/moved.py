@@ -1,0 +1,37 @@
+"""The field of points that move: beta looks at another time than alpha."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ..rig import Pair
+from ..sampling import sample
+from .protocol import Look, ReceptiveField
+
+
+@dataclass(frozen=True, eq=False)
+class Moved:
+    """Any field, for cameras that are not synchronised: it looks where alpha's pixels are when beta records.
+
+    `displacement` (2, H, W) says by how many pixels of alpha each of its pixels moves from alpha's exposure to
+    beta's, in x and y; optical flow between alpha's own frames tells it. It is looked up bilinearly, and counts as at
+    the nearest pixel outside alpha's picture. What is not known of it, `Widened` gives room for.
+    """
+
+    field: ReceptiveField
+    displacement: Float[Tensor, "2 h w"]
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
+        """What the field answers for the points where alpha's pixels x will be."""
+        return self.field(pair, self.points(x))
+
+    def points(self, x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+        """Where alpha's pixels are when beta records."""
+        h, w = self.displacement.shape[-2:]
+        inside = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
+        step = sample(self.displacement[None].to(x), inside.reshape(1, -1, 2)).values[0]
+        return x + step.mT.reshape(x.shape)

@@ -1,0 +1,339 @@
+"""What is wrong with a rig, from one picture of each camera: the usual mistakes, told apart by matched points."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.spatial import Delaunay, QhullError
+from torch import Tensor
+
+from arraygeom import Camera, Pair, Rig
+from arraygeom.pixels import HW
+from arraygeom.rig import Depths
+
+from .matches import Matches, match_cameras
+from .mistakes import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
+from .residuals import lines_basis, nature, related, residuals_and_depths, stacked
+
+MOST = 250
+"""Matches of a pair that are used."""
+FAR_OFF = 1000.0
+"""Pixels that a match counts as off its line at most, and one whose pixels have no ray."""
+UNSEEN = 0.2
+"""A misfit, in pixels, below which a rig has nothing wrong with it."""
+TRIMMED = 0.85
+"""The part of the points, those nearest to their lines, that figures are made of."""
+EQUAL = (1.4, 0.03)
+"""Explanations cannot be told apart whose misfit is less than 1.4 times the best one's and 0.03 px."""
+WRONG_WAY = 100.0
+"""Pixels of misfit that points behind the cameras, or outside the depth range, count for."""
+BETTER = 0.33
+"""A mistake is named if undoing it leaves no more than this part of the misfit: a drifted rig is made somewhat better
+by many wrong remedies."""
+FEW = 10
+"""Shares of fewer points than this say nothing."""
+BARREL, PINCUSHION = -0.6, 0.4
+"""Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
+
+Pairs = Mapping[tuple[str, str], Matches]
+
+
+class Figures(NamedTuple):
+    """What matched points say of a rig.
+
+    off: median distance in pixels of a point from its epipolar line.
+    misfit: the part of it (root mean square, pixels) that is the rig's and not the matches' own.
+    front: share of the points that lie in front of both cameras, of those whose depth can be told.
+    inside: share of those in front that lie in the rig's depth range; NaN without one.
+    handed: share of the triangles of neighbouring points that are turned over from one picture to the other, or not,
+    as they should be: mirrored pictures turn them over.
+    """
+
+    off: float
+    misfit: float
+    front: float
+    inside: float
+    handed: float
+
+    @property
+    def badness(self) -> float:
+        """All of it in one number, pixels."""
+        wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
+        return self.misfit + WRONG_WAY * wrong
+
+    def __str__(self) -> str:
+        parts = [f"{self.off:.2f} px off the lines, {self.misfit:.2f} px of it the rig's"]
+        if not math.isnan(self.front):
+            parts.append(f"{self.front:.0%} in front")
+        if not math.isnan(self.inside):
+            parts.append(f"{self.inside:.0%} within the depth range")
+        if self.handed < 0.5:
+            parts.append("one picture mirrored against the other")
+        return ", ".join(parts)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What the doctor found.
+
+    named: the mistake, or `NOTHING`. equal: other kinds of mistake that explain the pictures as well.
+    before, after: figures of the rig as given and of the repaired one. tried: all explanations, best first.
+    matches: how many points were used. healthy: the rig as given fits the pictures.
+    """
+
+    named: Remedy
+    equal: tuple[Remedy, ...]
+    before: Figures
+    after: Figures
+    tried: tuple[tuple[Remedy, Figures], ...]
+    matches: int
+    healthy: bool
+    repaired: Rig
+
+    @property
+    def verdict(self) -> str:
+        """In a sentence or two."""
+        if self.named.kind != "nothing":
+            others = "".join(f"; or: {remedy.words}" for remedy in self.equal)
+            return f"likely mistake: {self.named.words}{others}"
+        if self.healthy:
+            return "nothing wrong: the points lie on their lines as well as they can be located"
+        return (
+            f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these pictures: "
+            "it has drifted or was never better; `pat rig refine` may repair it"
+        )
+
+    def as_text(self) -> str:
+        """The verdict, and the figures before and after, as people read them."""
+        lines = [self.verdict, f"as given: {self.before}"]
+        if self.named.kind != "nothing":
+            lines.append(f"repaired: {self.after}")
+        return "\n".join([*lines, f"from {self.matches} points seen in two pictures"])
+
+    def as_json(self) -> str:
+        """The same for programs, with the ten best explanations."""
+        tried = [{"kind": r.kind, "words": r.words, **_plain(f)} for r, f in self.tried[:10]]
+        document = {
+            "verdict": self.verdict,
+            "mistake": self.named.kind,
+            "words": self.named.words,
+            "as_good": [{"mistake": remedy.kind, "words": remedy.words} for remedy in self.equal],
+            "healthy": self.healthy,
+            "matches": self.matches,
+            "before": _plain(self.before),
+            "after": _plain(self.after),
+            "tried": tried,
+        }
+        return json.dumps(document, indent=2)
+
+
+def _plain(figures: Figures) -> dict[str, float | None]:
+    return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
+
+
+def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosis:
+    """Which usual mistake, if any, was made with a rig, by one picture (C, H, W) of two or more of its cameras.
+
+    Raises ValueError, one line, for a camera that the rig lacks, fewer than two pictures, equal ones, and pictures in
+    which too few points match; and for a rig that says nothing of how its cameras are related.
+    """
+    for name in images:
+        rig.known(name)
+    sizes = {name: (int(image.shape[1]), int(image.shape[2])) for name, image in images.items()}
+    return diagnose_matches(rig, sizes, match_cameras(images))
+
+
+def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
+    """The same of points matched already, of pictures of these sizes."""
+    pairs = {names: _some(matches) for names, matches in related(rig, pairs).items()}
+    tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
+    figures = _examine(rig, tried, pairs)
+    fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].badness)
+    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
+    best = min(i for i in order if figures[i].badness <= least)
+    healthy = fits and figures[0].badness < UNSEEN
+    if healthy or (fits and figures[best].badness > BETTER * figures[0].badness):
+        best = 0
+    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].badness <= least and best}
+    equal.pop(tried[best].kind, None)
+    table = tuple((tried[i], figures[i]) for i in order)
+    count = sum(len(matches.alpha) for matches in pairs.values())
+    repaired = tried[best].repair(rig)
+    return Diagnosis(tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired)
+
+
+def _some(matches: Matches) -> Matches:
+    """At most `MOST` of them, evenly through the list."""
+    step = max(1, -(-len(matches.alpha) // MOST))
+    return Matches(matches.alpha[::step], matches.beta[::step])
+
+
+def _examine(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[Figures]:
+    """The figures of every explanation, from the same points: those that agree under the best of them."""
+    rigs = [remedy.repair(rig) for remedy in tried]
+    seen = _observe(rigs, pairs)
+    inliers, floor = _agreement(rig, tried, seen.off, pairs)
+    kept = [handedness(matches) for matches in pairs.values()]
+    return [
+        _figures(
+            *(part[i] for part in seen),
+            inliers=inliers,
+            floor=floor,
+            bounds=rig.depth,
+            handed=_mean(abs(share - _mirrors(repaired, names)) for share, names in zip(kept, pairs)),
+        )
+        for i, repaired in enumerate(rigs)
+    ]
+
+
+def handedness(matches: Matches) -> float:
+    """The share of triangles of neighbouring points (Delaunay's, in alpha) that keep their handedness in beta."""
+    try:
+        corners = Delaunay(matches.alpha.numpy()).simplices
+    except QhullError:
+        return 1.0
+    areas = [_area(points[torch.from_numpy(corners).long()]) for points in matches]
+    return float((areas[0] * areas[1] > 0).double().mean())
+
+
+def _area(triangles: Tensor) -> Tensor:
+    first, second = (triangles[:, i] - triangles[:, 0] for i in (1, 2))
+    return first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0]
+
+
+def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
+    """Whether one of two cameras is that of a mirrored picture."""
+    views = [rig[name] for name in names]
+    return sum(isinstance(v, Camera) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
+
+
+def _mean(shares: Iterable[float]) -> float:
+    found = list(shares)
+    return sum(found) / len(found)
+
+
+class Observed(NamedTuple):
+    """All points of all pairs (n) by several rigs (k): signed distance in pixels from the line, depth, in front.
+
+    Where the depth cannot be told it is NaN.
+    """
+
+    off: Float[Tensor, "k n"]
+    depth: Float[Tensor, "k n"]
+    front: Bool[Tensor, "k n"]
+
+
+def _observe(rigs: Sequence[Rig], pairs: Pairs) -> Observed:
+    parts = [_observe_pair([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
+    return Observed(*(torch.cat(part, 1) for part in zip(*parts)))
+
+
+def _observe_pair(pairs: Sequence[Pair], matches: Matches) -> Observed:
+    """One pair of cameras by several rigs, those with the same kind of lenses at a time."""
+    count = len(matches.alpha)
+    off, depth = torch.full((2, len(pairs), count), torch.nan, dtype=torch.float64)
+    front = torch.zeros(len(pairs), count, dtype=torch.bool)
+    groups: dict[object, list[int]] = {}
+    for i, pair in enumerate(pairs):
+        groups.setdefault(nature(pair), []).append(i)
+    for group in groups.values():
+        pair = stacked([pairs[i] for i in group])
+        (_, line, valid), seen = residuals_and_depths(pair, matches)
+        line = torch.where(valid, line.detach(), FAR_OFF)
+        off[group] = line.nan_to_num(FAR_OFF).clamp(-FAR_OFF, FAR_OFF)
+        if seen is not None:
+            depth[group], front[group] = torch.where(seen.known, seen.depth, torch.nan), seen.front
+    return Observed(off, depth, front)
+
+
+def _agreement(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
+    """Which points agree with some pose of the cameras, and their mean square distance then, in square pixels.
+
+    The pose is free, so only the lens makes a difference: of the explanations that change it, the best is taken.
+    """
+    fits = []
+    for remedy, o in zip(tried, off):
+        if remedy.kind in ("nothing", "distortion"):
+            repaired = remedy.repair(rig)
+            lengths = [len(matches.alpha) for matches in pairs.values()]
+            left = [_beyond_pose(repaired.pair(*n), m, r) for (n, m), r in zip(pairs.items(), o.split(lengths))]
+            fits.append(torch.cat(left))
+    left_over = min(fits, key=lambda e: float(e.abs().median()))
+    inliers = left_over.abs() <= max(4 * float(left_over.abs().median()), 0.2)
+    return inliers, _trimmed_square(left_over[inliers])
+
+
+def _trimmed_square(off: Tensor) -> float:
+    """The mean square of all but the largest."""
+    squares = off.square().sort().values
+    return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
+
+
+def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
+    """What of the distances no change of F explains, to first order; robustly."""
+    basis = lines_basis(pair, matches)
+    weight = torch.ones_like(off)
+    left = off
+    for _ in range(8):
+        solution = torch.linalg.lstsq(weight[:, None] * basis, (weight * off)[:, None], driver="gelsd").solution
+        left = off - (basis @ solution)[:, 0]
+        scale = left.abs().median().clamp(min=1e-3)
+        weight = 1 / (1 + (left / (2 * scale)).square())
+    return left
+
+
+def _figures(
+    off: Tensor,
+    depth: Tensor,
+    front: Tensor,
+    *,
+    inliers: Tensor,
+    floor: float,
+    bounds: Depths | None,
+    handed: float,
+) -> Figures:
+    off = off[inliers]
+    misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
+    told = ~depth.isnan()
+    share = float(front[told].double().mean()) if int(told.sum()) >= FEW else math.nan
+    return Figures(float(off.abs().median()), misfit, share, _inside(bounds, depth[told & front]), handed)
+
+
+def _inside(bounds: Depths | None, depth: Tensor) -> float:
+    """The share of depths between half the near and twice the far bound."""
+    if bounds is None or len(depth) < FEW:
+        return math.nan
+    near, far = (float(bound) for bound in bounds)
+    return float(((depth > 0.5 * near) & (depth < 2 * far)).double().mean())
+
+
+def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remedy]:
+    """The distortion that would explain the points best, in the cameras that have none."""
+    bare = bare_cameras(rig, sizes)
+    if not bare or any(rig[name].hw != hw for name, hw in sizes.items()):
+        return []
+    squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
+
+    lowest, highest = BARREL / squared, PINCUSHION / squared
+    k1 = 0.0
+    for _ in range(3):
+        candidates = torch.linspace(lowest, highest, 13, dtype=torch.float64).tolist()
+        off = _observe([lens_remedy(rig, bare, k).repair(rig) for k in candidates], pairs).off
+        best = int(off.abs().median(1).values.argmin())
+        k1, step = candidates[best], candidates[1] - candidates[0]
+        lowest, highest = k1 - step, k1 + step
+    return [lens_remedy(rig, bare, k1)]
+
+
+def _corner_radius(camera: Camera) -> float:
+    """Distance from the axis, at z = 1, of the farthest corner."""
+    h, w = camera.hw
+    corners = camera.K.new_tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]])
+    return float(camera.rays(corners)[0][:, :2].norm(dim=-1).max())

@@ -1,0 +1,284 @@
+"""The usual mistakes in rigs, each with what undoes it.
+
+A `Remedy` turns the rig that was given into the rig that is right if that mistake was made, for the pictures as they
+are. What was done to pictures without telling the rig is done to the rig's camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix
+from arraygeom.pixels import HW, shift_matrix, turn_matrix
+
+KINDS = (
+    *("nothing", "resized", "turned or mirrored", "cameras swapped", "pose inverted", "R transposed"),
+    *("x and y exchanged", "units", "distortion", "half-pixel shift", "one-pixel shift"),
+)
+RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
+UNITS = {
+    1e-3: "millimetres taken for metres",
+    1e3: "metres taken for millimetres",
+    1e-2: "centimetres taken for metres",
+    1e2: "metres taken for centimetres",
+}
+TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
+"""Exchanges x and y."""
+
+Repair = Callable[[Rig], Rig]
+
+
+@dataclass(frozen=True)
+class Remedy:
+    """One mistake that may have been made: its kind (one of `KINDS`), in words, and what undoes it."""
+
+    kind: str
+    words: str
+    repair: Repair
+
+
+NOTHING = Remedy("nothing", "as given", lambda rig: rig)
+
+
+def remedies(rig: Rig, sizes: Mapping[str, HW]) -> list[Remedy]:
+    """All single mistakes that can have been made with a rig whose pictures have these sizes, likely ones first.
+
+    Where pictures do not have the sizes that the rig states, only what explains it.
+    """
+    names = [name for name in rig.names if name in sizes]
+    wrong = tuple(name for name in names if rig[name].hw != sizes[name])
+    if wrong:
+        return [*_of_sizes(rig, wrong, sizes), *_swapped(rig, names, sizes)]
+    return [
+        *_swapped(rig, names, sizes),
+        *_poses(rig, names),
+        *_units(rig),
+        *_exchanged(rig, names),
+        *_turned(rig, names, sizes),
+        *_scaled(names),
+        *_lenses(rig, names),
+        *_shifts(names),
+    ]
+
+
+def bare_cameras(rig: Rig, names: Iterable[str]) -> dict[str, Camera]:
+    """Those of the cameras that are calibrated and have no lens distortion."""
+    return {n: c for n in names if isinstance(c := rig[n], Camera) and c.distortion is None}
+
+
+def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
+    """Distortion was ignored, and is about `k1` in all cameras that have none.
+
+    With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3): one
+    number, and one to one at any radius.
+    """
+    bare = bare_cameras(rig, names)
+    words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
+    lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
+    return Remedy("distortion", words, partial(on_cameras, names=bare, change=lambda c: c.replace(distortion=lens)))
+
+
+def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:
+    """Mirroring a picture left to right (`across`), or top to bottom.
+
+    >>> (mirror_matrix((4, 6), across=True) @ torch.tensor([5.0, 1.0, 1.0], dtype=torch.float64)).tolist()
+    [0.0, 1.0, 1.0]
+    """
+    A = torch.eye(3, dtype=torch.float64)
+    axis = 0 if across else 1
+    A[axis, axis], A[axis, 2] = -1, hw[1 - axis] - 1
+    return A
+
+
+TURNS: dict[str, Callable[[HW], Tensor]] = {
+    "turned by 180 degrees": lambda hw: turn_matrix(hw, 2),
+    "turned by 90 degrees counter-clockwise": lambda hw: turn_matrix(hw, 1),
+    "turned by 90 degrees clockwise": lambda hw: turn_matrix(hw, 3),
+    "mirrored left to right": lambda hw: mirror_matrix(hw, across=True),
+    "mirrored top to bottom": lambda hw: mirror_matrix(hw, across=False),
+    "mirrored about the diagonal (rows and columns exchanged)": lambda hw: TRANSPOSE,
+    "mirrored about the other diagonal": lambda hw: turn_matrix(hw[::-1], 2) @ TRANSPOSE,
+}
+"""What may be done to a picture by turning and mirroring it: x' ~ A x, A being that of the picture's size."""
+
+
+def turned_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
+    """A and the new size of one of `TURNS`."""
+    A = TURNS[words](view.hw)
+    return A, view.hw[::-1] if bool(A[0, 0] == 0) else view.hw
+
+
+def swap(rig: Rig, a: str, b: str) -> Rig:
+    """The rig in which two names have exchanged their cameras."""
+    other = {a: b, b: a}
+    cameras = {n: rig[other.get(n, n)] for n in rig.names}
+    links = {(other.get(i, i), other.get(j, j)): link for (i, j), link in rig.links.items()}
+    return rig.replace(cameras=cameras, links=links)
+
+
+def on_cameras(rig: Rig, names: Iterable[str], change: Callable[[Camera], Camera]) -> Rig:
+    """The rig with the calibrated ones among some cameras changed."""
+    changed = {n: change(c) for n in names if isinstance(c := rig[n], Camera)}
+    return rig.replace(cameras={**rig.cameras, **changed})
+
+
+def on_pixels(rig: Rig, names: Iterable[str], change: Callable[[View], tuple[Tensor, HW]]) -> Rig:
+    """The rig with the pixels of some cameras mapped: x' ~ A x, and the new size."""
+    for name in names:
+        rig = rig.mapped(name, *change(rig[name]))
+    return rig
+
+
+def _groups(names: Iterable[str]) -> Iterator[tuple[tuple[str, ...], str]]:
+    """All cameras together, then one by one; and how to say so."""
+    names = tuple(names)
+    if names:
+        yield names, "all cameras"
+        yield from (((n,), f"'{n}'") for n in names)
+
+
+def _calibrated(rig: Rig, names: Iterable[str]) -> list[str]:
+    return [n for n in names if isinstance(rig[n], Camera)]
+
+
+def _swapped(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
+    for a, b in combinations(names, 2):
+        if rig[a].hw == sizes[b] and rig[b].hw == sizes[a]:
+            yield Remedy("cameras swapped", f"pictures of '{a}' and '{b}' swapped", partial(swap, a=a, b=b))
+
+
+def _poses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
+    changes: dict[tuple[str, str], Callable[[Pose], Pose]] = {
+        ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
+        ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.transpose(-1, -2), pose.t),
+    }
+    for (kind, words), change in changes.items():
+        for group, spoken in _groups(_calibrated(rig, names)):
+            posed = partial(_posed, change=change)
+            yield Remedy(kind, words.format(spoken), partial(on_cameras, names=group, change=posed))
+
+
+def _posed(camera: Camera, change: Callable[[Pose], Pose]) -> Camera:
+    return camera.replace(cam_from_world=change(camera.cam_from_world))
+
+
+def _units(rig: Rig) -> Iterator[Remedy]:
+    for factor, words in UNITS.items() if rig.depth is not None else ():
+        scaled = partial(_posed, change=partial(_scaled_pose, factor=factor))
+        words = f"translations against the depth range: {words}"
+        yield Remedy("units", words, partial(on_cameras, names=rig.names, change=scaled))
+
+
+def _scaled_pose(pose: Pose, factor: float) -> Pose:
+    return Pose(pose.R, pose.t * factor)
+
+
+def _exchanged(rig: Rig, names: list[str]) -> Iterator[Remedy]:
+    for group, spoken in _groups(_calibrated(rig, names)):
+        words = f"x and y exchanged in focal lengths and principal point of {spoken}"
+        yield Remedy("x and y exchanged", words, partial(on_cameras, names=group, change=_transposed))
+    if rig.links:
+        words = "x and y exchanged in F (it is for row, column)"
+        yield Remedy("x and y exchanged", words, partial(on_pixels, names=names, change=lambda v: (TRANSPOSE, v.hw)))
+
+
+def _transposed(camera: Camera) -> Camera:
+    P = TRANSPOSE.to(camera.K)
+    return camera.replace(K=P @ camera.K @ P)
+
+
+def _turned(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
+    """Pictures turned or mirrored after calibration, where the sizes allow it."""
+    for words in TURNS:
+        for group, spoken in _groups(names):
+            if all(turned_view(rig[n], words)[1] == sizes[n] for n in group):
+                repair = partial(on_pixels, names=group, change=partial(turned_view, words=words))
+                yield Remedy("turned or mirrored", f"picture of {spoken} {words}", repair)
+
+
+def _scaled(names: list[str]) -> Iterator[Remedy]:
+    """K is for pictures of another size than the rig says."""
+    for factor in RESIZED:
+        for group, spoken in _groups(names):
+            words = f"K of {spoken} is for pictures {1 / factor:.3g} times as large"
+            yield Remedy("resized", words, partial(on_pixels, names=group, change=partial(_magnified, factor=factor)))
+
+
+def _magnified(view: View, factor: float) -> tuple[Tensor, HW]:
+    A = torch.diag(torch.tensor([factor, factor, 1.0], dtype=torch.float64))
+    A[:2, 2] = 0.5 * factor - 0.5
+    return A, view.hw
+
+
+def _of_sizes(rig: Rig, wrong: tuple[str, ...], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
+    """What makes the sizes that the rig states those of the pictures."""
+    spoken = ", ".join(map(repr, wrong))
+    if all(rig[n].hw == sizes[n][::-1] for n in wrong):
+        for words in TURNS:
+            if all(turned_view(rig[n], words)[1] == sizes[n] for n in wrong):
+                repair = partial(on_pixels, names=wrong, change=partial(turned_view, words=words))
+                yield Remedy("turned or mirrored", f"picture of {spoken} {words}", repair)
+        words = f"size of {spoken} written as height, width"
+        yield Remedy("x and y exchanged", words, partial(_to_sizes, names=wrong, sizes=sizes, matrix=_cut_at_corner))
+    for words, matrix in FITS.items():
+        repair = partial(_to_sizes, names=wrong, sizes=sizes, matrix=matrix)
+        yield Remedy("resized", f"picture of {spoken} {words}", repair)
+
+
+def _cut_at_corner(old: HW, new: HW) -> Tensor:
+    return shift_matrix(0, 0)
+
+
+def _cut_from_middle(old: HW, new: HW) -> Tensor:
+    return shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2)
+
+
+FITS: dict[str, Callable[[HW, HW], Tensor]] = {
+    "resized": resize_matrix,
+    "cut out of the middle": _cut_from_middle,
+    "cut off at the right and the bottom": _cut_at_corner,
+}
+"""How a picture may have come to another size."""
+
+
+def _to_sizes(rig: Rig, names: Iterable[str], sizes: Mapping[str, HW], matrix: Callable[[HW, HW], Tensor]) -> Rig:
+    for name in names:
+        rig = rig.mapped(name, matrix(rig[name].hw, sizes[name]), sizes[name])
+    return rig
+
+
+def _lenses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
+    curved = [n for n in _calibrated(rig, names) if n not in bare_cameras(rig, names)]
+    for group, spoken in _groups(curved):
+        drop, turn = (partial(on_cameras, names=group, change=change) for change in (_without_lens, _opposite_lens))
+        yield Remedy("distortion", f"pictures of {spoken} are undistorted already: distortion applied twice", drop)
+        yield Remedy("distortion", f"distortion of {spoken} with the wrong sign (the inverse map)", turn)
+
+
+def _without_lens(camera: Camera) -> Camera:
+    return camera.replace(distortion=None)
+
+
+def _opposite_lens(camera: Camera) -> Camera:
+    lens = camera.distortion
+    return camera if lens is None else camera.replace(distortion=Distortion(lens.model, -lens.coefficients))
+
+
+def _shifts(names: list[str]) -> Iterator[Remedy]:
+    for pixels, kind in ((0.5, "half-pixel shift"), (1.0, "one-pixel shift")):
+        for group, spoken in _groups(names):
+            for shift in (-pixels, pixels):
+                words = f"pixels of {spoken} are {shift:+g} from where the rig counts them"
+                repair = partial(on_pixels, names=group, change=partial(_shifted, shift=shift))
+                yield Remedy(kind, words, repair)
+
+
+def _shifted(view: View, shift: float) -> tuple[Tensor, HW]:
+    return shift_matrix(-shift, -shift), view.hw

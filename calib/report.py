@@ -1,0 +1,341 @@
+"""The report of a calibration: one HTML file with its figures inside."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LogNorm
+from matplotlib.figure import Figure
+
+from arraygeom import Camera, Pose, Rig
+from arraygeom.viz import COLOURS, draw_rig, show_picture
+
+from .bundle import BoardPoses
+from .calibrate import Calibration
+from .covariance import RigCovariance, baseline_deviation, beta_covariance
+from .coverage import CELLS, Coverage, coverage
+from .observability import LENS_TERMS
+
+STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
+table { border-collapse: collapse; margin: .6em 0 1.4em; font-variant-numeric: tabular-nums }
+td, th { padding: .2em .8em .2em 0; text-align: left; vertical-align: top; border-bottom: 1px solid #ddd }
+h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% } .note { color: #8a3b00 } small { color: #666 }
+"""
+
+
+def report_html(calibration: Calibration, *, title: str = "Calibration", notes: Sequence[str] = ()) -> str:
+    """The report: accuracy by camera, pair and picture, coverage, residual fields, uncertainties, the rig."""
+    covers = coverages(calibration)
+    advice = [*notes, *calibration.notes, *(f"{n}: {m}" for n, c in covers.items() for m in c.missing)]
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        f"<p>{escape(summary(calibration))}</p>",
+        _list(advice) if advice else "<p>Nothing is missing.</p>",
+        "<h2>Cameras</h2>",
+        camera_table(calibration, covers),
+        "<h2>Pairs</h2>" + pair_table(calibration) if len(calibration.views) > 1 else "",
+        "<h2>The rig and the boards</h2>",
+        image(draw_scene(calibration)),
+        "<h2>Residuals of each picture</h2><p>Root mean square, pixels.</p>",
+        image(draw_by_picture(calibration)),
+    ]
+    for name in calibration.views:
+        parts += [
+            f"<h2>{escape(name)}: coverage and residuals</h2>",
+            image(draw_camera(calibration, name, covers[name])),
+        ]
+    if len(calibration.views) > 1 and calibration.fit.covariance is not None:
+        near, far = depths(covers.values())
+        parts += [
+            "<h2>Uncertainty of what is predicted</h2>",
+            "<p>How far, in pixels (one standard deviation, worst direction), what the first camera sees may be from where "
+            f"the rig says that the others see it: at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
+            image(draw_uncertainty(calibration, (near, far))),
+        ]
+    body = "\n".join(parts)
+    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
+    return f'<!DOCTYPE html>\n<html lang="en">{head}\n{body}\n</html>\n'
+
+
+def summary(calibration: Calibration) -> str:
+    """The calibration in a sentence or two."""
+    points = sum(len(seen.x) for seen in calibration.fit.scene.seen.values())
+    text = (
+        f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, {points} points: "
+        f"reprojection error {calibration.rms:.3f} px (RMS)."
+    )
+    for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):
+        if errors:
+            everything = np.concatenate(list(errors.values()))
+            most = np.quantile(everything, 0.95)
+            text += f" Epipolar error{where} {everything.mean():.3f} px (mean; 95 % below {most:.3f})."
+    return text
+
+
+def coverages(calibration: Calibration) -> dict[str, Coverage]:
+    """Of every camera."""
+    structure = calibration.fit.scene.structure
+    assert isinstance(structure, BoardPoses)
+    boards = structure.world_from_board
+    found = {}
+    for name, views in calibration.views.items():
+        camera = calibration.fit.scene.cameras[name]
+        poses = {
+            key: camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
+            for i, key in enumerate(calibration.frames)
+            if key in views.seen
+        }
+        found[name] = coverage(views, poses, calibration.board)
+    return found
+
+
+def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
+    """Of the nearest and the furthest board point."""
+    near, far = zip(*(c.depths for c in covers))
+    return max(min(near), 1e-3), max(far)
+
+
+# Tables -------------------------------------------------------------------------------------------------------
+
+
+def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
+    """One row a camera: how much was seen, how well it fits, and its numbers with their deviations."""
+    residuals = calibration.fit.scene.residuals()
+    head = "camera|pictures, points|error px, together (alone)|noise px|focal length px|principal point px|lens|covered"
+    rows = []
+    for name, camera in calibration.fit.scene.cameras.items():
+        views, r, covered = calibration.views[name], residuals[name], covers[name]
+        rms = np.sqrt((r**2).sum(-1).mean())
+        rows.append(
+            (
+                f"{name} {camera.hw[1]}x{camera.hw[0]}",
+                f"{len(views.seen)}, {len(r)}",
+                f"{rms:.3f} ({calibration.alone[name]:.3f})",
+                f"{calibration.fit.sigma[name]:.3f}",
+                _with_deviations(calibration, name, camera, "focal"),
+                _with_deviations(calibration, name, camera, "centre"),
+                _with_deviations(calibration, name, camera, "distortion"),
+                f"{covered.share:.0%} of the picture, {covered.depths[0]:.3g} to {covered.depths[1]:.3g} m, "
+                f"tilts {covered.tilts[0]:.0f} to {covered.tilts[1]:.0f} deg",
+            )
+        )
+    return _table(head.split("|"), rows)
+
+
+def pair_table(calibration: Calibration) -> str:
+    """One row a pair: baseline, turn and epipolar errors."""
+    covariance = rig_covariance(calibration)
+    cameras = calibration.fit.scene.cameras
+    first = next(iter(cameras))
+    rows = []
+    for (a, b), errors in calibration.epipolar.items():
+        baseline = float((cameras[a].centre - cameras[b].centre).norm())
+        deviation = baseline_deviation(cameras, b, covariance) if covariance and a == first else None
+        held = calibration.held_out.get((a, b))
+        rows.append(
+            (
+                f"{a} – {b}",
+                f"{1e3 * baseline:.2f}" + (f" ± {1e3 * deviation:.2f}" if deviation is not None else ""),
+                f"{_turn(cameras[a], cameras[b]):.3f}",
+                f"{errors.mean():.3f}, {np.quantile(errors, 0.95):.3f}",
+                "" if held is None or not len(held) else f"{held.mean():.3f}, {np.quantile(held, 0.95):.3f}",
+            )
+        )
+    return _table(["pair", "baseline mm", "turn deg", "epipolar error px, mean, 95 %", "on held-out frames"], rows)
+
+
+def rig_covariance(calibration: Calibration) -> RigCovariance | None:
+    """The covariance of the calibration's free numbers, if they can be told."""
+    matrix = calibration.fit.covariance
+    return None if matrix is None else RigCovariance(calibration.fit.names, matrix)
+
+
+def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: str) -> str:
+    covariance = rig_covariance(calibration)
+    lens = camera.distortion
+    values = {
+        "focal": camera.K.diagonal()[:2],
+        "centre": camera.K[:2, 2],
+        "distortion": camera.K.new_zeros(0) if lens is None else lens.coefficients,
+    }[kind].tolist()
+    texts = []
+    for i, value in enumerate(values):
+        label = "" if kind != "distortion" or lens is None else f"{LENS_TERMS[lens.model][i]} "
+        if f"{name}.{kind}.{i}" not in calibration.fit.names:
+            texts.append(f"{label}{value:.4g} (kept)" if value or kind != "distortion" else "")
+            continue
+        deviation = covariance.deviation(f"{name}.{kind}.{i}") if covariance else float("nan")
+        texts.append(f"{label}{value:.{_digits(deviation)}f} ± {deviation:.2g}")
+    return ", ".join(t for t in texts if t)
+
+
+def _digits(deviation: float) -> int:
+    """Decimals that a number with a deviation deserves."""
+    return int(np.clip(1 - np.floor(np.log10(deviation)), 0, 8)) if deviation > 0 else 4
+
+
+def _turn(a: Camera, b: Camera) -> float:
+    cosine = (float((b.R @ a.R.T).trace()) - 1) / 2
+    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    top = "".join(f"<th>{escape(h)}</th>" for h in head)
+    lines = ["<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows]
+    return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
+
+
+def _list(items: Sequence[str]) -> str:
+    return "<ul>" + "".join(f'<li class="note">{escape(item)}</li>' for item in items) + "</ul>"
+
+
+# Figures ------------------------------------------------------------------------------------------------------
+
+
+def draw_scene(calibration: Calibration) -> Figure:
+    """The rig alone, and the boards as the first camera's neighbours saw them, from above."""
+    structure = calibration.fit.scene.structure
+    assert isinstance(structure, BoardPoses)
+    figure = draw_rig(Rig({_plain(n): c for n, c in calibration.rig.cameras.items()}))
+    figure.set_size_inches(10.4, 4.6)
+    axes: Any = figure.axes[0]
+    axes.set_position((0.0, 0.02, 0.46, 0.94))
+    figure.set_layout_engine("none")
+    above = figure.add_axes((0.55, 0.12, 0.43, 0.8))
+    corners = _outline(calibration)
+    for i in range(len(structure)):
+        X = corners @ structure.world_from_board.R[i].numpy().T + structure.world_from_board.t[i].numpy()
+        above.plot(X[:, 0], X[:, 2], color="0.75", lw=0.8)
+    for colour, (name, camera) in zip(_colours(), calibration.fit.scene.cameras.items()):
+        x, _, z = camera.centre.tolist()
+        dx, _, dz = camera.R[2].tolist()
+        above.plot(x, z, "o", ms=4, color=colour)
+        above.annotate(
+            _plain(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
+        )
+        above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
+    above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
+    above.set_title("from above, with the boards", fontsize=9)
+    above.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def draw_by_picture(calibration: Calibration) -> Figure:
+    """The root mean square residual of every picture of every camera, by frame."""
+    frames = calibration.frames
+    figure = Figure(figsize=(10.4, 2.8), layout="constrained")
+    axes = figure.subplots()
+    for colour, (name, r) in zip(_colours(), calibration.fit.scene.residuals().items()):
+        block = calibration.fit.scene.seen[name].block
+        squared = np.bincount(block, (r**2).sum(-1), len(frames)) / np.maximum(
+            np.bincount(block, minlength=len(frames)), 1
+        )
+        present = np.bincount(block, minlength=len(frames)) > 0
+        axes.plot(np.flatnonzero(present), np.sqrt(squared[present]), "o", ms=4, color=colour, label=_plain(name))
+    step = max(1, len(frames) // 30)
+    axes.set_xticks(range(0, len(frames), step), [_plain(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
+    axes.set(ylim=(0, None), xlabel="frame", ylabel="RMS residual (px)")
+    axes.spines[["top", "right"]].set_visible(False)
+    figure.legend(fontsize=8, frameon=False, loc="outside right upper")
+    return figure
+
+
+def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
+    """One camera: where points were seen; the mean residual of each part of the picture, magnified; their scatter."""
+    seen, r = calibration.fit.scene.seen[name], calibration.fit.scene.residuals()[name]
+    hw = calibration.views[name].hw
+    figure = Figure(figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed")
+    left, middle, right = figure.subplots(1, 3)
+    show_picture(left, hw)
+    left.imshow(np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal")
+    left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
+    left.set_title(f"points seen (red: none), {covered.share:.0%} covered", fontsize=9)
+    show_picture(middle, hw)
+    _draw_field(middle, seen.x, r, hw)
+    limit = max(4 * calibration.fit.sigma[name], 1e-3)
+    right.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5, color=COLOURS[0])
+    right.set(xlim=(-limit, limit), ylim=(limit, -limit), aspect="equal", xlabel="x (px)", ylabel="y (px)")
+    right.set_title(f"residuals, noise {calibration.fit.sigma[name]:.3f} px", fontsize=9)
+    right.spines[["top", "right"]].set_visible(False)
+    return figure
+
+
+def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) -> None:
+    """The median residual in each cell as an arrow, all magnified so that the longest is most of a cell."""
+    rows, columns = 2 * CELLS[0], 2 * CELLS[1]
+    row = np.clip(((x[:, 1] + 0.5) / hw[0] * rows).astype(int), 0, rows - 1)
+    column = np.clip(((x[:, 0] + 0.5) / hw[1] * columns).astype(int), 0, columns - 1)
+    cell = row * columns + column
+    filled = [c for c in np.unique(cell) if (cell == c).sum() >= 3]
+    if not filled:
+        return
+    at = np.array([x[cell == c].mean(0) for c in filled])
+    arrows = np.array([np.median(r[cell == c], axis=0) for c in filled])
+    longest = float(np.linalg.norm(arrows, axis=1).max())
+    magnify = 1.2 * hw[1] / columns / max(longest, 1e-9)
+    axes.quiver(*at.T, *(magnify * arrows).T, angles="xy", scale_units="xy", scale=1, width=0.004, color=COLOURS[1])
+    axes.set_title(f"median residuals, longest {longest:.3f} px", fontsize=9)
+
+
+def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figure:
+    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's picture."""
+    covariance = rig_covariance(calibration)
+    assert covariance is not None
+    alpha, *betas = calibration.views
+    h, w = calibration.views[alpha].hw
+    xs, ys = np.linspace(0, w - 1, 25), np.linspace(0, h - 1, 19)
+    x = np.stack(np.meshgrid(xs, ys), -1).reshape(-1, 2)
+    figure = Figure(figsize=(8.4, 2.6 * len(betas) + 0.3), layout="constrained")
+    grid = figure.subplots(len(betas), len(at), squeeze=False)
+    for row, beta in zip(grid, betas):
+        for axes, depth in zip(row, at):
+            pixels = beta_covariance(calibration.rig, covariance, alpha, beta, x, depth)
+            usable = np.isfinite(pixels).all((1, 2))
+            deviation = np.full(len(x), np.nan)
+            deviation[usable] = np.sqrt(np.linalg.eigvalsh(pixels[usable])[:, -1])
+            shown = axes.imshow(
+                deviation.reshape(len(ys), len(xs)), extent=_extent((h, w)), cmap="viridis", norm=LogNorm()
+            )
+            axes.set(xticks=[], yticks=[])
+            median = float(np.median(deviation[usable])) if usable.any() else float("nan")
+            axes.set_title(f"{_plain(beta)} of {_plain(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
+            figure.colorbar(shown, ax=axes, shrink=0.9)
+    return figure
+
+
+def image(figure: Figure) -> str:
+    """A figure as an HTML image with the pixels inside."""
+    FigureCanvasAgg(figure)
+    data = BytesIO()
+    figure.savefig(data, format="png", dpi=110)
+    return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+
+
+def _outline(calibration: Calibration) -> np.ndarray:
+    low, high = calibration.board.points.min(0), calibration.board.points.max(0)
+    return np.array(
+        [
+            [x, y, 0.0]
+            for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1]))
+        ]
+    )
+
+
+def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
+    return (-0.5, hw[1] - 0.5, hw[0] - 0.5, -0.5)
+
+
+def _colours() -> Iterable[str]:
+    return COLOURS * 32
+
+
+def _plain(text: str) -> str:
+    """Text that matplotlib does not take for formulas."""
+    return text.replace("$", r"\$")

@@ -1,0 +1,5 @@
+"""`python -m pat` is `pat`: torchrun starts it so."""
+
+from .cli import main
+
+main()

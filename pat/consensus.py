@@ -1,0 +1,229 @@
+"""Consensus: what neighbours along the segments agree on, before attention looks closely.
+
+Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
+semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
+are places along each pixel's own segment, so it works for any rig with straight fields, rectified or not. It is
+worked out on pictures of half the size, as a whole frame and without gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import Segments
+from arraygeom.sampling import sample
+
+from . import consensus_kernels as kernels
+from .threads import in_parallel
+
+FINE = 2
+"""The consensus is found on pictures this many times smaller."""
+BLOCK = 320
+"""Side of the squares that are worked off at a time, in pixels of the reduced pictures."""
+MOST_MARGIN = 192
+CONSISTENT = 0.2
+"""The views agree on a match if the look back is less than this (times 8 pixels) from it."""
+LIKENESS = 0.08
+"""Difference of brightness at which the trust in a match falls to 1 / e."""
+DOUBT = 0.25
+"""Trust in a match on which the two views do not agree, before the likeness."""
+REACH_FILL = (50.0, 4.0)
+"""Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
+COLOUR_FILLS = ((300.0, 3.0), (1000.0, 20.0))
+"""The same of colour: over what is smoothly connected, and over texture."""
+FLOOR = 1e-3
+"""Regulariser (variance of brightness) of the regression of colour on brightness."""
+FILLS = len(COLOUR_FILLS)
+
+
+class Consensus(NamedTuple):
+    """What neighbours agree on, for pictures of H x W.
+
+    reach: (B, 1, H / 2, W / 2), how far from its segment's end the match is, pixels of beta; where the match is
+        not trusted, spread from where it is.
+    facts: (B, 3, H / 2, W / 2), how far a look back from beta disagrees, by how much the match is better than
+        others, and its cost; each 0 to 1.
+    colour: (B, fills, C, H, W), beta's bands minus alpha, from pixels with trust spread to those without, once for
+        each of `COLOUR_FILLS`.
+    """
+
+    reach: Tensor
+    facts: Tensor
+    colour: Tensor
+
+    def cut(self, box: tuple[int, int, int, int]) -> Consensus:
+        """The part at alpha's (top, bottom, left, right), all even."""
+        top, bottom, left, right = box
+        half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
+        return Consensus(self.reach[half], self.facts[half], self.colour[..., top:bottom, left:right])
+
+    def band(self, i: int) -> Consensus:
+        """The same of one band alone."""
+        return self._replace(colour=self.colour[:, :, i : i + 1])
+
+
+class _Geometry(NamedTuple):
+    """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32."""
+
+    end: NDArray[np.float32]
+    along: NDArray[np.float32]
+    length: NDArray[np.float32]
+
+
+@torch.no_grad()
+def consensus(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    beta: Float[Tensor, "b c hb wb"],
+    segments: Segments,
+    blocks: Segments,
+) -> Consensus:
+    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
+
+    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
+    of its 2x2 pixels, in beta's pixels. All sides are even. On the CPU, with as many threads as torch may use; the
+    same whatever their number.
+    """
+    own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
+    other = levelled(other, own)
+    geometry = _geometry(blocks, len(alpha))
+    reach, facts = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
+    consistent = (facts[..., 0] < CONSISTENT).astype(np.float32)
+    planes = zip(reach, consistent, _bytes(own))
+    spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
+    reach = np.where(consistent > 0, reach, spread)
+    found = Consensus(
+        FINE * torch.from_numpy(reach)[:, None].to(alpha),
+        torch.from_numpy(facts).movedim(-1, 1).to(alpha),
+        alpha.new_empty(0),
+    )
+    return found._replace(colour=_spread_colour(alpha, guide, beta, segments, found))
+
+
+def levelled(picture: Float[Tensor, "b 1 hb wb"], like: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 hb wb"]:
+    """The picture with the mean and the standard deviation of another, each of the batch by itself."""
+    spread, mean = torch.std_mean(picture, (1, 2, 3), keepdim=True)
+    wanted, middle = torch.std_mean(like, (1, 2, 3), keepdim=True)
+    return (picture - mean) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + middle
+
+
+def _geometry(segments: Segments, batch: int) -> _Geometry:
+    """An invalid segment is as short as none: its length is negative."""
+    length = segments.length
+    along = (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+    end = (segments.end + 0.5) / FINE - 0.5
+    length = torch.where(segments.valid, length / FINE, -1.0)
+    return _Geometry(*(_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along, length)))
+
+
+def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
+    """Reach (B, h, w) in pixels of the reduced beta, and facts (B, h, w, 3)."""
+    labels = int(max(geometry.length.max(), 0)) + 2
+    reach = np.zeros(own.shape, np.float32)
+    facts = np.ones((*own.shape, 3), np.float32)
+    bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
+    in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
+    tasks = []
+    for i, (a, b) in enumerate(zip(own, other)):
+        views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
+        tasks += [partial(_block, views, box, labels, reach[i], facts[i]) for box in _blocks(a.shape, labels)]
+    in_parallel(tasks)
+    return reach, facts
+
+
+def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+    """Inner and outer squares: what is kept, and what is worked out for it."""
+    margin = min(labels + 32, MOST_MARGIN)
+    for top in range(0, hw[0], BLOCK):
+        for left in range(0, hw[1], BLOCK):
+            inner = slice(top, min(top + BLOCK, hw[0])), slice(left, min(left + BLOCK, hw[1]))
+            outer = (
+                slice(max(top - margin, 0), top + BLOCK + margin),
+                slice(max(left - margin, 0), left + BLOCK + margin),
+            )
+            yield inner, outer
+
+
+def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray) -> None:
+    own, own_bits, other, other_bits, end, along, length = views
+    inner, outer = box
+    a, a_bits, e, u, n = (np.ascontiguousarray(x[outer]) for x in (own, own_bits, end, along, length))
+    cost = np.empty((*a.shape, labels), np.uint8)
+    kernels.costs(a, a_bits, other, other_bits, e, u, n, cost)
+    total = np.zeros(cost.shape, np.float32)
+    kernels.aggregate(cost, a, total)
+    r, f = np.empty(a.shape, np.float32), np.empty((*a.shape, 3), np.float32)
+    kernels.winners(total, e, u, n, *other.shape, r, f)
+    inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
+    reach[inner], facts[inner] = r[inside], f[inside]
+
+
+def _spread_colour(alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, found: Consensus) -> Tensor:
+    """Beta's bands minus alpha at the matches, spread by trust over what is connected in alpha."""
+    position = _position(segments, found.reach).reshape(len(beta), -1, 2)
+    seen = sample(torch.cat([beta, levelled(guide, alpha)], 1), position.to(beta))
+    bands, brightness = seen.values.reshape(len(beta), -1, *alpha.shape[-2:]).split([beta.shape[1], 1], 1)
+    unlike = avg_pool2d((brightness - alpha).abs(), 3, 1, 1, count_include_pad=False)
+    agreed = _enlarged(torch.where(found.facts[:, :1] < CONSISTENT, 1.0, DOUBT))
+    trust = agreed * seen.valid.reshape(unlike.shape) * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+    planes = list(zip(_numpy(bands - alpha), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
+    filled = np.zeros((len(planes), FILLS, *bands.shape[1:]), np.float32)
+
+    def fill(picture: int, how: int) -> None:
+        filled[picture, how] = _regressed(*planes[picture], COLOUR_FILLS[how])
+
+    in_parallel([partial(fill, i, j) for i in range(len(planes)) for j in range(FILLS)])
+    return torch.from_numpy(filled).to(alpha)
+
+
+def _regressed(
+    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]
+) -> NDArray[np.float32]:
+    """Colour (c, h, w) as its weighted regression on brightness (h, w) says, over what is connected in the guide.
+
+    The moments of the guided filter (He et al. 2013), spread instead of averaged over a window: what no beta sees
+    has colour that varies with brightness as it does nearby.
+    """
+    moments = _filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
+    mean, square, (middle, product) = moments[0], moments[1], np.split(moments[2:], 2)
+    slope = (product - middle * mean) / (np.maximum(square - mean**2, 0) + FLOOR)
+    return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
+
+
+def _position(segments: Segments, reach: Tensor) -> Tensor:
+    """The matches of all alpha pixels (B, H, W, 2), in beta's pixels."""
+    length = segments.length
+    along = (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+    return segments.end + _enlarged(reach)[:, 0, ..., None] * along
+
+
+def _enlarged(x: Tensor) -> Tensor:
+    return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)
+
+
+def _filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
+    """The weighted mean of planes (c, h, w) over what is connected in the guide. Weights are positive."""
+
+    def smooth(plane: NDArray) -> NDArray:
+        return cv2.ximgproc.fastGlobalSmootherFilter(guide, np.ascontiguousarray(plane, np.float32), *how)
+
+    total = smooth(weight)
+    return np.stack([smooth(plane * weight) / total for plane in planes])
+
+
+def _numpy(x: Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)
+
+
+def _bytes(picture: Tensor) -> NDArray[np.uint8]:
+    return np.rint(np.clip(_numpy(picture[:, 0]), 0, 1) * 255).astype(np.uint8)

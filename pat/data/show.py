@@ -1,0 +1,49 @@
+"""Drawings of samples: what cameras record of a patch, where some pixels look, the truth and its depth."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from arraygeom.fields import ReceptiveField
+from arraygeom.viz import COLOURS, draw_look, numpy, show_picture, suitable_field
+from pat.results import colour_depth
+
+from .scenes import Patch
+
+LOOKS = 6
+"""Pixels of alpha whose fields are drawn."""
+
+
+def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = None) -> Figure:
+    """One line for each patch: alpha and betas as recorded with a few pixels' fields, truth, depth."""
+    columns = len(patches[0].images) + 2
+    h, w = patches[0].truth.shape[-2:]
+    figure = Figure(figsize=(3.2 * columns, (3.2 * h / w + 0.35) * len(patches)), layout="constrained")
+    for row, patch in enumerate(patches):
+        x = _spots(patch.rig[patch.alpha].hw)
+        for column, (name, image) in enumerate(patch.images.items()):
+            axes = figure.add_subplot(len(patches), columns, row * columns + column + 1)
+            show_picture(axes, patch.rig[name].hw, image.expand(3, -1, -1).clamp(0, 1))
+            axes.set_title(f"{name} (alpha)" if column == 0 else name, fontsize=8)
+            if column == 0:
+                axes.scatter(*numpy(x).T, c=COLOURS[: len(x)], s=18, edgecolors="white", linewidths=0.6)
+            else:
+                pair = patch.rig.pair(patch.alpha, name)
+                draw_look(axes, field or suitable_field(pair), pair, x)
+        for column, (title, image) in enumerate({"truth": patch.truth, "depth": colour_depth(patch.depth)}.items()):
+            axes = figure.add_subplot(len(patches), columns, row * columns + columns - 1 + column)
+            show_picture(axes, (image.shape[-2], image.shape[-1]), image)
+            axes.set_title(title, fontsize=8)
+    return figure
+
+
+def _spots(hw: tuple[int, int]) -> Float[Tensor, "n 2"]:
+    """A few pixels spread over a picture, in a zigzag."""
+    across = (torch.arange(LOOKS) + 0.5) / LOOKS * hw[1]
+    down = torch.tensor([0.25, 0.75]).repeat(LOOKS)[:LOOKS] * hw[0]
+    return torch.stack([across, down], -1).floor()

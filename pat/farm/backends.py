@@ -1,0 +1,205 @@
+"""What renders one scene from one seed: layered photographs, or Blender."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW
+from arraygeom.pose import Pose
+from arraygeom.rig import Rig
+from pat.sensors import Linear, record
+from pat.synthesis.blender.lens import lens_for
+from pat.synthesis.blender.settings import RenderSettings
+from pat.synthesis.blender.task import fitted, render_here, shots
+from pat.synthesis.check import Limits, Report, check_views
+from pat.synthesis.document import from_document
+from pat.synthesis.generators import GENERATORS
+from pat.synthesis.layered import ArrayBatch, LayeredScenes
+from pat.synthesis.patterns import patterns
+from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rendered import RENDER_FILE, Frame, frame_file, save_frame
+from pat.synthesis.rigs import RigBatch, RigDistribution
+
+FARTHEST = 50.0
+"""Layered scenes of rigs that see to infinity end at this many times the near bound."""
+
+
+@runtime_checkable
+class Renderer(Protocol):
+    """Renders scenes of one job."""
+
+    def render(self, seed: int, out: Path) -> Report:
+        """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises ValueError."""
+        ...
+
+
+@dataclass(frozen=True, kw_only=True)
+class LayeredSettings:
+    """Layered scenes: the first camera of the rig is alpha.
+
+    `photos` are folders of pictures (none: patterns alone), reduced to `edge` pixels; `layers` bounds the number of
+    planes; `oversampling` samples a pixel along each axis.
+    """
+
+    photos: tuple[Path, ...] = ()
+    edge: int = 512
+    layers: tuple[int, int] = (5, 12)
+    oversampling: int = 2
+
+    def check_rig(self, rig: Rig) -> None:
+        """Raises ValueError for a rig that cannot be rendered."""
+        rig_from_alpha(rig)
+
+    def pictures(self, rig: Rig) -> list[HW]:
+        """The sizes of the pictures of a scene."""
+        return [camera.hw for camera in rig.cameras.values()]
+
+    def renderer(self, rig: Rig, limits: Limits) -> Renderer:
+        """A renderer that is ready."""
+        return LayeredRenderer(rig, self, limits)
+
+
+@dataclass(frozen=True, kw_only=True)
+class BlenderSettings:
+    """Blender's scenes: a generator, a preset, and settings that differ from the preset's.
+
+    `photos` is the folder of pictures for the generator "photographs".
+    """
+
+    generator: Literal["abstract", "photographs"] = "abstract"
+    photos: Path | None = None
+    preset: Literal["fast", "paper"] = "fast"
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.generator == "photographs") != (self.photos is not None):
+            raise ValueError("the generator 'photographs' needs a folder `photos`, and only that one takes it")
+        self.render_settings()
+
+    def render_settings(self) -> RenderSettings:
+        """All settings; one thread unless they say otherwise, because a farm has a worker a core."""
+        given = from_document(RenderSettings, dict(self.settings), "settings")
+        changes = {name: getattr(given, name) for name in self.settings}
+        return RenderSettings.preset(self.preset, **{"threads": 1, **changes})
+
+    def check_rig(self, rig: Rig) -> None:
+        """Raises ValueError for a rig that cannot be rendered."""
+        for name, camera in rig.cameras.items():
+            lens_for(camera, name)
+
+    def pictures(self, rig: Rig) -> list[HW]:
+        """The sizes of the pictures of a scene, as often as they are taken."""
+        settings = self.render_settings()
+        rig = fitted(rig, settings)
+        return [rig[shot.camera].hw for shot in shots(rig, settings)]
+
+    def renderer(self, rig: Rig, limits: Limits) -> Renderer:
+        """A renderer that is ready. Raises ValueError without Blender."""
+        return BlenderRenderer(rig, self, limits)
+
+
+class LayeredRenderer:
+    """Layered scenes seen by a rig of pinholes."""
+
+    def __init__(self, rig: Rig, settings: LayeredSettings, limits: Limits):
+        self.rig, self.settings, self.limits = rig, settings, limits
+        self.seen = rig_from_alpha(rig)
+        self.scenes = LayeredScenes(
+            _bank(settings), RigDistribution(), hw=self.seen.cameras[0].hw, layers=settings.layers
+        )
+
+    def render(self, seed: int, out: Path) -> Report:
+        """Render, write and check."""
+        started = time.monotonic()
+        batch = self.scenes.render(
+            self.seen, torch.Generator().manual_seed(seed), oversampling=self.settings.oversampling
+        )
+        frames = dict(zip(self.rig.names, _frames(batch)))
+        out.mkdir(parents=True)
+        self.rig.save(out / "rig.yaml")
+        for name, frame in frames.items():
+            save_frame(out / frame_file(self.rig, name), frame)
+        report = check_views(self.rig, frames, self.limits)
+        about = {
+            "settings": {"backend": "layered"},
+            "versions": {"pat": version("arraygeom-pat"), "torch": torch.__version__},
+            "seconds": round(time.monotonic() - started, 3),
+            "frames": {name: [{"file": frame_file(self.rig, name), "time": 0.0}] for name in self.rig.names},
+            "check": report.to_document(),
+        }
+        (out / RENDER_FILE).write_text(json.dumps(about, indent=1), encoding="utf-8")
+        return report
+
+
+def rig_from_alpha(rig: Rig) -> RigBatch:
+    """A rig as layered scenes want it: batched, the first camera being the world's frame.
+
+    Raises ValueError for cameras that are not calibrated or have a lens, and for a rig without a depth range.
+    """
+    for name, camera in rig.cameras.items():
+        if not isinstance(camera, Camera):
+            raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
+        if camera.distortion is not None:
+            raise ValueError(
+                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or leave it out"
+            )
+    if rig.depth is None:
+        raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
+    near, far = (float(d) for d in rig.depth)
+    far = min(far, FARTHEST * near)
+    cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
+    world_from_alpha = cameras[0].cam_from_world.inverse()
+    seen = [_batched(c, c.cam_from_world @ world_from_alpha) for c in cameras]
+    return RigBatch(seen, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64))
+
+
+def _batched(camera: Camera, pose: Pose) -> Camera:
+    return camera.replace(K=camera.K[None], cam_from_world=Pose(pose.R[None], pose.t[None]))
+
+
+def _bank(settings: LayeredSettings) -> PhotoBank:
+    if settings.photos:
+        return PhotoBank.load(*settings.photos, max_edge=settings.edge)
+    return PhotoBank(patterns(np.random.default_rng(0), 60))
+
+
+def _frames(batch: ArrayBatch) -> list[Frame]:
+    return [
+        Frame(time=0.0, rgb=_linear(image)[0], depth=depth[0], index=index[0])
+        for image, depth, index in zip(batch.images, batch.depth, batch.index)
+    ]
+
+
+def _linear(image: Tensor) -> Tensor:
+    return record(image, [Linear()], torch.Generator()).image
+
+
+class BlenderRenderer:
+    """Blender's scenes seen by any calibrated rig. This process imports bpy."""
+
+    def __init__(self, rig: Rig, settings: BlenderSettings, limits: Limits):
+        from pat.synthesis.blender import compat
+
+        compat.load()
+        self.rig, self.settings = rig, settings
+        self.render_settings = replace(settings.render_settings(), limits=limits)
+
+    def render(self, seed: int, out: Path) -> Report:
+        """Render, write and check."""
+        further = {} if self.settings.photos is None else {"folder": self.settings.photos}
+        moving = self.render_settings.duration
+        scene = GENERATORS[self.settings.generator](seed, self.rig, moving=moving, **further)
+        rendered = render_here(scene, self.rig, out, settings=self.render_settings)
+        said = dict(rendered.about["check"])
+        return Report(views=said["views"], pairs=said["pairs"], reasons=tuple(said["reasons"]))

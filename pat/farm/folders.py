@@ -1,0 +1,176 @@
+"""The folder of a job: what is done, what is under way, what was given up. Only the standard library."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+RESERVE = 64 << 20
+"""Bytes of disk that stay free."""
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Part `number` (from 1) of `count`: scenes number - 1, number - 1 + count, and so on."""
+
+    number: int = 1
+    count: int = 1
+
+    @classmethod
+    def parse(cls, text: str) -> Shard:
+        """From "2/4". Raises ValueError.
+
+        >>> Shard.parse("2/4").of(10)
+        [1, 5, 9]
+        """
+        number, _, count = text.partition("/")
+        if not (number.isdecimal() and count.isdecimal() and 1 <= int(number) <= int(count)):
+            raise ValueError(f"--shard: '{text}' is not i/n with i from 1 to n, such as 2/4")
+        return cls(int(number), int(count))
+
+    def of(self, scenes: int) -> list[int]:
+        """The scenes of this part."""
+        return list(range(self.number - 1, scenes, self.count))
+
+    @property
+    def tag(self) -> str:
+        """For names of files."""
+        return f"{self.number}of{self.count}"
+
+
+@dataclass(frozen=True)
+class JobFolder:
+    """Names in a job's folder, and what there is."""
+
+    root: Path
+
+    @property
+    def scenes(self) -> Path:
+        """Where whole scenes are."""
+        return self.root / "scenes"
+
+    @property
+    def work(self) -> Path:
+        """What is under way."""
+        return self.root / ".work"
+
+    def scene(self, index: int) -> Path:
+        """The folder of a scene, whether it is there or not."""
+        return self.scenes / f"{index:06d}"
+
+    def quarantined(self, index: int) -> Path:
+        """The folder that says why a scene was given up, whether it is there or not."""
+        return self.root / "quarantine" / f"{index:06d}"
+
+    def is_done(self, index: int) -> bool:
+        """Whether a scene is there."""
+        return self.scene(index).is_dir()
+
+    def done(self) -> list[int]:
+        """The scenes that are there, in order."""
+        return _numbers(self.scenes)
+
+    def given_up(self) -> list[int]:
+        """The scenes in quarantine, in order."""
+        return _numbers(self.root / "quarantine")
+
+    def partial(self, index: int, tag: str) -> Path:
+        """A new name for a scene under way."""
+        self.work.mkdir(parents=True, exist_ok=True)
+        return self.work / f"{tag}-{index:06d}-{uuid4().hex[:12]}"
+
+    def clean(self, tag: str) -> None:
+        """Remove what a former run of the same shard left half done."""
+        names = (f"{tag}-*", f".{tag}-*", f"log-{tag}-*")
+        for left in (path for name in names for path in self.work.glob(name)):
+            shutil.rmtree(left) if left.is_dir() else left.unlink()
+
+    @contextmanager
+    def locked(self, tag: str) -> Iterator[None]:
+        """Only one run of a shard at a time on this machine. Raises ValueError if there is one."""
+        self.work.mkdir(parents=True, exist_ok=True)
+        with (self.work / f"lock-{tag}").open("w") as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except OSError:
+                raise ValueError(
+                    f"{self.root}: another run is rendering into it: wait for it, or use --shard"
+                ) from None
+            yield
+
+    def journal(self, event: str, index: int, **facts: Any) -> None:
+        """Note that something happened to a scene, in a file of this process alone."""
+        folder = self.work / "journal"
+        folder.mkdir(parents=True, exist_ok=True)
+        line = json.dumps({"time": time.time_ns(), "scene": index, "event": event, **facts})
+        with (folder / f"{socket.gethostname()}-{os.getpid()}.jsonl").open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+
+    def give_up(self, index: int, reason: str, log: str, **facts: Any) -> None:
+        """Put a scene into quarantine."""
+        partial = self.partial(index, "quarantine")
+        partial.mkdir()
+        (partial / "log.txt").write_text(log, encoding="utf-8")
+        (partial / "reason.json").write_text(json.dumps({"reason": reason, **facts}, indent=1), encoding="utf-8")
+        publish(partial, self.quarantined(index))
+
+    def free(self) -> int:
+        """Bytes of disk left."""
+        self.root.mkdir(parents=True, exist_ok=True)
+        return shutil.disk_usage(self.root).free
+
+    def bytes_per_scene(self) -> float | None:
+        """The mean size of up to 20 scenes that are there; None if there are none."""
+        some = [self.scene(i) for i in self.done()[:20]]
+        sizes = [sum(f.stat().st_size for f in scene.iterdir()) for scene in some]
+        return sum(sizes) / len(sizes) if sizes else None
+
+
+def publish(partial: Path, final: Path) -> bool:
+    """Give a whole folder its name, after all of it is on disk. False if the name was taken; then it is removed."""
+    for path in [*partial.iterdir(), partial]:
+        _sync(path)
+    final.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.rename(partial, final)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise
+        shutil.rmtree(partial, ignore_errors=True)
+        return False
+    _sync(final.parent)
+    return True
+
+
+def write_whole(path: Path, text: str) -> None:
+    """A file that appears whole or not at all."""
+    temporary = path.with_name(f".{path.name}-{uuid4().hex[:12]}")
+    try:
+        temporary.write_text(text, encoding="utf-8")
+        _sync(temporary)
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def _numbers(folder: Path) -> list[int]:
+    return sorted(int(p.name) for p in folder.iterdir() if p.name.isdecimal()) if folder.is_dir() else []

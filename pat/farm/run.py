@@ -1,0 +1,148 @@
+"""A job from its configuration to its last scene, with progress."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from .folders import RESERVE, JobFolder, Shard
+from .job import Job, RenderConfig
+from .pools import dask_pool, local_pool
+from .worker import FACTS
+from .workshop import Order, Outcome, worker_command
+
+LINE_EVERY = 30.0
+"""Seconds between lines of progress where there is no terminal."""
+
+
+@dataclass
+class Summary:
+    """What a run has done."""
+
+    made: int = 0
+    there: int = 0
+    given_up: list[int] = field(default_factory=list)
+    stopped: int = 0
+    refusals: int = 0
+    crashes: int = 0
+    seconds: float = 0.0
+
+    def add(self, outcome: Outcome) -> None:
+        """Count one scene."""
+        self.made += outcome.state == "done"
+        self.there += outcome.state == "there"
+        self.stopped += outcome.state == "stopped"
+        self.refusals += outcome.refusals
+        self.crashes += outcome.crashes
+        if outcome.state == "given up":
+            self.given_up.append(outcome.index)
+
+    @property
+    def complete(self) -> bool:
+        """Whether every scene that was asked for is there."""
+        return not (self.given_up or self.stopped)
+
+    @property
+    def rate(self) -> float:
+        """Scenes an hour."""
+        return 3600 * self.made / self.seconds if self.seconds else 0.0
+
+    def __str__(self) -> str:
+        extra = [f"{n} {what}" for n, what in ((self.refusals, "refused by the check"), (self.crashes, "crashed")) if n]
+        if self.given_up:
+            extra.append(
+                f"given up: {', '.join(map(str, self.given_up[:10]))}{' ...' if len(self.given_up) > 10 else ''}"
+            )
+        return ", ".join([f"{self.made} scenes made, {self.there} were there", f"{self.rate:.0f} an hour", *extra])
+
+
+def render(
+    config: RenderConfig,
+    *,
+    scenes: int,
+    out: Path,
+    workers: int = 1,
+    shard: Shard = Shard(),  # noqa: B008
+    scheduler: str | None = None,
+    console: Console | None = None,
+) -> Summary:
+    """Render what is missing of `scenes` scenes into the folder `out`.
+
+    With `scheduler`, on a Dask cluster (see `pat.farm.pools`), else by `workers` processes. Scenes that are there
+    or in quarantine are left alone. Raises ValueError for what cannot be rendered, more scenes than the disk
+    holds, or a folder in use or of another configuration; Stopped if the job cannot go on.
+    """
+    if scenes < 1 or workers < 1:
+        raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
+    config.load_rig()
+    job = Job(config=config, root=Path(out).absolute(), tag=shard.tag)
+    job.root.mkdir(parents=True, exist_ok=True)
+    with job.folder.locked(shard.tag):
+        wanted = shard.of(scenes)
+        summary, missing, order = _prepared(job, wanted)
+        pool = (
+            local_pool(order, missing, workers) if scheduler is None else dask_pool(order, missing, scheduler, workers)
+        )
+        try:
+            for _ in _shown(pool, summary, len(wanted), console or Console(stderr=True)):
+                pass
+        finally:
+            with suppress(OSError):
+                job.write_table(FACTS)
+    return summary
+
+
+def _prepared(job: Job, wanted: list[int]) -> tuple[Summary, list[int], Order]:
+    """What there is, the scenes that are missing, and what workers are told. Raises ValueError."""
+    folder, config = job.folder, job.config
+    folder.clean(job.tag)
+    job.write_manifest()
+    job.save()
+    done, given_up = set(folder.done()), set(folder.given_up())
+    missing = [i for i in wanted if i not in done | given_up]
+    size = folder.bytes_per_scene() or config.scene_bytes()
+    check_space(folder, len(missing), size)
+    command = worker_command(job.file)
+    order = Order(root=job.root, tag=job.tag, command=command, limits=config.limits, scene_bytes=size)
+    return Summary(there=len(done & set(wanted)), given_up=sorted(given_up & set(wanted))), missing, order
+
+
+def check_space(folder: JobFolder, scenes: int, scene_bytes: float) -> None:
+    """Raises ValueError if so many more scenes do not fit on the disk."""
+    need, free = scenes * scene_bytes + RESERVE, folder.free()
+    if scenes and need > free:
+        fits = max(int((free - RESERVE) / scene_bytes), 0)
+        raise ValueError(
+            f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {folder.root} has "
+            f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another --out"
+        )
+
+
+def _shown(outcomes: Iterator[Outcome], summary: Summary, total: int, console: Console) -> Iterator[Outcome]:
+    """The outcomes, counted in `summary` and shown as they come."""
+    started = told = time.monotonic()
+    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
+    done = summary.there + len(summary.given_up)
+    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
+        task = bar.add_task("", total=total, completed=done)
+        for outcome in outcomes:
+            summary.add(outcome)
+            summary.seconds = time.monotonic() - started
+            done += 1
+            bar.update(task, completed=done, description=_status(summary, total - done))
+            if not console.is_terminal and time.monotonic() - told > LINE_EVERY:
+                told = time.monotonic()
+                console.print(f"{done} of {total}: {_status(summary, total - done)}", soft_wrap=True, highlight=False)
+            yield outcome
+
+
+def _status(summary: Summary, left: int) -> str:
+    hours = left / summary.rate if summary.rate else float("nan")
+    eta = f"{hours:.1f} h left" if hours > 1 else f"{60 * hours:.0f} min left"
+    return f"{summary.rate:.0f} scenes/h, {eta}, {summary.refusals} refused, {summary.crashes} crashed"

@@ -1,0 +1,74 @@
+"""Motion between frames of one camera: optical flow, how far it can be trusted, and pictures carried along it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from arraygeom import pixel_grid, sample
+
+ASTRAY = 1.0
+"""Flow that does not lead back to within this many pixels is trusted less than 1 / e."""
+UNLIKE = 0.08
+"""So is flow between pixels whose values differ by this."""
+STILL = 0.5
+"""Pixels that move less than this between two frames are still."""
+
+
+class Flow(NamedTuple):
+    """Where each pixel of one frame is in another: (2, H, W) pixels in x and y, and trust (H, W) in that, 0 to 1."""
+
+    step: Float[Tensor, "2 h w"]
+    trust: Float[Tensor, "h w"]
+
+
+def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
+    """Dense inverse search (Kroeger et al. 2016) from frame a to b; trusted where it leads back and values agree.
+
+    Values of b are first brought to a's mean: light that flickers is no motion.
+    """
+    b = b * (a.mean() / b.mean().clamp(min=1e-6))
+    there, back = _steps(a, b), _steps(b, a)
+    returned = there + carried(back, there)
+    likeness = _smooth((carried(b, there) - a).abs()[0])
+    trust = torch.exp(-returned.square().sum(0) / ASTRAY**2 - (likeness / UNLIKE).square())
+    return Flow(there, trust * _inside(there))
+
+
+def carried(picture: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
+    """The picture looked up where each pixel goes, bilinearly; outside the frame its nearest pixel."""
+    h, w = picture.shape[-2:]
+    x = pixel_grid((h, w)) + step.movedim(0, -1)
+    x = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
+    return sample(picture[None], x[None]).values[0]
+
+
+def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, "h w"]:
+    """Where nothing moves from frame a to b, and nothing near does."""
+    moves = (_steps(a, b).square().sum(0) > STILL**2).numpy().astype(np.uint8)
+    return torch.from_numpy(cv2.dilate(moves, np.ones((9, 9), np.uint8)) == 0)
+
+
+def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
+    engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    flow = engine.calc(_bytes(a), _bytes(b), np.empty(0, np.float32))
+    return torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))
+
+
+def _bytes(picture: Tensor) -> np.ndarray:
+    return np.rint(picture[0].clamp(0, 1).numpy() * 255).astype(np.uint8)
+
+
+def _inside(step: Tensor) -> Tensor:
+    h, w = step.shape[-2:]
+    x = pixel_grid((h, w)) + step.movedim(0, -1)
+    return ((x >= 0) & (x <= x.new_tensor([w - 1, h - 1]))).all(-1).float()
+
+
+def _smooth(plane: Tensor) -> Tensor:
+    return torch.from_numpy(cv2.boxFilter(plane.numpy(), -1, (5, 5)))

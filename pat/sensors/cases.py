@@ -1,0 +1,74 @@
+"""Cases: how the pictures of a pair are degraded, one drawn for each pair."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Generator, Tensor
+
+from .chain import Step, record
+from .electronics import Clip
+from .grids import Resample
+from .optics import BoxBlur
+
+
+@dataclass(frozen=True)
+class Case:
+    """One way in which the two pictures of a pair are degraded."""
+
+    name: str
+    alpha: tuple[Step, ...] = ()
+    beta: tuple[Step, ...] = ()
+
+
+def paper_cases(blur: int = 5) -> tuple[Case, Case, Case, Case]:
+    """The paper's four augmentations for two inputs; each is to be drawn with probability 1/4.
+
+    The paper does not give the blur; here it is a box of `blur` pixels.
+    """
+    reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
+    return (
+        Case("blur alpha", alpha=(BoxBlur(blur),)),
+        Case("blur beta", beta=(BoxBlur(blur),)),
+        Case("reduce beta", beta=reduced),
+        Case("blur and reduce beta", beta=(BoxBlur(blur), *reduced)),
+    )
+
+
+class Pairs(NamedTuple):
+    """Degraded pictures of both cameras, and which case each pair of the batch met."""
+
+    alpha: Float[Tensor, "b ca ha wa"]
+    beta: Float[Tensor, "b cb hb wb"]
+    case: Int[Tensor, " b"]
+
+
+def augment(
+    alpha: Float[Tensor, "b ca ha wa"],
+    beta: Float[Tensor, "b cb hb wb"],
+    cases: Sequence[Case],
+    generator: Generator,
+) -> Pairs:
+    """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must come out as they went in."""
+    drawn = torch.randint(len(cases), (len(alpha),), generator=generator, device=generator.device)
+    alpha, beta = alpha.clone(), beta.clone()
+    for i, case in enumerate(cases):
+        met = (drawn == i).nonzero()[:, 0].to(alpha.device)
+        if len(met):
+            alpha[met] = _same_size(alpha[met], case.alpha, generator, case.name)
+            beta[met] = _same_size(beta[met], case.beta, generator, case.name)
+    return Pairs(alpha, beta, drawn)
+
+
+def _same_size(image: Tensor, steps: Sequence[Step], generator: Generator, name: str) -> Tensor:
+    degraded = record(image, steps, generator).image
+    if degraded.shape != image.shape:
+        old, new = tuple(image.shape[1:]), tuple(degraded.shape[1:])
+        raise ValueError(
+            f'case "{name}" turns {old} into {new}; the cases of a batch must keep the size: add a Resample'
+        )
+    return degraded

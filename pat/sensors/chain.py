@@ -1,0 +1,175 @@
+"""Chains of steps, and what each does to pictures, pixels and cameras."""
+
+from __future__ import annotations
+
+import hashlib
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW, map_homogeneous, pixel_grid
+from arraygeom.rig import Rig
+from arraygeom.sampling import sample
+
+
+@dataclass(frozen=True)
+class Light:
+    """Pictures on their way through a chain, and what is known of what they show, all of the same pixels.
+
+    `depth` in metres along the optical axis; `motion` (x, y) in pixels a second; `camera` with K of these pixels;
+    `pixels` is A with x ~ A x_first (float64).
+    """
+
+    image: Float[Tensor, "b c h w"]
+    pixels: Float[Tensor, "3 3"]
+    depth: Float[Tensor, "b h w"] | None = None
+    motion: Float[Tensor, "b 2 h w"] | None = None
+    camera: Camera | None = None
+
+    @property
+    def hw(self) -> HW:
+        """Height and width."""
+        return self.image.shape[-2], self.image.shape[-1]
+
+    def moved(self, A: Float[Tensor, "3 3"], image: Float[Tensor, "b c2 h2 w2"]) -> Light:
+        """New pictures whose pixels are x' ~ A x; depth and motion are those of the nearest former pixels."""
+        hw = image.shape[-2], image.shape[-1]
+        if hw == self.hw and torch.equal(A, torch.eye(3, dtype=A.dtype)):
+            return replace(self, image=image)
+        depth = None if self.depth is None else _looked_up(self.depth[:, None], A, hw)[:, 0]
+        motion = None if self.motion is None else _turned(_looked_up(self.motion, A, hw), A)
+        camera = None if self.camera is None else self.camera.mapped(A, hw)
+        return Light(image, A @ self.pixels, depth, motion, camera)
+
+
+def _looked_up(values: Tensor, A: Tensor, hw: HW) -> Tensor:
+    old = map_homogeneous(torch.linalg.inv(A)[:2], pixel_grid(hw, dtype=values.dtype, device=values.device))
+    limits = old.new_tensor([values.shape[-1] - 1, values.shape[-2] - 1])
+    return sample(values, torch.minimum(old.clamp(min=0), limits)[None], interpolation="nearest").values
+
+
+def _turned(motion: Tensor, A: Tensor) -> Tensor:
+    return torch.einsum("ij,bjhw->bihw", A[:2, :2].to(motion), motion)
+
+
+class Step(ABC):
+    """One thing that happens to a picture. Subclasses say what in `apply`, or in `expose` if they must know more."""
+
+    def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
+        """A with x_after ~ A x_before for a picture of height and width `hw`."""
+        return torch.eye(3, dtype=torch.float64)
+
+    @abstractmethod
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
+        """The pictures afterwards."""
+
+    def expose(self, light: Light, generator: Generator) -> Light:
+        """The pictures afterwards, with what is known of them."""
+        return light.moved(self.pixel_matrix(light.hw), self.apply(light.image, generator))
+
+
+class LitStep(Step):
+    """A step that must know what the picture shows; `expose` is the whole of it."""
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """The pictures afterwards, if what `light` holds beside the picture is not needed after all."""
+        return self.expose(Light(image, torch.eye(3, dtype=torch.float64)), generator).image
+
+    @abstractmethod
+    def expose(self, light: Light, generator: Generator) -> Light:
+        """The pictures afterwards, with what is known of them."""
+
+
+class Recorded(NamedTuple):
+    """Pictures after a chain, and A with x_after ~ A x_before (float64)."""
+
+    image: Float[Tensor, "b c h w"]
+    pixels: Float[Tensor, "3 3"]
+
+
+def record(
+    image: Float[Tensor, "b c h w"],
+    steps: Sequence[Step],
+    generator: Generator,
+    *,
+    depth: Float[Tensor, "b h w"] | None = None,
+    motion: Float[Tensor, "b 2 h w"] | None = None,
+    camera: Camera | None = None,
+) -> Recorded:
+    """Apply the steps in order.
+
+    `depth` (metres) and `camera` are needed by `Defocus`, `motion` (pixels a second) by `MotionBlur` without a
+    velocity of its own. Raises ValueError if a step misses what it needs.
+    """
+    light = Light(image, torch.eye(3, dtype=torch.float64), depth, motion, camera)
+    for step in steps:
+        light = step.expose(light, generator)
+    return Recorded(light.image, light.pixels)
+
+
+class RecordedArray(NamedTuple):
+    """Pictures of every camera after its chain, and the rig of those pictures."""
+
+    images: dict[str, Float[Tensor, "b _ _ _"]]
+    rig: Rig
+
+
+def record_array(
+    images: Mapping[str, Float[Tensor, "b _ _ _"]],
+    rig: Rig,
+    chains: Mapping[str, Sequence[Step]],
+    *,
+    seed: int,
+    depth: Mapping[str, Float[Tensor, "b _ _"]] | None = None,
+    motion: Mapping[str, Float[Tensor, "b 2 _ _"]] | None = None,
+) -> RecordedArray:
+    """Each camera's chain on its pictures; cameras without one record the ideal picture.
+
+    Each camera draws from its own generator, made of `seed` and its name: a camera more or less changes nothing
+    for the others. The rig's cameras follow what the steps do to the pixels. Raises ValueError for a camera that
+    the rig does not have.
+    """
+    recorded = {}
+    for name, image in images.items():
+        view = rig[name]
+        recorded[name], pixels = record(
+            image,
+            chains.get(name, ()),
+            generator_for(seed, name, device=image.device),
+            depth=(depth or {}).get(name),
+            motion=(motion or {}).get(name),
+            camera=view if isinstance(view, Camera) else None,
+        )
+        rig = rig.mapped(name, pixels, (recorded[name].shape[-2], recorded[name].shape[-1]))
+    for name in chains:
+        rig.known(name)
+    return RecordedArray(recorded, rig)
+
+
+def generator_for(seed: int, *names: object, device: torch.device | str = "cpu") -> Generator:
+    """A generator for something named, the same on every machine.
+
+    >>> generator_for(0, "mono", 3).initial_seed() == generator_for(0, "mono", 3).initial_seed()
+    True
+    >>> generator_for(0, "mono", 3).initial_seed() == generator_for(0, "mono", 4).initial_seed()
+    False
+    """
+    return Generator(device=device).manual_seed(seed_for(seed, *names))
+
+
+def seed_for(seed: int, *names: object) -> int:
+    """A seed of 63 bits from another one and names."""
+    digest = hashlib.sha256("/".join(map(str, (seed, *names))).encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def normal(shape: Sequence[int], like: Tensor, generator: Generator) -> Tensor:
+    """Standard normal numbers from a generator, on the device of `like`."""
+    noise = torch.randn(tuple(shape), generator=generator, device=generator.device, dtype=like.dtype)
+    return noise.to(like.device)

@@ -1,0 +1,143 @@
+"""The grid of pixels: resampling, cropping, colour filters."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from kornia.color import CFA, raw_to_rgb, rgb_to_raw
+from torch import Generator, Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom.pixels import HW, resize_matrix, shift_matrix
+
+from .chain import Step
+
+Pattern = Literal["RGGB", "GRBG", "BGGR", "GBRG"]
+_KORNIA = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
+_OPENCV = {
+    "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
+    "GRBG": cv2.COLOR_BayerGRBG2RGB_EA,
+    "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
+    "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
+}
+
+
+@dataclass(frozen=True)
+class Resample(Step):
+    """Another number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
+
+    `to` is a factor (sizes are rounded, and the factor along each axis is what they give) or a (height, width).
+    "area" is what a sensor with larger pixels records: it keeps the mean of the picture exactly. "bicubic" is
+    the usual antialiased resize with a = -0.5.
+    """
+
+    to: float | HW
+    method: Literal["area", "bicubic"] = "area"
+
+    def __post_init__(self) -> None:
+        if min(self.to if isinstance(self.to, tuple) else (self.to,)) <= 0:
+            raise ValueError(f"resample: give a positive factor or a (height, width), got {self.to}")
+
+    def hw(self, hw: HW) -> HW:
+        """The size that comes out for a size that goes in."""
+        if isinstance(self.to, tuple):
+            return self.to
+        return max(round(hw[0] * self.to), 1), max(round(hw[1] * self.to), 1)
+
+    def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
+        """The resize matrix."""
+        return resize_matrix(hw, self.hw(hw))
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
+        """The resized pictures."""
+        h, w = image.shape[-2:]
+        new = self.hw((h, w))
+        if self.method == "bicubic":
+            return interpolate(image, new, mode="bicubic", align_corners=False, antialias=True)
+        return _area_weights(h, new[0]).to(image) @ image @ _area_weights(w, new[1]).to(image).mT
+
+
+def _area_weights(old: int, new: int) -> Tensor:
+    """(new, old): the share of each old pixel in each new one, rows adding up to 1."""
+    edge = torch.arange(new + 1, dtype=torch.float64) * (old / new)
+    pixel = torch.arange(old, dtype=torch.float64)
+    overlap = torch.minimum(edge[1:, None], pixel + 1) - torch.maximum(edge[:-1, None], pixel)
+    return overlap.clamp(min=0) * (new / old)
+
+
+@dataclass(frozen=True)
+class Crop(Step):
+    """Only a window of the sensor is read: `hw` from row `top` and column `left` on."""
+
+    top: int
+    left: int
+    hw: HW
+
+    def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
+        """The shift."""
+        return shift_matrix(self.left, self.top)
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
+        """The window. Raises ValueError where it leaves the picture."""
+        (h, w), (height, width) = self.hw, image.shape[-2:]
+        if min(self.top, self.left) < 0 or self.top + h > height or self.left + w > width:
+            raise ValueError(
+                f"crop: {w}x{h} from ({self.left}, {self.top}) leaves the picture of {width}x{height}: "
+                "give a window in it"
+            )
+        return image[..., self.top : self.top + h, self.left : self.left + w]
+
+
+@dataclass(frozen=True)
+class Mosaic(Step):
+    """A Bayer filter: each pixel keeps one of R, G and B. `pattern` is read from the top left, row by row."""
+
+    pattern: Pattern = "RGGB"
+
+    def __post_init__(self) -> None:
+        _known(self.pattern)
+
+    def apply(self, image: Float[Tensor, "b 3 h w"], generator: Generator) -> Float[Tensor, "b 1 h w"]:
+        """The raw pictures. Raises ValueError for odd sizes."""
+        _even(image)
+        return rgb_to_raw(image, _KORNIA[self.pattern])
+
+
+@dataclass(frozen=True)
+class Demosaic(Step):
+    """Colours from a raw picture: bilinear (kornia; differentiable) or edge-aware (OpenCV, on 16 bits, clipped).
+
+    The gradient of "edge-aware" is that of "bilinear".
+    """
+
+    pattern: Pattern = "RGGB"
+    method: Literal["bilinear", "edge-aware"] = "bilinear"
+
+    def __post_init__(self) -> None:
+        _known(self.pattern)
+
+    def apply(self, image: Float[Tensor, "b 1 h w"], generator: Generator) -> Float[Tensor, "b 3 h w"]:
+        """The pictures in colour. Raises ValueError for odd sizes."""
+        _even(image)
+        bilinear = raw_to_rgb(image, _KORNIA[self.pattern])
+        if self.method == "bilinear":
+            return bilinear
+        raw = (image.detach().clamp(0, 1) * 65535).round().cpu().numpy().astype(np.uint16)
+        colours = np.stack([cv2.cvtColor(picture[0], _OPENCV[self.pattern]) for picture in raw])
+        edge_aware = torch.from_numpy(colours.astype(np.float32) / 65535).movedim(-1, 1).to(image)
+        return bilinear + (edge_aware - bilinear).detach()
+
+
+def _known(pattern: str) -> None:
+    if pattern not in _KORNIA:
+        raise ValueError(f"a colour filter pattern is one of {', '.join(_KORNIA)}, got '{pattern}'")
+
+
+def _even(image: Tensor) -> None:
+    if image.shape[-2] % 2 or image.shape[-1] % 2:
+        raise ValueError(f"a colour filter needs even sizes, got {image.shape[-1]}x{image.shape[-2]}: crop first")

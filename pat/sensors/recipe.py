@@ -1,0 +1,93 @@
+"""Chains as lists in a file.
+
+    mono:
+      - linear
+      - spectral: luminance
+      - defocus: {focus: 3, f_number: 2, lens: 25}
+      - resample: 0.5
+      - noise: {full_well: 8000, read: 3}
+      - clip
+      - coded
+      - quantise: 8
+
+A step is its name, or its name with its options; a single value is its first option. Steps are named as their
+classes are, in small letters with hyphens.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any
+
+from pat.synthesis.document import from_document, near
+
+from .cases import Case
+from .chain import Step
+from .electronics import Clip, Exposure, Jitter, Noise, Quantise
+from .grids import Crop, Demosaic, Mosaic, Resample
+from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting
+from .spectral import Coded, Gamma, Linear, Spectral
+
+_CLASSES: tuple[type[Step], ...] = (
+    *(Linear, Coded, Gamma, Spectral, Exposure, Vignetting),
+    *(BoxBlur, GaussianBlur, DiscBlur, Defocus, MotionBlur),
+    *(Resample, Crop, Mosaic, Demosaic, Noise, Clip, Quantise, Jitter),
+)
+STEPS: dict[str, type[Step]] = {re.sub(r"(?<!^)(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
+"""Every step by its name in files."""
+
+
+def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
+    """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest name.
+
+    >>> read_chain(["linear", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
+    (Linear(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
+    """
+    if not isinstance(value, list):
+        raise ValueError(f"{where}: wanted a list of steps, such as [linear, {{noise: {{full_well: 8000}}}}]")
+    return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
+
+
+def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...]]:
+    """One chain for each camera, from a mapping of names to lists."""
+    if not isinstance(value, Mapping):
+        raise ValueError(f"{where}: wanted a mapping of cameras to lists of steps")
+    return {str(name): read_chain(steps, f"{where}.{name}") for name, steps in value.items()}
+
+
+def read_cases(value: Any, where: str = "cases") -> tuple[Case, ...]:
+    """Cases for pairs, from a list of mappings with `name` and, if degraded, `alpha` and `beta`."""
+    if not isinstance(value, list) or not value:
+        raise ValueError(f"{where}: wanted a list of cases, such as [{{name: blur beta, beta: [{{box-blur: 5}}]}}]")
+    return tuple(_case(entry, f"{where}[{i}]") for i, entry in enumerate(value))
+
+
+def _case(entry: Any, where: str) -> Case:
+    if not isinstance(entry, Mapping) or "name" not in entry:
+        raise ValueError(f"{where}: wanted a mapping with name, alpha and beta")
+    for key in entry:
+        if key not in ("name", "alpha", "beta"):
+            raise ValueError(f"{where}.{key}: unknown key{near(key, ('name', 'alpha', 'beta'))}")
+    alpha, beta = (read_chain(entry.get(side, []), f"{where}.{side}") for side in ("alpha", "beta"))
+    return Case(str(entry["name"]), alpha, beta)
+
+
+def _step(entry: Any, where: str) -> Step:
+    name, options = next(iter(entry.items())) if isinstance(entry, Mapping) and len(entry) == 1 else (entry, {})
+    if not isinstance(name, str):
+        raise ValueError(f"{where}: is {entry!r}; wanted a step's name, or one name with its options")
+    if name not in STEPS:
+        raise ValueError(f"{where}: no step is called '{name}'{near(name, STEPS)}")
+    kind = STEPS[name]
+    if isinstance(options, Mapping) and not _is_band(kind, options):
+        return from_document(kind, dict(options), f"{where}.{name}")
+    first = next((f.name for f in fields(kind)), None)  # type: ignore[arg-type]
+    if first is None:
+        raise ValueError(f"{where}.{name}: takes no options, got {options!r}")
+    return from_document(kind, {first: options}, f"{where}.{name}")
+
+
+def _is_band(kind: type[Step], options: Mapping[str, Any]) -> bool:
+    return kind is Spectral and "response" not in options and bool(options)

@@ -1,0 +1,129 @@
+"""Spectral responses, and the coding of light."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from arraygeom.sensor import Band, Curve
+
+from .chain import Step
+
+CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
+"""What the channels R, G, B and NIR of an ideal picture are taken to hold: Gaussians, centre and sigma in nm."""
+
+NAMES = ("rgb", "luminance", "nir")
+_REC601 = (0.299, 0.587, 0.114)
+_VISIBLE, _NEAR_INFRARED = (400.0, 700.0), (400.0, 1000.0)
+
+
+@dataclass(frozen=True)
+class Linear(Step):
+    """sRGB coding to linear light (IEC 61966-2-1)."""
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """The linear values; the straight part of the curve continues below zero."""
+        toe = image <= 0.04045
+        return torch.where(toe, image / 12.92, ((torch.where(toe, 0.5, image) + 0.055) / 1.055) ** 2.4)
+
+
+@dataclass(frozen=True)
+class Coded(Step):
+    """Linear light to sRGB coding, the inverse of `Linear`."""
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """The coded values."""
+        toe = image <= 0.04045 / 12.92
+        return torch.where(toe, 12.92 * image, 1.055 * torch.where(toe, 0.5, image) ** (1 / 2.4) - 0.055)
+
+
+@dataclass(frozen=True)
+class Gamma(Step):
+    """Values to the power 1 / `gamma`: a plain gamma curve. Negative values become 0."""
+
+    gamma: float | Tensor = 2.2
+
+    def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """The coded values."""
+        return image.clamp(min=1e-8) ** (1 / self.gamma)
+
+
+@dataclass(frozen=True)
+class Spectral(Step):
+    """What a sensor with another spectral response sees of an RGB, or an RGB + NIR, picture.
+
+    "rgb" is the first three channels; "luminance" is Rec. 601 (0.299, 0.587, 0.114); "nir" is the fourth channel;
+    a `Band` or a `Curve` is one channel: the channels taken as Gaussians (`CHANNELS`), weighted by how much of
+    each the response collects, and scaled so that white stays white. A picture does not hold a spectrum: this
+    approximation is right for greys and only plausible for colours. Beyond 700 nm it needs a NIR channel.
+    """
+
+    response: Literal["rgb", "luminance", "nir"] | Band | Curve
+
+    def __post_init__(self) -> None:
+        if self.response not in NAMES and not isinstance(self.response, Band | Curve):
+            raise ValueError(f'response must be "rgb", "luminance", "nir", a Band or a Curve, got {self.response!r}')
+        if isinstance(self.response, Band) and self.response.width <= 0:
+            raise ValueError(f"the width of a band must be positive, in nm; got {self.response.width:g}")
+
+    def apply(self, image: Float[Tensor, "b c1 h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """One channel, or three for "rgb"."""
+        channels = image.shape[1]
+        if channels not in (3, 4):
+            raise ValueError(f"a spectral response needs a picture in RGB or RGB + NIR, got {channels} channels")
+        if self.response == "rgb":
+            return image[:, :3]
+        weights = image.new_tensor(self._weights(channels))
+        return (image * weights[:, None, None]).sum(1, keepdim=True)
+
+    def _weights(self, channels: int) -> tuple[float, ...]:
+        if self.response == "luminance":
+            return (*_REC601, 0.0)[:channels]
+        if self.response == "nir":
+            if channels == 3:
+                raise ValueError("the response 'nir' needs a picture with a NIR channel, got RGB alone")
+            return 0.0, 0.0, 0.0, 1.0
+        if isinstance(self.response, Band):
+            return band_weights(self.response, channels)
+        assert isinstance(self.response, Curve)
+        return curve_weights(self.response, channels)
+
+
+def band_weights(band: Band, channels: int = 3) -> tuple[float, ...]:
+    """Weights of R, G, B (and NIR) that add up to 1, for a Gaussian of full width at half maximum `band.width`.
+
+    Raises ValueError for a band that lies beyond what the channels hold: 400 to 700 nm, or to 1000 nm with NIR.
+
+    >>> [round(w, 2) for w in band_weights(Band(600, 40))]
+    [0.77, 0.23, 0.0]
+    """
+    low, high = _VISIBLE if channels == 3 else _NEAR_INFRARED
+    if not low <= band.centre <= high:
+        kind = "an RGB picture" if channels == 3 else "an RGB + NIR picture"
+        raise ValueError(f"{kind} tells nothing of a band at {band.centre:g} nm; use {low:g} to {high:g} nm")
+    own = (band.width / (8 * math.log(2)) ** 0.5) ** 2
+    variances = [own + sigma**2 for _, sigma in CHANNELS[:channels]]
+    exponents = [-((band.centre - c) ** 2) / (2 * v) for (c, _), v in zip(CHANNELS, variances)]
+    return _shares([math.exp(e - max(exponents)) / v**0.5 for e, v in zip(exponents, variances)])
+
+
+def curve_weights(curve: Curve, channels: int = 3) -> tuple[float, ...]:
+    """Weights of R, G, B (and NIR) that add up to 1, for a sampled response.
+
+    Raises ValueError if it sees none of them.
+    """
+    wavelength, response = torch.tensor([curve.wavelength, curve.response], dtype=torch.float64)
+    gaussians = [(-0.5 * ((wavelength - c) / s) ** 2).exp() / s for c, s in CHANNELS[:channels]]
+    overlaps = [float(torch.trapezoid(response * g, wavelength)) for g in gaussians]
+    if sum(overlaps) < 1e-6:
+        raise ValueError("the response curve collects no light of the picture's channels: check its wavelengths, in nm")
+    return _shares(overlaps)
+
+
+def _shares(overlaps: list[float]) -> tuple[float, ...]:
+    return tuple(o / sum(overlaps) for o in overlaps)

@@ -1,0 +1,326 @@
+"""A scene's objects, materials and lights as Blender's data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import cv2
+import numpy as np
+
+from ..boards import PIXELS, draw_board
+from ..scene import Light, Material, Object, Paint, Scene, Texture, TextureKind, World
+from ..shapes import mesh
+from . import compat
+
+Spectrum = Literal["rgb", "nir"]
+
+_STEPS = {"voronoi", "brick", "checker"}
+_MIRRORED = "MIRROR"
+
+
+@dataclass(frozen=True)
+class Stage:
+    """A scene in Blender: its objects in order, and what to do to light and paint it in a spectrum."""
+
+    objects: list[Any]
+    paints: list[Callable[[Spectrum], None]]
+
+    def show(self, spectrum: Spectrum) -> None:
+        """Make all surfaces and lights those of a spectrum (near infrared is grey)."""
+        for paint in self.paints:
+            paint(spectrum)
+
+
+def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> Stage:
+    """All objects and lights of a scene. `scratch` is a folder for files that are needed until the end."""
+    stage = Stage([], [])
+    for i, thing in enumerate(scene.objects):
+        item = _object(bpy, thing)
+        item.pass_index = i + 1
+        item.data.materials.append(_material(bpy, thing, stage, scratch))
+        stage.objects.append(item)
+    for light in scene.lights:
+        _light(bpy, light, stage)
+    _world(world, scene.world, stage)
+    return stage
+
+
+def colour(spectrum: Spectrum, rgb: tuple[float, float, float], nir: float) -> tuple[float, float, float]:
+    """What a spectrum's picture shows: near infrared in all three channels."""
+    return rgb if spectrum == "rgb" else (nir, nir, nir)
+
+
+def _object(bpy: Any, thing: Object) -> Any:
+    surface = mesh(thing)
+    data = bpy.data.meshes.new(thing.name)
+    faces = [f[:3] if f[2] == f[3] else f for f in surface.faces.tolist()]
+    data.from_pydata(surface.vertices.tolist(), [], faces)
+    uv = np.concatenate([c[: len(f)] for f, c in zip(faces, surface.uv)])
+    data.uv_layers.new(name="UVMap").data.foreach_set("uv", uv.astype(np.float32).ravel())
+    data.polygons.foreach_set("use_smooth", np.ones(len(faces), dtype=bool))
+    item = bpy.data.objects.new(thing.name, data)
+    item.rotation_mode = "QUATERNION"
+    item.visible_shadow = thing.shape != "room"
+    bpy.context.scene.collection.objects.link(item)
+    return item
+
+
+def _light(bpy: Any, light: Light, stage: Stage) -> None:
+    data = bpy.data.lights.new(light.kind, light.kind.upper())
+    data.energy = light.power
+    _set_size(data, light)
+    item = bpy.data.objects.new(light.kind, data)
+    item.location = light.position
+    item.rotation_mode = "QUATERNION"
+    item.rotation_quaternion = _towards(light.direction)
+    item.visible_camera = False
+    bpy.context.scene.collection.objects.link(item)
+    stage.paints.append(lambda spectrum: setattr(data, "color", colour(spectrum, light.rgb, light.nir)))
+
+
+def _set_size(data: Any, light: Light) -> None:
+    if light.kind == "area":
+        data.size = light.size
+    elif light.kind == "sun":
+        data.angle = light.size
+    else:
+        data.shadow_soft_size = light.size
+
+
+def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float, float]:
+    """The quaternion (w, x, y, z) that turns -z, where lamps shine, to a direction."""
+    d = np.asarray(direction) / np.linalg.norm(direction)
+    if d[2] > 1 - 1e-9:
+        return 0.0, 1.0, 0.0, 0.0
+    q = np.array([1 - d[2], d[1], -d[0], 0.0])
+    w, x, y, z = q / np.linalg.norm(q)
+    return w, x, y, z
+
+
+def _world(world: Any, given: World, stage: Stage) -> None:
+    background = world.node_tree.nodes["Background"]
+
+    def paint(spectrum: Spectrum) -> None:
+        background.inputs["Color"].default_value = (*colour(spectrum, given.rgb, given.nir), 1.0)
+
+    stage.paints.append(paint)
+
+
+# Materials --------------------------------------------------------------------------------------------------
+
+
+class _Nodes:
+    """A node tree, with short words for what is needed here."""
+
+    def __init__(self, tree: Any):
+        self.tree = tree
+
+    def new(self, kind: str, **settings: Any) -> Any:
+        node = self.tree.nodes.new(f"ShaderNode{kind}")
+        for name, value in settings.items():
+            setattr(node, name, value)
+        return node
+
+    def give(self, socket: Any, value: Any) -> None:
+        """Connect an output to an input, or set the input."""
+        if hasattr(value, "is_linked"):
+            self.tree.links.new(value, socket)
+        else:
+            socket.default_value = value
+
+    def vector(self, operation: str, *values: Any) -> Any:
+        node = self.new("VectorMath", operation=operation)
+        for socket, value in zip(node.inputs, values):
+            self.give(socket, value)
+        return node.outputs[0]
+
+    def number(self, operation: str, *values: Any) -> Any:
+        node = self.new("Math", operation=operation)
+        for socket, value in zip(node.inputs, values):
+            self.give(socket, value)
+        return node.outputs[0]
+
+
+def _material(bpy: Any, thing: Object, stage: Stage, scratch: Path) -> Any:
+    material = thing.material
+    made = bpy.data.materials.new(thing.name)
+    compat.use_nodes(made)
+    nodes = _Nodes(made.node_tree)
+    shader = made.node_tree.nodes["Principled BSDF"]
+    paint, height = _texture(bpy, nodes, material.texture, stage, scratch)
+    for name, value in _principled(material).items():
+        shader.inputs[name].default_value = value
+    nodes.give(shader.inputs["Base Color"], paint)
+    if material.emission:
+        nodes.give(shader.inputs["Emission Color"], paint)
+    if material.bump and height is not None:
+        bump = nodes.new("Bump")
+        bump.inputs["Distance"].default_value = material.bump
+        nodes.give(bump.inputs["Height"], height)
+        nodes.give(shader.inputs["Normal"], bump.outputs[0])
+    return made
+
+
+def _principled(material: Material) -> dict[str, float]:
+    return {
+        "Roughness": material.roughness,
+        "Specular IOR Level": material.specular,
+        "Metallic": material.metallic,
+        "Transmission Weight": material.transmission,
+        "Emission Strength": material.emission,
+    }
+
+
+def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> tuple[Any, Any]:
+    """The output that has the paint, and the one that has the height of bumps (None for pictures)."""
+    if texture.kind in ("picture", "board"):
+        return _picture(bpy, nodes, texture, stage, scratch), None
+    height = _PATTERNS[texture.kind](nodes, texture)
+    ramp = nodes.new("ValToRGB")
+    nodes.give(ramp.inputs[0], height)
+    _set_ramp(ramp.color_ramp, texture)
+    stage.paints.append(lambda spectrum: _paint_ramp(ramp.color_ramp, texture.paints, spectrum))
+    return _grained(nodes, texture, ramp.outputs[0]), height
+
+
+def _set_ramp(ramp: Any, texture: Texture) -> None:
+    """One stop for each paint; patterns that have steps keep them."""
+    stepped = texture.kind in _STEPS
+    ramp.interpolation = "CONSTANT" if stepped else "LINEAR"
+    n = len(texture.paints)
+    low, high = (0.35, 0.65) if texture.kind == "noise" else (0.0, 1.0)
+    stops = [i / n if stepped else low + (high - low) * i / max(n - 1, 1) for i in range(n)]
+    ramp.elements.remove(ramp.elements[1])
+    ramp.elements[0].position = stops[0]
+    for stop in stops[1:]:
+        ramp.elements.new(stop)
+
+
+def _paint_ramp(ramp: Any, paints: tuple[Paint, ...], spectrum: Spectrum) -> None:
+    for stop, paint in zip(ramp.elements, paints):
+        stop.color = (*colour(spectrum, paint.rgb, paint.nir), 1.0)
+
+
+def _place(nodes: _Nodes, texture: Texture, source: str = "Object", scale: float = 1.0) -> Any:
+    """Where on the texture: the object's coordinates (or those along its surface) times the scale, shifted."""
+    where = nodes.new("TexCoord").outputs[source]
+    return nodes.vector("MULTIPLY_ADD", where, (scale * texture.scale,) * 3, texture.offset)
+
+
+def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
+    if not texture.grain:
+        return paint
+    noise = nodes.new("TexNoise")
+    nodes.give(noise.inputs["Vector"], _place(nodes, texture, scale=4.0))
+    noise.inputs["Scale"].default_value = 1.0
+    noise.inputs["Detail"].default_value = 3.0
+    grain = nodes.number("MULTIPLY_ADD", compat.factor(noise), 3 * texture.grain, 1 - 1.5 * texture.grain)
+    node = nodes.new("VectorMath", operation="SCALE")
+    nodes.give(node.inputs[0], paint)
+    nodes.give(node.inputs["Scale"], grain)
+    return node.outputs[0]
+
+
+def _pattern(kind: str, source: str = "Object", **inputs: float) -> Callable[[_Nodes, Texture], Any]:
+    def make(nodes: _Nodes, texture: Texture) -> Any:
+        node = nodes.new(f"Tex{kind}")
+        nodes.give(node.inputs["Vector"], _place(nodes, texture, source))
+        for name, value in inputs.items():
+            node.inputs[name].default_value = value
+        if "Distortion" in node.inputs and texture.distortion:
+            node.inputs["Distortion"].default_value = texture.distortion
+        return compat.factor(node)
+
+    return make
+
+
+def _voronoi(nodes: _Nodes, texture: Texture) -> Any:
+    node = nodes.new("TexVoronoi")
+    nodes.give(node.inputs["Vector"], _place(nodes, texture))
+    node.inputs["Scale"].default_value = 1.0
+    split = nodes.new("SeparateXYZ")
+    nodes.give(split.inputs[0], node.outputs["Color"])
+    return split.outputs[0]
+
+
+def _brick(nodes: _Nodes, texture: Texture) -> Any:
+    node = nodes.new("TexBrick")
+    nodes.give(node.inputs["Vector"], _place(nodes, texture, "UV"))
+    greys = {"Color1": 0.0, "Color2": 0.7, "Mortar": 1.0}
+    for name, grey in greys.items():
+        node.inputs[name].default_value = (grey, grey, grey, 1.0)
+    node.inputs["Scale"].default_value = 0.5
+    return node.outputs["Color"]
+
+
+def _plain(nodes: _Nodes, texture: Texture) -> Any:
+    node = nodes.new("Value")
+    node.outputs[0].default_value = 0.0
+    return node.outputs[0]
+
+
+_PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
+    "plain": _plain,
+    "voronoi": _voronoi,
+    "magic": _pattern("Magic", Scale=1.0),
+    "brick": _brick,
+    "checker": _pattern("Checker", Scale=1.0),
+    "noise": _pattern("Noise", Scale=1.0, Detail=3.0),
+    "wave": _pattern("Wave", Scale=0.3),
+}
+
+
+def _picture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> Any:
+    image = _image(bpy, texture, scratch)
+    node = nodes.new("TexImage", image=image, extension=_MIRRORED)
+    (w, h), (left, top) = _laid(image.size, texture)
+    onto = (1 / w, -1 / h, 0), (left / w + texture.offset[0], 1 - top / h + texture.offset[1], 0)
+    nodes.give(node.inputs["Vector"], nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto))
+    rgb = node.outputs["Color"]
+    infrared = nodes.vector("SUBTRACT", _infrared(nodes, rgb), rgb)
+    mix = nodes.vector("MULTIPLY_ADD", infrared, (0, 0, 0), rgb)
+    paint = nodes.vector("MULTIPLY", mix, (1, 1, 1))
+    switch, tint = mix.node.inputs[1], paint.node.inputs[1]
+
+    def show(spectrum: Spectrum) -> None:
+        switch.default_value = colour(spectrum, (0, 0, 0), 1)
+        tint.default_value = colour(spectrum, texture.paints[0].rgb, texture.paints[0].nir)
+
+    stage.paints.append(show)
+    return _grained(nodes, texture, paint)
+
+
+def _laid(wh: tuple[int, int], texture: Texture) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Metres that a picture covers, and where on it the surface's corner is. Boards are centred, true to scale."""
+    if texture.board is None:
+        return (1 / texture.scale, wh[1] / wh[0] / texture.scale), (0, 0)
+    w, h = (n * texture.board.square / PIXELS for n in wh)
+    return (w, h), ((w - texture.board.wh[0]) / 2, (h - texture.board.wh[1]) / 2)
+
+
+def _infrared(nodes: _Nodes, rgb: Any) -> Any:
+    """Red, and 1.5 times by how much green exceeds red and blue, in all channels; at most 1."""
+    split = nodes.new("SeparateXYZ")
+    nodes.give(split.inputs[0], rgb)
+    red, green, blue = split.outputs
+    excess = nodes.number("MAXIMUM", nodes.number("SUBTRACT", green, nodes.number("MAXIMUM", red, blue)), 0.0)
+    value = nodes.number("MINIMUM", nodes.number("MULTIPLY_ADD", excess, 1.5, red), 1.0)
+    joined = nodes.new("CombineXYZ")
+    for socket in joined.inputs:
+        nodes.give(socket, value)
+    return joined.outputs[0]
+
+
+def _image(bpy: Any, texture: Texture, scratch: Path) -> Any:
+    if texture.kind == "picture":
+        if not Path(texture.picture).is_file():
+            raise ValueError(f"{texture.picture or 'a texture without a file'}: no such picture for a texture")
+        return bpy.data.images.load(str(Path(texture.picture).resolve()), check_existing=True)
+    if texture.board is None:
+        raise ValueError("a texture of kind 'board' needs a board")
+    path = scratch / f"board-{len(bpy.data.images)}.png"
+    cv2.imwrite(str(path), draw_board(texture.board))
+    return bpy.data.images.load(str(path))

@@ -1,0 +1,112 @@
+"""All that differs between versions of Blender, found by looking at what is there; and the only import of bpy."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
+"""Debian packages that `import bpy` needs (Cycles needs no more)."""
+
+PYTHONS = "Python 3.11 (bpy 4.5 and 5.0) or 3.13 (5.1 and newer)"
+INSTALL = "pip install 'arraygeom-pat[synthesis]'"
+
+_PASSES = {"index": ("Object Index.X", "IndexOB.X")}
+
+
+def load() -> Any:
+    """The module bpy. Raises ValueError with what to install, in one line."""
+    try:
+        return importlib.import_module("bpy")
+    except ModuleNotFoundError as error:
+        if error.name != "bpy":
+            raise ValueError(f"Blender needs the Python package {error.name}: {INSTALL}") from None
+        raise ValueError(_not_installed(sys.version_info[:2])) from None
+    except ImportError as error:
+        library = str(error).partition(":")[0]
+        raise ValueError(
+            f"Blender needs system libraries ({library} is missing): apt-get install -y {LIBRARIES}"
+        ) from None
+
+
+def _not_installed(version: tuple[int, int]) -> str:
+    if version in ((3, 11), (3, 13)):
+        return f"rendering needs Blender as a Python module: {INSTALL}"
+    return f"rendering needs Blender as a Python module, which exists for {PYTHONS}; this is {version[0]}.{version[1]}"
+
+
+def new_scene(bpy: Any) -> Any:
+    """An empty scene, everything at its default. All references to former data are dead."""
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    scene = bpy.context.scene
+    scene.world = bpy.data.worlds.new("world")
+    use_nodes(scene.world)
+    return scene
+
+
+def use_nodes(thing: Any) -> None:
+    """Give a material or world its nodes, where they are not always there (before 5.0)."""
+    if thing.node_tree is None:
+        thing.use_nodes = True
+
+
+def eevee(scene: Any) -> str:
+    """What EEVEE is called here: BLENDER_EEVEE, or BLENDER_EEVEE_NEXT up to 4.5."""
+    for name in ("BLENDER_EEVEE_NEXT", "BLENDER_EEVEE"):
+        try:
+            scene.render.engine = name
+        except TypeError:
+            continue
+        return name
+    raise ValueError("this Blender has no EEVEE: use engine 'cycles'")
+
+
+def write_layers(scene: Any) -> None:
+    """Make renders go to one multi-layer float EXR file, of one part: several fail if pixels are not square (5.0)."""
+    images = scene.render.image_settings
+    if hasattr(images, "media_type"):
+        images.media_type = "MULTI_LAYER_IMAGE"
+    images.file_format = "OPEN_EXR_MULTILAYER"
+    images.color_depth = "32"
+    images.exr_codec = "ZIP"
+    if hasattr(images, "use_exr_interleave"):
+        images.use_exr_interleave = True
+
+
+def factor(node: Any) -> Any:
+    """The single-valued output of a texture node: 'Factor', 'Fac' before 5.0, or the only one there is."""
+    outputs = node.outputs
+    return outputs.get("Factor") or outputs.get("Fac") or outputs[0]
+
+
+def index_name(channels: Mapping[str, Any]) -> str:
+    """The channel of the object index among those of a file."""
+    return next(name for name in _PASSES["index"] if name in channels)
+
+
+def make_linear(thing: Any) -> None:
+    """Make all keys of an object linear. Works with the layered actions of 4.4 and newer."""
+    animation = thing.animation_data
+    channels = animation.action.layers[0].strips[0].channelbag(animation.action_slot)
+    for curve in channels.fcurves:
+        for key in curve.keyframe_points:
+            key.interpolation = "LINEAR"
+
+
+def use_gpu(bpy: Any) -> bool:
+    """Turn on the GPUs that Cycles can use; False if there is none."""
+    preferences = bpy.context.preferences.addons["cycles"].preferences
+    for kind in ("OPTIX", "CUDA", "HIP", "METAL", "ONEAPI"):
+        try:
+            preferences.compute_device_type = kind
+        except TypeError:
+            continue
+        preferences.refresh_devices()
+        devices = [d for d in preferences.devices if d.type == kind]
+        for device in devices:
+            device.use = True
+        if devices:
+            return True
+    return False

@@ -1,0 +1,148 @@
+"""What Blender can render of a camera: a pinhole with square axes; and how its picture becomes the camera's."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.ndimage import map_coordinates
+from torch import Tensor
+
+from arraygeom.camera import Camera, View
+from arraygeom.pixels import HW, map_homogeneous, pixel_grid
+from arraygeom.pose import Pose
+from arraygeom.sampling import sample
+
+from ..surfaces import depth_between
+
+WIDEST = math.radians(80)
+"""The largest angle off axis that a plane picture can cover at all sensibly."""
+
+_MARGIN = 3
+_MOST_PIXELS = 64e6
+_STEP = 0.01
+
+
+class Lens(NamedTuple):
+    """A pinhole camera, and where the pixels of the true camera are in its picture (None: the same pixels)."""
+
+    pinhole: Camera
+    x: Float[Tensor, "h w 2"] | None
+    valid: Bool[Tensor, "h w"] | None
+
+    def picture(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
+        """Colours, by cubic splines; 0 where the lens sees nothing.
+
+        (The bicubic kernel of `grid_sample` moves straight slopes by up to 0.05 pixels, splines do not.)
+        """
+        if self.x is None or self.valid is None:
+            return image
+        places = self.x.movedim(-1, 0).flip(0).numpy()
+        planes = [map_coordinates(plane, places, order=3, mode="mirror") for plane in image.numpy()]
+        return torch.where(self.valid, torch.from_numpy(np.stack(planes)).clamp(min=0), 0.0)
+
+    def nearest(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
+        """Values as they are at the nearest pixels; 0 where the lens sees nothing."""
+        if self.x is None or self.valid is None:
+            return image
+        return torch.where(
+            self.valid, sample(image[None], self.x[None].to(image), interpolation="nearest").values[0], 0
+        )
+
+    def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
+        """Depth along the very rays, exact on planes: beside edges the nearest pixel's surface is continued to them.
+
+        NaN where nothing is seen.
+        """
+        if self.x is None or self.valid is None:
+            return depth
+        between, clean = depth_between(depth.double(), index, self.x, uneven=_STEP)
+        continued = 1 / _continued(1 / depth.double(), self.x)
+        return torch.where(self.valid, torch.where(clean, between, continued), torch.nan).to(depth)
+
+
+def _continued(inverse: Float[Tensor, "h1 w1"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
+    """Inverse depth at positions by that of the nearest pixel and its slopes to the more even sides."""
+    layers = torch.stack([inverse, _gentlest(inverse, 1), _gentlest(inverse, 0)])
+    q, across, down = sample(layers[None], x[None], interpolation="nearest").values[0]
+    dx, dy = (x - (x + 0.5).floor()).unbind(-1)
+    return (q + across * dx + down * dy).clamp(min=0)
+
+
+def _gentlest(inverse: Float[Tensor, "h w"], dim: int) -> Float[Tensor, "h w"]:
+    """Of the differences to the two neighbours along an axis, the smaller."""
+    steps = inverse.diff(dim=dim)
+    edge = torch.full_like(steps.narrow(dim, 0, 1), torch.inf)
+    before, after = torch.cat([edge, steps], dim), torch.cat([steps, edge], dim)
+    return torch.where(before.abs() < after.abs(), before, after)
+
+
+def lens_for(camera: View, name: str) -> Lens:
+    """The lens of a camera of a rig. Raises ValueError, naming the camera, for one that cannot be rendered."""
+    if not isinstance(camera, Camera):
+        raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
+    if camera.K.ndim != 2:
+        raise ValueError(f"camera '{name}' is batched over {tuple(camera.K.shape[:-2])}: render one rig at a time")
+    camera = camera.to(dtype=torch.float64, device="cpu")
+    upright = _upright(camera, name)
+    if camera.distortion is None:
+        return Lens(upright, None, None)
+    return _wide(camera, upright, name)
+
+
+def _upright(camera: Camera, name: str) -> Camera:
+    """The same pinhole with K upper triangular: K = K' Q with a turn Q about the optical axis, which the pose takes."""
+    K = camera.K
+    angle = torch.atan2(K[1, 0], K[1, 1])
+    c, s = angle.cos(), angle.sin()
+    zero, one = torch.zeros_like(c), torch.ones_like(c)
+    Q = torch.stack([torch.stack([c, -s, zero]), torch.stack([s, c, zero]), torch.stack([zero, zero, one])])
+    K = K @ Q.T
+    if abs(float(K[0, 1])) > 1e-9 * float(K[0, 0].abs()):
+        raise ValueError(
+            f"camera '{name}' has skew (K[0, 1] = {float(K[0, 1]):.4g}), which Blender's cameras cannot have: "
+            "set it to 0, or calibrate without skew"
+        )
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        raise ValueError(f"camera '{name}' mirrors its picture (K has determinant below 0): flip the picture instead")
+    K = K.clone()
+    K[0, 1] = K[1, 0] = 0
+    return camera.replace(K=K, cam_from_world=Pose(Q @ camera.R, Q @ camera.t), distortion=None)
+
+
+def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
+    """A pinhole that covers all that the lens sees, at least as finely, with square pixels."""
+    rays, valid = camera.rays(pixel_grid(camera.hw, dtype=torch.float64))
+    rays = rays @ (upright.R @ camera.R.T).T
+    if not valid.any():
+        raise ValueError(f"camera '{name}': its lens model is not valid for any pixel; check the coefficients")
+    angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])[valid].max()
+    if angle > WIDEST:
+        raise ValueError(
+            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; a plane picture covers at most "
+            f"{math.degrees(WIDEST):.0f}: crop the camera"
+        )
+    plane = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
+    f = float(_finest(plane, valid))
+    low, high = (f * plane[valid].amin(0)).floor() - _MARGIN, (f * plane[valid].amax(0)).ceil() + _MARGIN
+    w, h = (int(n) for n in high - low + 1)
+    if w * h > _MOST_PIXELS:
+        raise ValueError(f"camera '{name}': its lens needs an undistorted picture of {w}x{h} pixels: crop the camera")
+    K = torch.tensor([[f, 0, -float(low[0])], [0, f, -float(low[1])], [0, 0, 1]], dtype=torch.float64)
+    x = map_homogeneous(K[:2], plane)
+    return Lens(upright.replace(K=K, hw=(h, w)), x, valid)
+
+
+def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[Tensor, ""]:
+    """The focal length at which neighbouring pixels of the lens are at least one pixel apart nearly everywhere."""
+    across, down = plane.diff(dim=1).norm(dim=-1), plane.diff(dim=0).norm(dim=-1)
+    steps = torch.cat([across[valid[:, 1:] & valid[:, :-1]], down[valid[1:] & valid[:-1]]])
+    return 1 / steps.quantile(0.1) if len(steps) < 1e6 else 1 / steps.kthvalue(len(steps) // 10).values
+
+
+def resized(camera: View, hw: HW) -> View:
+    """The camera with pictures of another size; as it is if they have that."""
+    return camera if camera.hw == hw else camera.resize(hw)

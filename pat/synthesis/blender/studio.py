@@ -1,0 +1,217 @@
+"""A built scene, photographed: cameras set, renders run, passes read."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from arraygeom.camera import Camera
+
+from ..scene import Motion, Scene
+from . import compat
+from .build import Spectrum, Stage, build
+from .settings import Optics, RenderSettings
+
+NOTHING = 1e9
+"""Depths beyond this are where Blender hit nothing."""
+
+_FLIP = np.diag([1.0, -1.0, -1.0])
+_SENSOR = 36.0
+_EXPOSURE = (0, 1, 2)
+
+
+class Studio:
+    """Blender with one scene in it. Frames of any pinhole at any time can be asked for."""
+
+    def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
+        self.scene, self.settings, self.scratch = scene, settings, scratch
+        self.bpy = compat.load()
+        self.blender = compat.new_scene(self.bpy)
+        self.camera = self.bpy.data.objects.new("camera", self.bpy.data.cameras.new("camera"))
+        self.blender.collection.objects.link(self.camera)
+        self.blender.camera = self.camera
+        self.stage: Stage = build(self.bpy, scene, self.blender.world, scratch)
+        self._quality()
+
+    def colours(self, camera: Camera, time: float, optics: Optics, spectrum: Spectrum) -> dict[str, Tensor]:
+        """Channels by Blender's names (H, W), blur included where the optics have it."""
+        self._engine()
+        self._expose(time, optics.shutter)
+        self._aim(camera, optics)
+        self.stage.show(spectrum)
+        return self._shoot()
+
+    def geometry(self, camera: Camera, time: float) -> dict[str, Tensor]:
+        """The same with one sample, without any blur, and with all surfaces plain: exact depth, index and normals."""
+        cycles, layer = self.blender.cycles, self.blender.view_layers[0]
+        self._expose(time, None)
+        self._aim(camera, Optics())
+        self.blender.render.engine = "CYCLES"
+        kept = cycles.samples, cycles.use_denoising
+        cycles.samples, cycles.use_denoising = 1, False
+        layer.material_override = self._plain()
+        try:
+            return self._shoot()
+        finally:
+            cycles.samples, cycles.use_denoising = kept
+            layer.material_override = None
+
+    # Settings --------------------------------------------------------------------------------------------
+
+    def _quality(self) -> None:
+        s, render, cycles = self.settings, self.blender.render, self.blender.cycles
+        render.engine = "CYCLES"
+        cycles.device = "GPU" if s.device != "cpu" and self._gpu() else "CPU"
+        cycles.samples, cycles.use_adaptive_sampling, cycles.seed = s.samples, False, self.scene.seed % 2**31
+        cycles.use_denoising = s.denoise != "none"
+        cycles.denoiser = "OPENIMAGEDENOISE"
+        cycles.denoising_input_passes = "RGB_ALBEDO_NORMAL"
+        cycles.denoising_quality, cycles.denoising_prefilter = (
+            ("HIGH", "ACCURATE") if s.denoise == "accurate" else ("FAST", "FAST")
+        )
+        self._light_paths()
+        render.use_persistent_data = True
+        render.dither_intensity = 0
+        render.film_transparent = "alpha" in s.passes
+        render.threads_mode = "FIXED" if s.threads else "AUTO"
+        render.threads = s.threads or 1
+        layer = self.blender.view_layers[0]
+        layer.use_pass_z = layer.use_pass_object_index = layer.use_pass_normal = True
+        compat.write_layers(self.blender)
+
+    def _light_paths(self) -> None:
+        s, cycles = self.settings, self.blender.cycles
+        glass = any(thing.material.transmission for thing in self.scene.objects)
+        cycles.max_bounces = max(s.bounces, 6 if glass else 0)
+        cycles.diffuse_bounces = cycles.glossy_bounces = s.bounces
+        cycles.transmission_bounces = 6 if glass else 0
+        cycles.caustics_reflective = cycles.caustics_refractive = False
+        cycles.sample_clamp_indirect = 5
+        cycles.use_light_tree = len(self.scene.lights) > 4
+        cycles.use_fast_gi = s.fast_light
+        cycles.fast_gi_method = "REPLACE"
+        cycles.ao_bounces_render = 1
+        self.blender.world.light_settings.distance = 0.15 * self.scene.depth[1]
+
+    def _gpu(self) -> bool:
+        found = compat.use_gpu(self.bpy)
+        if not found and self.settings.device == "gpu":
+            raise ValueError("no GPU that Cycles can use was found: take device 'cpu' or 'auto'")
+        return found
+
+    def _engine(self) -> None:
+        if self.settings.engine == "eevee":
+            self.blender.render.engine = compat.eevee(self.blender)
+
+    def _plain(self) -> Any:
+        name = "plain"
+        return self.bpy.data.materials.get(name) or self.bpy.data.materials.new(name)
+
+    # One picture -----------------------------------------------------------------------------------------
+
+    def _expose(self, time: float, shutter: float | None) -> None:
+        """Put objects where they are at a time, or key them over the exposure: from frame 0 to 2, 1 the middle."""
+        render = self.blender.render
+        moving = False
+        for item, thing in zip(self.stage.objects, self.scene.objects):
+            item.animation_data_clear()
+            _place(item, thing.motion, time)
+            if shutter and not thing.motion.still:
+                moving = True
+                _key(item, thing.motion, time, shutter)
+        render.use_motion_blur = moving
+        render.motion_blur_position, render.motion_blur_shutter = "CENTER", 2.0
+        self.blender.frame_set(1)
+
+    def _aim(self, camera: Camera, optics: Optics) -> None:
+        """Blender's camera as ours, 36 units wide whatever the true sensor: Blender refuses less than 1 mm."""
+        data, render = self.camera.data, self.blender.render
+        (h, w), K = camera.hw, camera.K
+        fx, fy = float(K[0, 0]), float(K[1, 1])
+        render.resolution_x, render.resolution_y, render.resolution_percentage = w, h, 100
+        render.pixel_aspect_x, render.pixel_aspect_y = max(1.0, fy / fx), max(1.0, fx / fy)
+        data.sensor_fit, data.sensor_width, data.lens = "HORIZONTAL", _SENSOR, fx * _SENSOR / w
+        aspect = render.pixel_aspect_y / render.pixel_aspect_x
+        data.shift_x = (w / 2 - 0.5 - float(K[0, 2])) / w
+        data.shift_y = (float(K[1, 2]) + 0.5 - h / 2) * aspect / w
+        data.clip_start, data.clip_end = 1e-3, 1e5
+        data.dof.use_dof = optics.f_number is not None
+        if optics.f_number is not None and optics.focus is not None:
+            aperture = 1e3 * fx * optics.pixel_pitch / optics.f_number
+            data.dof.focus_distance, data.dof.aperture_fstop = optics.focus, data.lens / aperture
+        self.camera.matrix_world = _blender_pose(camera).T.tolist()
+
+    def _shoot(self) -> dict[str, Tensor]:
+        path = self.scratch / "layers.exr"
+        self.blender.render.filepath = str(path)
+        with quietly():
+            self.bpy.ops.render.render(write_still=True)
+        channels = read_layers(path)
+        path.unlink()
+        return channels
+
+
+def read_layers(path: Path) -> dict[str, Tensor]:
+    """The channels of a multi-layer EXR file by `Pass.Channel`, each float32 (H, W)."""
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ValueError(f"rendering needs OpenEXR to read what Blender writes: {compat.INSTALL}") from None
+    found: dict[str, Tensor] = {}
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        for part in file.parts:
+            for name, channel in part.channels.items():
+                short = name.split(".", 1)[1] if name.count(".") > 1 else name
+                found[short] = torch.from_numpy(np.array(channel.pixels, dtype=np.float32))
+    return found
+
+
+@contextmanager
+def quietly() -> Iterator[None]:
+    """Without what Blender prints, which goes past Python's own standard output."""
+    sys.stdout.flush()
+    kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(sink, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(sink)
+
+
+def _blender_pose(camera: Camera) -> Float[NDArray, "4 4"]:
+    """World from camera with Blender's axes: x right, y up, z back."""
+    M = np.eye(4)
+    M[:3, :3] = camera.R.numpy().T @ _FLIP
+    M[:3, 3] = camera.centre.numpy()
+    return M
+
+
+def _place(item: Any, motion: Motion, time: float) -> None:
+    R, position, extent = motion.at(time)
+    x, y, z, w = Rotation.from_matrix(R).as_quat()
+    old = np.array(item.rotation_quaternion)
+    sign = -1.0 if old @ [w, x, y, z] < 0 else 1.0
+    item.location = position.tolist()
+    item.rotation_quaternion = [sign * w, sign * x, sign * y, sign * z]
+    item.scale = (extent / np.asarray(motion.keys[0].extent)).tolist()
+
+
+def _key(item: Any, motion: Motion, time: float, shutter: float) -> None:
+    for frame in _EXPOSURE:
+        _place(item, motion, time + (frame - 1) * shutter / 2)
+        for channel in ("location", "rotation_quaternion", "scale"):
+            item.keyframe_insert(channel, frame=frame)
+    compat.make_linear(item)

@@ -1,0 +1,165 @@
+"""Frozen dataclasses to plain documents (for YAML and JSON) and back, with errors that name the entry."""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+import yaml
+
+T = TypeVar("T")
+
+
+def to_document(value: Any) -> Any:
+    """Dataclasses as mappings without what is at its default, tuples as lists, paths as text, the rest as it is."""
+    if dataclasses.is_dataclass(value):
+        return {
+            f.name: to_document(v) for f in dataclasses.fields(value) if not _default(f, v := getattr(value, f.name))
+        }
+    if isinstance(value, tuple | list):
+        return [to_document(v) for v in value]
+    if isinstance(value, dict):
+        return {k: to_document(v) for k, v in value.items()}
+    return str(value) if isinstance(value, Path) else value
+
+
+def from_document(kind: type[T], document: Any, entry: str = "") -> T:
+    """The dataclass (or other annotated type) that a document describes.
+
+    Raises ValueError naming the entry for unknown keys, missing ones, and values of another type.
+    """
+    return typing.cast(T, _read(kind, document, entry))
+
+
+def read_yaml(path: str | Path) -> Any:
+    """What a YAML file holds. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        mark = getattr(error, "problem_mark", None)
+        line = f" at line {mark.line + 1}" if mark else ""
+        raise ValueError(f"{path}: not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}") from None
+
+
+def near(name: object, known: Iterable[str]) -> str:
+    """What to say after an unknown name: the nearest known one, or all of them.
+
+    >>> near("nois", ["noise", "clip"])
+    "; did you mean 'noise'?"
+    """
+    return _hint(name, tuple(known))
+
+
+def _default(field: dataclasses.Field[Any], value: Any) -> bool:
+    if field.default is not dataclasses.MISSING:
+        return bool(value == field.default)
+    return field.default_factory is not dataclasses.MISSING and bool(value == field.default_factory())
+
+
+def _read(kind: Any, value: Any, entry: str) -> Any:
+    origin, arguments = typing.get_origin(kind), typing.get_args(kind)
+    if dataclasses.is_dataclass(kind):
+        return _read_dataclass(kind, value, entry)
+    if origin is typing.Literal:
+        if value not in arguments:
+            raise ValueError(f"{entry}: is {value!r}{_hint(value, arguments)}")
+        return value
+    if origin is tuple:
+        return _read_tuple(arguments, value, entry)
+    if origin in (dict, Mapping):
+        return _read_mapping(arguments, value, entry)
+    if origin in (typing.Union, types.UnionType):
+        return _read_union(arguments, value, entry)
+    return _read_plain(kind, value, entry)
+
+
+def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
+    if not isinstance(value, dict):
+        raise ValueError(f"{entry or kind.__name__}: is {value!r}; wanted a mapping")
+    fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
+    for key in value:
+        if key not in fields:
+            raise ValueError(f"{_below(entry, key)}: unknown key{_hint(key, tuple(fields))}")
+    for name, field in fields.items():
+        required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+        if required and name not in value:
+            raise ValueError(f"{_below(entry, name)}: missing")
+    types_ = typing.get_type_hints(kind)
+    made = {k: _read(types_[k], v, _below(entry, k)) for k, v in value.items()}
+    try:
+        return kind(**made)
+    except ValueError as error:
+        raise ValueError(f"{entry}: {error}" if entry else str(error)) from None
+
+
+def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any, ...]:
+    if not isinstance(value, list | tuple):
+        raise ValueError(f"{entry}: is {value!r}; wanted a list")
+    kinds = (arguments[0],) * len(value) if arguments[1:] == (...,) else arguments
+    if len(kinds) != len(value):
+        raise ValueError(f"{entry}: has {len(value)} entries; wanted {len(kinds)}")
+    return tuple(_read(k, v, f"{entry}[{i}]") for i, (k, v) in enumerate(zip(kinds, value)))
+
+
+def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[Any, Any]:
+    if not isinstance(value, dict):
+        raise ValueError(f"{entry}: is {value!r}; wanted a mapping")
+    return {k: _read(arguments[1], v, _below(entry, k)) for k, v in value.items()}
+
+
+def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
+    """The first of several types that fits; if none does, what one that is about as wanted says."""
+    if value is None and type(None) in arguments:
+        return None
+    said = []
+    for kind in (k for k in arguments if k is not type(None)):
+        try:
+            return _read(kind, value, entry)
+        except ValueError as error:
+            said.append((isinstance(value, dict) == dataclasses.is_dataclass(kind), str(error)))
+    raise ValueError(max(said, key=lambda s: s[0])[1])
+
+
+def _read_plain(kind: Any, value: Any, entry: str) -> Any:
+    if kind is Any:
+        return value
+    if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if math.isnan(value):
+            raise ValueError(f"{entry}: is NaN; wanted a number")
+        return float(value)
+    if kind is float and isinstance(value, str) and _is_number(value):
+        return float(value)
+    if kind is Path and isinstance(value, str):
+        return Path(value)
+    if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
+        raise ValueError(f"{entry}: is {value!r}; wanted {_PLAIN.get(kind, kind.__name__)}")
+    return value
+
+
+_PLAIN = {float: "a number", int: "a whole number", str: "text", bool: "true or false", Path: "a path"}
+
+
+def _is_number(text: str) -> bool:
+    """YAML takes 1e-3 for text, because it has no point."""
+    try:
+        return not math.isnan(float(text))
+    except ValueError:
+        return False
+
+
+def _below(entry: str, key: object) -> str:
+    return f"{entry}.{key}" if entry else str(key)
+
+
+def _hint(given: object, known: tuple[Any, ...]) -> str:
+    near = difflib.get_close_matches(str(given), [str(k) for k in known], 1)
+    return f"; did you mean '{near[0]}'?" if near else f"; known here: {', '.join(map(str, known))}"

@@ -1,0 +1,274 @@
+"""Furnishes rooms: shapes, lights and walls around the cameras of a rig, from a seed."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arraygeom.camera import Camera
+from arraygeom.pixels import coarse_grid
+from arraygeom.rig import Rig
+
+from .scene import Key, Light, Material, Motion, Object, Relief, Scene, Shape, Texture, TextureKind, Vec3, World
+
+DEPTHS = (2.0, 20.0)
+"""Near and far, metres, of scenes for rigs that state none."""
+
+_SHAPES: tuple[Shape, ...] = ("plane", "cube", "sphere", "cylinder", "cone", "torus")
+_PATTERNS: tuple[TextureKind, ...] = ("voronoi", "magic", "brick", "checker", "noise", "wave")
+_WALLS: tuple[TextureKind, ...] = ("voronoi", "brick", "noise", "wave", "magic")
+_IRRADIANCE = 5.0
+
+Surface = Callable[["Setting", float, tuple[TextureKind, ...]], Texture]
+"""Makes the texture of a surface that is so many metres away, of one of some kinds."""
+
+
+@dataclass(frozen=True)
+class _Room:
+    """A box in the world that everything is in."""
+
+    R: Float[NDArray, "3 3"]
+    centre: Float[NDArray, "3"]
+    extent: Float[NDArray, "3"]
+
+    def holds(self, X: NDArray, margin: float) -> bool:
+        return bool((np.abs(self.R.T @ (X - self.centre)) < self.extent / 2 - margin).all())
+
+    def at(self, fraction: NDArray) -> NDArray:
+        """The point at fractions (-1..1) of the way from the middle to the walls."""
+        return np.asarray(self.centre + self.R @ (fraction * self.extent / 2))
+
+
+class Setting:
+    """The rig that looks, and the randomness of one scene."""
+
+    def __init__(self, rig: Rig, rng: Generator):
+        self.rng = rng
+        self.cameras = [c.to("cpu") for c in rig.cameras.values() if isinstance(c, Camera)]
+        if not self.cameras:
+            raise ValueError("the rig has no calibrated camera to make a scene for")
+        near, far = (float(d) for d in rig.depth) if rig.depth is not None else DEPTHS
+        self.near, self.far = near, far if math.isfinite(far) else 10 * near
+        self.centres = np.stack([c.centre.double().numpy() for c in self.cameras])
+
+    @property
+    def focal(self) -> float:
+        """The longest focal length, pixels."""
+        return max(float(c.K[:2, :2].abs().max()) for c in self.cameras)
+
+    def metres(self, depth: float, pixels: float) -> float:
+        """What so many pixels are at a depth, in the camera that sees finest."""
+        return float(pixels * depth / self.focal)
+
+    def camera(self) -> Camera:
+        """One of the cameras, drawn."""
+        return self.cameras[int(self.rng.integers(len(self.cameras)))]
+
+    def distance(self, X: NDArray) -> float:
+        """From the nearest camera, metres."""
+        return float(np.linalg.norm(self.centres - X, axis=1).min())
+
+    def ahead(self, camera: Camera, fraction: NDArray, depth: float) -> NDArray:
+        """The point at a depth in the middle `fraction` (-1..1, across and down) of a camera's picture."""
+        h, w = camera.hw
+        x = camera.K.new_tensor([(w - 1) / 2 * (1 + fraction[0]), (h - 1) / 2 * (1 + fraction[1])])
+        return camera.unproject(x, x.new_tensor(depth)).double().numpy()
+
+
+def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -> Scene:
+    """10 to 20 shapes with surfaces of a kind, in a room, within the depths of the rig."""
+    setting = Setting(rig, seeded(name, seed))
+    room = _room(setting)
+    count = int(setting.rng.integers(10, 21))
+    objects: list[Object] = []
+    for _ in range(20 * count):
+        if len(objects) < count and (thing := _object(setting, room, objects, surface, moving)):
+            objects.append(thing)
+    walls = Material(texture=surface(setting, 0.8 * setting.far, _WALLS), roughness=0.9, specular=0.1)
+    place = Key(
+        position=vec(room.centre), rotation=vec(Rotation.from_matrix(room.R).as_rotvec()), extent=vec(room.extent)
+    )
+    objects.append(Object(name="room", shape="room", motion=Motion((place,)), material=walls))
+    return Scene(
+        objects=tuple(objects),
+        lights=_lights(setting, room),
+        world=World((0.25, 0.25, 0.25), 0.25),
+        depth=(setting.near, setting.far),
+        generator=name,
+        seed=seed,
+    )
+
+
+# The room and its lights ----------------------------------------------------------------------------------------
+
+
+def _room(setting: Setting) -> _Room:
+    """A room around the cameras, its walls between near and far along every camera's axis."""
+    rng, camera = setting.rng, setting.cameras[0]
+    turn = Rotation.from_rotvec(np.radians(rng.uniform(-8, 8, 3)))
+    R = (turn * Rotation.from_matrix(camera.R.double().numpy())).as_matrix().T
+    local = (setting.centres - setting.centres[0]) @ R
+    back = local[:, 2].min() - 2 * setting.near
+    rays = [_rays(c) for c in setting.cameras]
+    half = np.tan(_half_view(setting.cameras)) * rng.uniform(0.5, 0.9, 2) * setting.far + np.abs(local[:, :2]).max()
+    front = setting.far
+    for _ in range(30):
+        centre, extent = np.array([0, 0, (front + back) / 2]), np.array([2 * half[0], 2 * half[1], front - back])
+        room = _Room(R, setting.centres[0] + R @ centre, extent)
+        nearest, farthest = _reach(room, setting.cameras, rays)
+        if farthest <= 0.99 * setting.far and nearest >= setting.near:
+            return room
+        front = front if farthest <= 0.99 * setting.far else 0.93 * front
+        half = half if nearest >= setting.near else 1.15 * half
+    return room
+
+
+def _rays(camera: Camera) -> NDArray:
+    """Directions in the world, per metre of depth, of pixels all over the picture."""
+    grid = coarse_grid(camera.hw, max(camera.hw) // 8 or 1).reshape(-1, 2)
+    directions = (camera.unproject(grid, grid.new_ones(len(grid))) - camera.centre).double().numpy()
+    return np.asarray(directions[np.isfinite(directions).all(1)])
+
+
+def _half_view(cameras: Sequence[Camera]) -> NDArray:
+    """Half the widest view across and down, radians."""
+    angles = [
+        [math.atan(n / 2 / float(f)) for n, f in zip((c.hw[1], c.hw[0]), c.K[:2, :2].abs().amax(1))] for c in cameras
+    ]
+    return np.max(angles, axis=0)
+
+
+def _reach(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]) -> tuple[float, float]:
+    """The least and the greatest depth at which cameras see the walls."""
+    depths = []
+    for camera, directions in zip(cameras, rays):
+        origin = (camera.centre.double().numpy() - room.centre) @ room.R
+        d = directions @ room.R
+        walls = np.where(d > 0, 1, -1) * room.extent / 2
+        depths.append(((walls - origin) / np.where(np.abs(d) < 1e-9, 1e-9, d)).min(1))
+    every = np.concatenate(depths)
+    return float(every.min()), float(every.max())
+
+
+def _lights(setting: Setting, room: _Room) -> tuple[Light, ...]:
+    """Two to four lamps beside and above the cameras, and perhaps a sun; together about as bright everywhere."""
+    rng = setting.rng
+    count = int(rng.integers(2, 5))
+    shares = rng.dirichlet(np.full(count, 3.0)) * _IRRADIANCE * rng.uniform(0.8, 1.2)
+    target = room.at(np.array([0.0, 0.0, 0.2]))
+    lights = [_lamp(setting, room, target, float(share)) for share in shares]
+    if rng.uniform() < 0.6:
+        direction = room.R @ np.array([rng.uniform(-1, 1), rng.uniform(0.2, 1), rng.uniform(0.3, 1)])
+        lights.append(
+            _tinted(rng, Light(kind="sun", power=float(rng.uniform(0.8, 2)), direction=vec(direction), size=0.05))
+        )
+    return tuple(lights)
+
+
+def _lamp(setting: Setting, room: _Room, target: NDArray, irradiance: float) -> Light:
+    rng = setting.rng
+    where = room.at(np.array([rng.uniform(-0.8, 0.8), rng.uniform(-0.9, 0.1), rng.uniform(-0.9, -0.1)]))
+    squared = float(((target - where) ** 2).sum())
+    if rng.uniform() < 0.5:
+        size = float(rng.uniform(0.05, 0.2) * room.extent.min())
+        power, direction = irradiance * math.pi * squared, vec(target - where)
+        return _tinted(rng, Light(kind="area", power=power, position=vec(where), direction=direction, size=size))
+    power, size = irradiance * 4 * math.pi * squared, float(rng.uniform(0.01, 0.03) * room.extent.min())
+    return _tinted(rng, Light(kind="point", power=power, position=vec(where), size=size))
+
+
+def _tinted(rng: Generator, light: Light) -> Light:
+    """From warm to cold; warm light has more near infrared."""
+    warmth = float(rng.uniform(-0.12, 0.2))
+    return replace(light, rgb=(1 + warmth, 1.0, 1 - warmth), nir=1 + 2 * max(warmth, 0.0))
+
+
+# Objects --------------------------------------------------------------------------------------------------------
+
+
+def _object(setting: Setting, room: _Room, others: list[Object], surface: Surface, moving: float) -> Object | None:
+    """A shape at a random place in view, or None if the place drawn does not suit."""
+    rng, camera = setting.rng, setting.camera()
+    depth = float(1 / rng.uniform(1 / (0.75 * setting.far), 1 / (1.25 * setting.near)))
+    centre = setting.ahead(camera, rng.uniform(-0.95, 0.95, 2), depth)
+    view = depth * min(n / 2 / float(f) for n, f in zip((camera.hw[1], camera.hw[0]), camera.K[:2, :2].abs().amax(1)))
+    radius = float(min(view * rng.uniform(0.2, 0.55), 0.9 * (setting.distance(centre) - setting.near)))
+    if not radius > 0.05 * view or not room.holds(centre, 0.4 * radius) or _crowded(centre, radius, others):
+        return None
+    shape = _SHAPES[int(rng.integers(len(_SHAPES)))]
+    extent = _extent(rng, shape, radius)
+    relief = _relief(rng, extent) if rng.uniform() < 0.4 else None
+    key = Key(position=vec(centre), rotation=vec(Rotation.random(random_state=rng).as_rotvec()), extent=vec(extent))
+    material = _material(rng, surface(setting, depth, _PATTERNS), setting.metres(depth, 1))
+    keys = (key,) if moving == 0 else _path(setting, key, radius, moving)
+    return Object(name=f"{shape}{len(others) + 1}", shape=shape, motion=Motion(keys), material=material, relief=relief)
+
+
+def _crowded(centre: NDArray, radius: float, others: list[Object]) -> bool:
+    """Whether much of the object would be inside another one."""
+    keys = [o.motion.keys[0] for o in others]
+    return any(np.linalg.norm(centre - k.position) < 0.5 * (radius + np.linalg.norm(k.extent) / 2) for k in keys)
+
+
+def _extent(rng: Generator, shape: Shape, radius: float) -> NDArray:
+    """Lengths of the box around a shape that is inside a sphere."""
+    extent = rng.uniform(0.55, 1.0, 3)
+    if shape == "torus":
+        extent[1] = 0.3 * extent[0]
+    if shape == "plane":
+        extent[2] = 0.01
+    extent *= 2 * radius / np.linalg.norm(extent)
+    return np.asarray(extent)
+
+
+def _relief(rng: Generator, extent: NDArray) -> Relief:
+    size = np.sort(extent)[1] * rng.uniform(0.25, 0.8)
+    height = size * rng.uniform(0.05, 0.15)
+    return Relief(height=float(height), size=float(size), seed=int(rng.integers(2**31)))
+
+
+def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple[Key, ...]:
+    """Four keys, evenly spaced: steps up to the object's size, turns up to 60 degrees, a fifth longer or shorter."""
+    rng, keys = setting.rng, [start]
+    for k in range(1, 4):
+        position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius
+        if setting.distance(position) - radius < setting.near:
+            position = np.asarray(keys[-1].position)
+        turn = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(keys[-1].rotation)
+        extent = np.asarray(start.extent) * rng.uniform(0.8, 1.2, 3)
+        key = Key(position=vec(position), rotation=vec(turn.as_rotvec()), extent=vec(extent), time=k * duration / 3)
+        keys.append(key)
+    return tuple(keys)
+
+
+def _material(rng: Generator, texture: Texture, pixel: float) -> Material:
+    """Mostly dull; metallic one time in ten, transparent one in twenty, with fine bumps one in three."""
+    metallic = float(rng.uniform(0.6, 1)) if rng.uniform() < 0.1 else 0.0
+    transmission = float(rng.uniform(0.5, 0.9)) if not metallic and rng.uniform() < 0.05 else 0.0
+    return Material(
+        texture=texture,
+        roughness=float(rng.uniform(0.25, 1)),
+        specular=float(rng.uniform(0, 0.5)),
+        metallic=metallic,
+        transmission=transmission,
+        bump=float(rng.uniform(0.5, 2) * pixel) if rng.uniform() < 0.33 else 0.0,
+    )
+
+
+def seeded(name: str, seed: int) -> Generator:
+    """Randomness of its own for every generator and seed."""
+    return np.random.default_rng([zlib.crc32(name.encode()), seed])
+
+
+def vec(values: NDArray) -> Vec3:
+    """Three numbers as a scene keeps them."""
+    x, y, z = (float(v) for v in values)
+    return x, y, z

@@ -1,0 +1,168 @@
+"""Scenes from seeds: the paper's abstract ones, photograph-textured ones, calibration boards."""
+
+from __future__ import annotations
+
+import colorsys
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.random import Generator
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from arraygeom.pose import Pose
+from arraygeom.rig import Rig
+
+from .furnish import Setting, furnished, seeded, vec
+from .scene import Board, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
+
+PICTURES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
+
+
+def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
+    """The paper's scenes: 10 to 20 shapes with patterns in a room, within the depths of the rig.
+
+    With `moving` seconds, objects move, turn and stretch along random paths for so long. The same seed and rig
+    give the same scene. Raises ValueError if the rig has no calibrated camera.
+    """
+    return furnished("abstract", seed, rig, _pattern, moving)
+
+
+def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
+    """Scenes like those of `abstract`, with the pictures under a folder on all surfaces.
+
+    Raises ValueError if the folder holds no pictures.
+    """
+    files = _pictures(Path(folder))
+
+    def picture(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
+        rng, tint = setting.rng, float(setting.rng.uniform(0.75, 1.0))
+        width = setting.metres(depth, rng.uniform(150, 400))
+        paint = Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0)))
+        shift = (float(rng.uniform()), float(rng.uniform()), 0.0)
+        return Texture(kind="picture", picture=str(rng.choice(files)), scale=1 / width, paints=(paint,), offset=shift)
+
+    return furnished("photographs", seed, rig, picture, moving)
+
+
+def board(poses: Sequence[Pose], spec: Board, *, seed: int = 0) -> Scene:
+    """A calibration board that is at the k-th pose (world_from_board) at the time of k seconds.
+
+    Render it with cameras of one frame a second for as many seconds as there are poses.
+    """
+    if not poses:
+        raise ValueError("a board needs at least one pose")
+    width, height = spec.wh
+    middle = np.array([width / 2 - spec.margin, height / 2 - spec.margin, 0.0])
+    keys = tuple(_board_key(pose, middle, (width, height, 1.0), float(k)) for k, pose in enumerate(poses))
+    ink = Texture(kind="board", board=spec, paints=(Paint((0.85, 0.85, 0.85), 0.85),))
+    sheet = Object(name="board", shape="plane", motion=Motion(keys), material=Material(texture=ink, specular=0.1))
+    rng = seeded("board", seed)
+    facing = np.mean([p.R[:, 2].tolist() for p in poses], axis=0) + rng.normal(0, 0.3, 3)
+    sun = Light(kind="sun", power=1.6, direction=vec(facing), size=0.2)
+    centres = [np.asarray(k.position) for k in keys]
+    far = float(max(np.linalg.norm(c) for c in centres)) + max(width, height)
+    return Scene(
+        objects=(sheet,),
+        lights=(sun,),
+        world=World((0.3, 0.3, 0.3), 0.3),
+        depth=(0.1, far),
+        generator="board",
+        seed=seed,
+    )
+
+
+GENERATORS: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photographs": photographs, "board": board}
+"""By name. All take a seed; "abstract" and "photographs" a rig."""
+
+
+def random_board_poses(rig: Rig, spec: Board, count: int, *, seed: int = 0) -> list[Pose]:
+    """Poses (world_from_board) in front of all cameras at once: near and far, to all sides, tilted up to 40 degrees.
+
+    The board is from 0.6 to 1.1 times as long as the narrowest view is wide, and its middle is in every picture.
+    """
+    setting = Setting(rig, seeded("poses", seed))
+    return [_board_pose(setting, spec) for _ in range(count)]
+
+
+# Surfaces -------------------------------------------------------------------------------------------------------
+
+
+def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
+    rng = setting.rng
+    feature = setting.metres(depth, math.exp(rng.uniform(math.log(10), math.log(50))))
+    return Texture(
+        kind=kinds[int(rng.integers(len(kinds)))],
+        paints=_paints(rng),
+        scale=1 / feature,
+        offset=vec(rng.uniform(-50, 50, 3)),
+        distortion=float(rng.choice([0.0, rng.uniform(0.5, 4)])),
+        grain=float(rng.uniform(0.1, 0.4)),
+    )
+
+
+def _paints(rng: Generator) -> tuple[Paint, ...]:
+    """Two to four paints, by turns lighter and darker, of hues near each other or not."""
+    hue, spread, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
+    paints = []
+    for i in range(int(rng.integers(2, 5))):
+        value = rng.uniform(0.25, 0.5) if (i + dark_first) % 2 else rng.uniform(0.6, 0.95)
+        coded = colorsys.hsv_to_rgb((hue + rng.uniform(-spread, spread)) % 1, rng.uniform(0.1, 0.9), value)
+        r, g, b = (_linear(c) for c in coded)
+        paints.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
+    return tuple(paints)
+
+
+def _near_infrared(rng: Generator, rgb: Vec3) -> float:
+    """Dyes hardly absorb there, pigments much as they do in red, green is often a leaf, soot stays black."""
+    r, g, b = rgb
+    if g > 1.2 * max(r, b):
+        return float(rng.uniform(0.4, 0.6))
+    kind = rng.choice(["dye", "pigment", "soot"], p=[0.5, 0.4, 0.1])
+    if kind == "dye":
+        return float(rng.uniform(0.45, 0.8))
+    return float(rng.uniform(0.03, 0.1)) if kind == "soot" else float(np.clip(r * rng.uniform(0.8, 1.2), 0.02, 0.9))
+
+
+@lru_cache(maxsize=8)
+def _pictures(folder: Path) -> tuple[str, ...]:
+    found = sorted(str(p.resolve()) for p in folder.rglob("*") if p.suffix.lower() in PICTURES)
+    if not found:
+        raise ValueError(f"{folder}: no pictures ({', '.join(sorted(PICTURES))}) under this folder")
+    return tuple(found)
+
+
+def _linear(coded: float) -> float:
+    """sRGB to linear."""
+    return coded / 12.92 if coded <= 0.04045 else ((coded + 0.055) / 1.055) ** 2.4
+
+
+# Boards -----------------------------------------------------------------------------------------------------------
+
+
+def _board_key(pose: Pose, middle: NDArray, extent: Vec3, time: float) -> Key:
+    R, t = (np.asarray(v.detach().cpu().double()) for v in (pose.R, pose.t))
+    return Key(
+        position=vec(R @ middle + t), rotation=vec(Rotation.from_matrix(R).as_rotvec()), extent=extent, time=time
+    )
+
+
+def _board_pose(setting: Setting, spec: Board) -> Pose:
+    """The board faces the cameras' middle, turned and tilted; its middle is where every camera can see."""
+    rng = setting.rng
+    narrow = max(float((c.K[:2, :2].abs().amax(1) / torch.tensor([c.hw[1], c.hw[0]])).max()) for c in setting.cameras)
+    for _ in range(200):
+        camera = setting.camera()
+        depth = max(spec.wh) * narrow / float(rng.uniform(0.6, 1.1))
+        middle = setting.ahead(camera, rng.uniform(-0.6, 0.6, 2), depth)
+        seen = [(c, c.project(torch.from_numpy(middle))) for c in setting.cameras]
+        if all(bool(p.valid) and bool(c.contains(p.x)) for c, p in seen):
+            break
+    tilt = Rotation.from_rotvec([*np.radians(rng.uniform(-40, 40, 2)), math.radians(rng.uniform(-25, 25))])
+    R = camera.R.double().numpy().T @ tilt.as_matrix()
+    sheet = np.array([spec.wh[0] / 2 - spec.margin, spec.wh[1] / 2 - spec.margin, 0])
+    return Pose(torch.from_numpy(R), torch.from_numpy(middle - R @ sheet))

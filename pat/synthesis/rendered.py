@@ -1,0 +1,124 @@
+"""A rendered scene on disk: pictures and truth of every camera, its rig, its description, how it was checked.
+
+A folder holds `rig.yaml` (the rig as rendered), `scene.yaml`, `render.json` (settings, versions, frames, check) and
+one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `Frame` by name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+from torch import Tensor
+
+from arraygeom.rig import Rig
+
+from .scene import Scene
+
+RENDER_FILE = "render.json"
+"""The last file written: a folder that has it is whole."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame:
+    """One picture and its truth, at the pixels' centres.
+
+    `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of the near
+    infrared, `alpha` how much of a pixel objects cover. `depth` is z in metres (float32), infinite where nothing
+    is. `index` is 0 where nothing is, else the object's place in the scene plus one. `normals` are unit vectors in
+    the camera's frame; `flow` is how far each pixel's point moves in the picture until the camera's next frame (for
+    one frame: 1/30 s). What a lens does not see has `depth` NaN and index 0.
+    """
+
+    time: float
+    rgb: Float[Tensor, "3 h w"]
+    depth: Float[Tensor, "h w"]
+    index: Int[Tensor, "h w"]
+    normals: Float[Tensor, "3 h w"] | None = None
+    flow: Float[Tensor, "2 h w"] | None = None
+    nir: Float[Tensor, "1 h w"] | None = None
+    alpha: Float[Tensor, "1 h w"] | None = None
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A rendered folder. Pictures are read when asked for."""
+
+    folder: Path
+
+    @cached_property
+    def about(self) -> dict[str, Any]:
+        """What `render.json` says: `settings`, `versions`, `seconds`, `frames` and `check`."""
+        return dict(json.loads((self.folder / RENDER_FILE).read_text(encoding="utf-8")))
+
+    @cached_property
+    def rig(self) -> Rig:
+        """The cameras as rendered: sizes included, calibrated, with their lenses."""
+        return Rig.load(self.folder / "rig.yaml")
+
+    @cached_property
+    def scene(self) -> Scene:
+        """What was rendered."""
+        return Scene.load(self.folder / "scene.yaml")
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the self-check found nothing wrong."""
+        return bool(self.about["check"]["accepted"])
+
+    def frames(self, camera: str) -> int:
+        """How many frames of a camera there are."""
+        return len(self.about["frames"][self.rig.known(camera)])
+
+    def frame(self, camera: str, number: int = 0) -> Frame:
+        """One frame of a camera, as float32 (index: int64)."""
+        entry = self.about["frames"][self.rig.known(camera)][number]
+        with np.load(self.folder / entry["file"]) as arrays:
+            tensors = {k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32)) for k in arrays}
+        return Frame(time=entry["time"], **tensors)
+
+    def first_frames(self) -> Mapping[str, Frame]:
+        """The first frame of every camera."""
+        return {name: self.frame(name) for name in self.rig.names}
+
+
+_STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals": np.float16, "index": np.uint16}
+_MOST = 6e4
+
+
+def save_frame(path: Path, frame: Frame) -> None:
+    """Write the arrays of a frame, on disk when this returns."""
+    arrays: dict[str, NDArray] = {}
+    for field in dataclasses.fields(frame):
+        value = getattr(frame, field.name)
+        if isinstance(value, Tensor):
+            kind = _STORED.get(field.name, np.float32)
+            array = value.numpy()
+            arrays[field.name] = (np.minimum(array, _MOST) if kind == np.float16 else array).astype(kind)
+    with path.open("wb") as file:
+        np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def frame_file(rig: Rig, camera: str, number: int = 0) -> str:
+    """The name of a frame's file; the camera's number is in front where its name has odd characters."""
+    plain = re.sub(r"[^A-Za-z0-9_.+]", "_", camera)
+    same = plain == camera and not camera.startswith(".")
+    return f"{plain if same else f'{rig.names.index(camera):02d}_{plain}'}-{number:04d}.npz"
+
+
+def is_rendered(folder: str | Path) -> bool:
+    """Whether a folder holds a whole rendered scene."""
+    return (Path(folder) / RENDER_FILE).is_file()

@@ -1,0 +1,251 @@
+"""A scene apart from any renderer: objects, materials, lights and motions, as frozen values that serialise.
+
+The world is the rig's: metres, and whatever directions the rig's `cam_from_world` give it. Radians, seconds.
+Colours are linear reflectances and radiances of red, green and blue (Rec. 709 primaries), with one of the near
+infrared beside them.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..images import write_text
+from .document import from_document, to_document
+
+Vec3 = tuple[float, float, float]
+Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "room"]
+TextureKind = Literal["plain", "voronoi", "magic", "brick", "checker", "noise", "wave", "picture", "board"]
+
+FORMAT = "pat-scene 1"
+
+
+@dataclass(frozen=True)
+class Paint:
+    """What a surface reflects, 0..1: linear red, green and blue, and near infrared."""
+
+    rgb: Vec3
+    nir: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Board:
+    """A calibration target, printed in black on white.
+
+    `squares` are (columns, rows) of `square` metres; a ChArUco board has markers of `marker` metres from an OpenCV
+    `dictionary` in its white squares. `margin` metres of white surround it. Its frame has the origin at the outer
+    corner of the first square, x along the columns, y along the rows, z away from who looks at it (as OpenCV's).
+    """
+
+    kind: Literal["charuco", "chessboard"] = "charuco"
+    squares: tuple[int, int] = (9, 6)
+    square: float = 0.04
+    marker: float = 0.03
+    dictionary: str = "DICT_5X5_250"
+    margin: float = 0.02
+
+    @property
+    def wh(self) -> tuple[float, float]:
+        """Width and height of the sheet in metres, margins included."""
+        columns, rows = self.squares
+        return columns * self.square + 2 * self.margin, rows * self.square + 2 * self.margin
+
+
+@dataclass(frozen=True, kw_only=True)
+class Texture:
+    """How paints are laid on a surface.
+
+    Patterns live in the object's own coordinates in metres and have about `scale` features a metre; `offset`
+    shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They run
+    through the `paints` in order. A "picture" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
+    and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is its red plus
+    1.5 times by how much green exceeds red and blue (leaves), times the paint's. A "board" fills its plane.
+    """
+
+    kind: TextureKind = "plain"
+    paints: tuple[Paint, ...] = (Paint((0.5, 0.5, 0.5), 0.5),)
+    scale: float = 1.0
+    offset: Vec3 = (0.0, 0.0, 0.0)
+    distortion: float = 0.0
+    grain: float = 0.0
+    picture: str = ""
+    board: Board | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Material:
+    """A surface: its texture and how it shines.
+
+    `roughness`, `specular`, `metallic` and `transmission` are 0..1 as in Disney's principled model; `bump` metres
+    of relief follow the texture in shading only; `emission` makes the surface shine its paint, unlit.
+    """
+
+    texture: Texture = field(default_factory=Texture)
+    roughness: float = 0.6
+    specular: float = 0.3
+    metallic: float = 0.0
+    transmission: float = 0.0
+    bump: float = 0.0
+    emission: float = 0.0
+
+
+class Placement(NamedTuple):
+    """X_world = R diag(extent) X_object + position, for a shape that fills [-0.5, 0.5]^3."""
+
+    R: Float[NDArray, "3 3"]
+    position: Float[NDArray, "3"]
+    extent: Float[NDArray, "3"]
+
+    @property
+    def matrix(self) -> Float[NDArray, "4 4"]:
+        """The same as one affine map."""
+        M = np.eye(4)
+        M[:3, :3], M[:3, 3] = self.R * self.extent, self.position
+        return M
+
+
+@dataclass(frozen=True, kw_only=True)
+class Key:
+    """Where an object is at a time: position of its middle, rotation vector (radians), extent along its own axes."""
+
+    position: Vec3
+    rotation: Vec3 = (0.0, 0.0, 0.0)
+    extent: Vec3 = (1.0, 1.0, 1.0)
+    time: float = 0.0
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Keys in order of time. Between them positions and extents change evenly and rotations turn evenly about an
+    axis; before the first and after the last nothing moves."""
+
+    keys: tuple[Key, ...]
+
+    def __post_init__(self) -> None:
+        times = [k.time for k in self.keys]
+        if not times or any(a >= b for a, b in pairwise(times)):
+            raise ValueError(f"a motion needs keys whose times rise, got times {times}")
+
+    @property
+    def still(self) -> bool:
+        """Whether nothing ever changes."""
+        return all(replace(k, time=0.0) == replace(self.keys[0], time=0.0) for k in self.keys)
+
+    def at(self, time: float) -> Placement:
+        """Where the object is at a time in seconds."""
+        a, b, fraction = self._between(time)
+        start = Rotation.from_rotvec(a.rotation)
+        turn = (Rotation.from_rotvec(b.rotation) * start.inv()).as_rotvec()
+        R = (Rotation.from_rotvec(fraction * turn) * start).as_matrix()
+        return Placement(R, _mix(a.position, b.position, fraction), _mix(a.extent, b.extent, fraction))
+
+    def _between(self, time: float) -> tuple[Key, Key, float]:
+        after = next((i for i, k in enumerate(self.keys) if k.time > time), len(self.keys))
+        if after in (0, len(self.keys)):
+            edge = self.keys[min(after, len(self.keys) - 1)]
+            return edge, edge, 0.0
+        a, b = self.keys[after - 1], self.keys[after]
+        return a, b, (time - a.time) / (b.time - a.time)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Relief:
+    """Bumps and dents in the surface itself, `height` metres to both sides and about `size` metres across."""
+
+    height: float
+    size: float
+    seed: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Object:
+    """A shape with a material, and perhaps a relief.
+
+    A "room" is a cube seen from inside; it casts no shadow. Object `i` of a scene has the index i + 1 in rendered
+    index pictures.
+    """
+
+    name: str
+    shape: Shape
+    motion: Motion
+    material: Material = field(default_factory=Material)
+    relief: Relief | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Light:
+    """A light. `power` is in watts ("sun": watts a square metre), for each of the colours times that colour.
+
+    `direction` is where an area light or a sun shines to. `size` is the side of an area light or the radius of a
+    point light in metres, and the angle of a sun in radians.
+    """
+
+    kind: Literal["area", "sun", "point"]
+    power: float
+    position: Vec3 = (0.0, 0.0, 0.0)
+    direction: Vec3 = (0.0, 0.0, 1.0)
+    rgb: Vec3 = (1.0, 1.0, 1.0)
+    nir: float = 1.0
+    size: float = 0.1
+
+
+@dataclass(frozen=True)
+class World:
+    """Light from everywhere that no object blocks: radiance of red, green, blue and near infrared."""
+
+    rgb: Vec3 = (0.0, 0.0, 0.0)
+    nir: float = 0.0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """All there is to see. `depth` is (near, far) in metres, `generator` and `seed` say where the scene is from."""
+
+    objects: tuple[Object, ...]
+    lights: tuple[Light, ...] = ()
+    world: World = World()
+    depth: tuple[float, float] = (1.0, 20.0)
+    generator: str = ""
+    seed: int = 0
+
+    def to_yaml(self) -> str:
+        """The text of a scene file."""
+        return yaml.safe_dump(
+            {"format": FORMAT, **to_document(self)}, sort_keys=False, width=120, default_flow_style=None
+        )
+
+    @classmethod
+    def from_yaml(cls, text: str, source: str = "scene") -> Scene:
+        """The scene of a file's text (YAML or JSON). Raises ValueError naming `source` and the entry."""
+        try:
+            document = json.loads(text) if text.lstrip().startswith("{") else yaml.safe_load(text)
+        except (yaml.YAMLError, json.JSONDecodeError) as error:
+            raise ValueError(f"{source}: not valid YAML: {str(error).splitlines()[0]}") from None
+        if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
+            raise ValueError(f"{source}: not a scene file: its first line must be 'format: {FORMAT}'")
+        try:
+            return from_document(cls, document)
+        except ValueError as error:
+            raise ValueError(f"{source}: {error}") from None
+
+    def save(self, path: str | Path) -> None:
+        """Write the scene file, whole or not at all."""
+        write_text(path, self.to_yaml())
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """Read a scene file. Raises ValueError naming the file and the entry."""
+        return cls.from_yaml(Path(path).read_text(encoding="utf-8"), str(path))
+
+
+def _mix(a: Vec3, b: Vec3, fraction: float) -> NDArray:
+    return (1 - fraction) * np.asarray(a) + fraction * np.asarray(b)

@@ -1,0 +1,209 @@
+"""The shapes of scenes as meshes in metres, the same for every renderer."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy.typing import NDArray
+
+from .scene import Object, Relief, Shape, Vec3
+
+Patch = Callable[[NDArray, NDArray], tuple[NDArray, NDArray, NDArray]]
+"""(s, t) in 0..1 to (x, y, z) on the shape that fills [-0.5, 0.5]^3. Seen from outside, s is right where t is down."""
+
+TORUS = 0.3
+"""Radius of a torus's tube over that of its outline."""
+
+_FLAT = 1
+_ROUND = 64
+_RELIEF_CELLS = 3
+_MOST_CELLS = 96
+
+
+class Mesh(NamedTuple):
+    """Corners of quadrilaterals, and where each corner is on a picture laid on the surface.
+
+    `vertices` are metres in the object's frame, at the extent of its first key. `faces` go counter-clockwise seen
+    from outside; one of three corners has its last index twice. `uv` (metres, x right, y down) is by face and corner.
+    """
+
+    vertices: Float[NDArray, "v 3"]
+    faces: Int[NDArray, "f 4"]
+    uv: Float[NDArray, "f 4 2"]
+
+
+class _Surface(NamedTuple):
+    """A patch, how many cells it needs along s and t to look right, and whether corners that coincide are one.
+
+    They are not at the tip of a cone, where each has the normal of its own part of the side.
+    """
+
+    patch: Patch
+    cells: tuple[int, int]
+    weld: bool = True
+
+
+def mesh(thing: Object) -> Mesh:
+    """The object's surface, relief included.
+
+    Patches of a plain shape do not share corners, so that edges between them are sharp; those of a relief do.
+    """
+    extent = np.asarray(thing.motion.keys[0].extent)
+    parts = [_part(s, extent, thing.relief) for s in SURFACES[thing.shape]]
+    if thing.relief is None:
+        return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, SURFACES[thing.shape])])
+    return _with_relief(_welded(_joined(parts), extent), thing.relief)
+
+
+def inside(thing: Object, point: Float[NDArray, "3"], time: float) -> bool:
+    """Whether a point of the world is within a solid object, or about as near to it as its relief is high."""
+    place = thing.motion.at(time)
+    margin = thing.relief.height if thing.relief else 0.0
+    local = place.R.T @ (point - place.position) / (place.extent + 2 * margin)
+    return thing.shape in _INSIDE and bool(_INSIDE[thing.shape](*local))
+
+
+def _part(surface: _Surface, extent: NDArray, relief: Relief | None) -> Mesh:
+    m, n = _cells(surface, extent, relief)
+    s, t = np.meshgrid(np.linspace(0, 1, m + 1), np.linspace(0, 1, n + 1), indexing="ij")
+    points = np.stack(surface.patch(s, t), -1) * extent
+    lengths = _lengths(points)
+    uv = np.stack([s * lengths[0], t * lengths[1]], -1)
+    corner = np.arange((m + 1) * (n + 1)).reshape(m + 1, n + 1)
+    faces = np.stack([corner[:-1, :-1], corner[:-1, 1:], corner[1:, 1:], corner[1:, :-1]], -1).reshape(-1, 4)
+    return Mesh(points.reshape(-1, 3), faces, uv.reshape(-1, 2)[faces])
+
+
+def _joined(parts: list[Mesh]) -> Mesh:
+    starts = np.cumsum([0, *(len(p.vertices) for p in parts[:-1])])
+    faces = np.concatenate([p.faces + start for p, start in zip(parts, starts)])
+    return Mesh(np.concatenate([p.vertices for p in parts]), faces, np.concatenate([p.uv for p in parts]))
+
+
+def _cells(surface: _Surface, extent: NDArray, relief: Relief | None) -> tuple[int, int]:
+    if relief is None:
+        return surface.cells
+    grid = np.linspace(0, 1, 17)
+    points = np.stack(surface.patch(*np.meshgrid(grid, grid, indexing="ij")), -1) * extent
+    wanted = (math.ceil(_RELIEF_CELLS * length / relief.size) for length in _lengths(points))
+    m, n = (min(max(w, c), _MOST_CELLS) for w, c in zip(wanted, surface.cells))
+    return m, n
+
+
+def _lengths(points: NDArray) -> tuple[float, float]:
+    """The longest line along each of the two directions of a grid of points."""
+    along_s = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum(0).max()
+    along_t = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(1).max()
+    return float(along_s), float(along_t)
+
+
+def _welded(loose: Mesh, extent: NDArray) -> Mesh:
+    """Corners that coincide made one, and faces without area gone."""
+    _, first, new = np.unique(np.round(loose.vertices / extent, 6), axis=0, return_index=True, return_inverse=True)
+    faces, uv = new.reshape(-1)[loose.faces], loose.uv
+    faces, uv = _triangles_last(faces, uv)
+    keep = np.array([len(set(f)) >= 3 for f in faces.tolist()])
+    return Mesh(loose.vertices[first], faces[keep], uv[keep])
+
+
+def _triangles_last(faces: NDArray, uv: NDArray) -> tuple[NDArray, NDArray]:
+    """Faces with two equal corners in a row turned so that these come last."""
+    faces, uv = faces.copy(), uv.copy()
+    for i in range(3):
+        rows = np.flatnonzero(faces[:, i] == faces[:, i + 1])
+        faces[rows], uv[rows] = np.roll(faces[rows], 2 - i, axis=1), np.roll(uv[rows], 2 - i, axis=1)
+    return faces, uv
+
+
+def _with_relief(flat: Mesh, relief: Relief) -> Mesh:
+    bumps = relief.height * _noise(flat.vertices / relief.size, relief.seed)
+    return flat._replace(vertices=flat.vertices + bumps[:, None] * _normals(flat))
+
+
+def _normals(surface: Mesh) -> NDArray:
+    """Unit normals at the vertices, outwards."""
+    a, b, c, d = (surface.vertices[surface.faces[:, i]] for i in range(4))
+    by_face = np.cross(c - a, d - b)
+    total = np.zeros_like(surface.vertices)
+    for i in range(4):
+        np.add.at(total, surface.faces[:, i], by_face)
+    return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
+
+
+def _noise(points: NDArray, seed: int, waves: int = 24) -> NDArray:
+    """Smooth noise in -1..1 with features about 1 across: plane waves of random directions."""
+    rng = np.random.default_rng(seed)
+    direction = rng.normal(size=(waves, 3))
+    direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(direction, axis=1, keepdims=True)
+    total = np.cos(points @ direction.T + rng.uniform(0, 2 * np.pi, waves)).sum(1)
+    return np.tanh(total / math.sqrt(waves / 2) / 1.5)
+
+
+def _quad(origin: Vec3, along_s: Vec3, along_t: Vec3) -> Patch:
+    o, a, b = (np.asarray(v, float) for v in (origin, along_s, along_t))
+    return lambda s, t: tuple(o[i] + a[i] * s + b[i] * t for i in range(3))  # type: ignore[return-value]
+
+
+def _sphere(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    polar, turn = np.pi * t, 2 * np.pi * s
+    return 0.5 * np.sin(polar) * np.cos(turn), -0.5 * np.cos(polar), 0.5 * np.sin(polar) * np.sin(turn)
+
+
+def _disc(y: float, sign: int) -> Patch:
+    def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        turn = 2 * np.pi * s * sign
+        return 0.5 * t * np.cos(turn), np.full_like(s, y), 0.5 * t * np.sin(turn)
+
+    return patch
+
+
+def _side(top: float) -> Patch:
+    """The side of a cylinder (`top` 1) or cone (0) whose axis is y, its top at y = -0.5."""
+
+    def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        radius, turn = 0.5 * (top + (1 - top) * t), 2 * np.pi * s
+        return radius * np.cos(turn), t - 0.5, radius * np.sin(turn)
+
+    return patch
+
+
+def _torus(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+    turn, tube = 2 * np.pi * s, 2 * np.pi * t
+    radius = 0.5 * (1 - TORUS) + 0.5 * TORUS * np.cos(tube)
+    return radius * np.cos(turn), 0.5 * np.sin(tube), radius * np.sin(turn)
+
+
+_CUBE = (
+    _quad((-0.5, -0.5, -0.5), (1, 0, 0), (0, 1, 0)),
+    _quad((0.5, -0.5, 0.5), (-1, 0, 0), (0, 1, 0)),
+    _quad((0.5, -0.5, -0.5), (0, 0, 1), (0, 1, 0)),
+    _quad((-0.5, -0.5, 0.5), (0, 0, -1), (0, 1, 0)),
+    _quad((-0.5, -0.5, 0.5), (1, 0, 0), (0, 0, -1)),
+    _quad((-0.5, 0.5, -0.5), (1, 0, 0), (0, 0, 1)),
+)
+
+SURFACES: dict[Shape, tuple[_Surface, ...]] = {
+    "plane": (_Surface(_quad((-0.5, -0.5, 0), (1, 0, 0), (0, 1, 0)), (_FLAT, _FLAT)),),
+    "cube": tuple(_Surface(q, (_FLAT, _FLAT)) for q in _CUBE),
+    "room": tuple(_Surface(q, (_FLAT, _FLAT)) for q in _CUBE),
+    "sphere": (_Surface(_sphere, (_ROUND, _ROUND // 2)),),
+    "cylinder": (
+        _Surface(_side(1), (_ROUND, _FLAT)),
+        _Surface(_disc(-0.5, 1), (_ROUND, _FLAT)),
+        _Surface(_disc(0.5, -1), (_ROUND, _FLAT)),
+    ),
+    "cone": (_Surface(_side(0), (_ROUND, _FLAT), weld=False), _Surface(_disc(0.5, -1), (_ROUND, _FLAT))),
+    "torus": (_Surface(_torus, (_ROUND, _ROUND // 2)),),
+}
+
+_INSIDE: dict[Shape, Callable[[float, float, float], bool]] = {
+    "cube": lambda x, y, z: max(abs(x), abs(y), abs(z)) < 0.5,
+    "sphere": lambda x, y, z: math.hypot(x, y, z) < 0.5,
+    "cylinder": lambda x, y, z: math.hypot(x, z) < 0.5 and abs(y) < 0.5,
+    "cone": lambda x, y, z: math.hypot(x, z) < 0.5 * (y + 0.5) and abs(y) < 0.5,
+    "torus": lambda x, y, z: ((math.hypot(x, z) - 0.35) / 0.15) ** 2 + (y / 0.5) ** 2 < 1,
+}

@@ -1,0 +1,57 @@
+"""High frame rate - low frame rate: a fast mono alpha, three slow cameras behind filters, and an object that moves.
+
+No two clocks agree. Every frame of alpha gets colour from the slow frames nearest in time (`pat.sequence`).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pat.images import luminance
+from pat.sensors import Clip, Linear, Noise, record
+from pat.systems.exposures import banded
+from pat.systems.stage import Stage
+from pat.systems.system import Recording, coded
+
+TITLE = "fast mono alpha, three slow cameras with filters, not synchronised; an object moves"
+REDUCED = 1 / 4
+DEPTHS, LAYERS, SEED = (2.2, 9.0), 9, 14
+FRAMES = 11
+SPEED = 18.0
+"""Of the object, per cent of alpha's width in the time of a slow frame."""
+
+
+def record_scene(stage: Stage) -> Recording:
+    """Eleven frames of alpha, and of each beta those of that time."""
+    rig, generator = stage.rig, stage.generator("record")
+    times = {name: frame_times(stage, name) for name in rig.names}
+    velocity, layer = object_velocity(stage)
+    raw: dict[str, list[Tensor]] = {name: [] for name in rig.names}
+    truth = []
+    for name in rig.names:
+        for time in times[name]:
+            lit = record(stage.seen(name, stage.moved(layer, velocity * time))[0], (Linear(),), generator).image
+            own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
+            raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
+            if name == stage.alpha:
+                bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
+                truth.append(coded(torch.cat(bands)))
+    return Recording(raw, truth)
+
+
+def frame_times(stage: Stage, name: str) -> list[float]:
+    """When a camera records, seconds, for as long as alpha does."""
+    own, alpha = (stage.rig[n].sensor for n in (name, stage.alpha))
+    rate, last = own.frame_rate or 1.0, (FRAMES - 1) / (alpha.frame_rate or 1.0)
+    return [t for i in range(FRAMES) if (t := own.time_offset + i / rate) <= last + 0.5 / rate]
+
+
+def object_velocity(stage: Stage) -> tuple[Tensor, int]:
+    """Metres a second in alpha's frame, and which layer moves: a thing that covers about a seventh of the picture."""
+    things = stage.shares() * (~stage.scene.solid[0])
+    layer = int((things - 0.14).abs().argmin())
+    depth = float(stage.seen(stage.alpha)[1].median())
+    camera = stage.camera(stage.alpha)
+    across = SPEED / 100 * camera.hw[1] * 30.0 * depth / float(camera.K[0, 0, 0])
+    return torch.tensor([across, 0.15 * across, 0.0], dtype=torch.float64), layer

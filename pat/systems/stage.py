@@ -1,0 +1,95 @@
+"""What the systems look at: one layered scene, seen by any camera, in any light, at any time."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from arraygeom import Camera, Pose, Rig
+from arraygeom.pose import matvec
+from pat.synthesis.layered import LayeredScenes
+from pat.synthesis.layers import Layers, draw_layers
+from pat.synthesis.patterns import patterns
+from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rigs import RigBatch, RigDistribution
+
+Seen = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
+
+
+class Stage(LayeredScenes):
+    """A scene in front of a rig's alpha, between two depths in metres.
+
+    Textures are the pictures of a folder, or patterns and the pictures that scikit-image ships. The seed decides all.
+    """
+
+    def __init__(
+        self, rig: Rig, alpha: str, *, depths: tuple[float, float], layers: int, photos: Path | None, seed: int
+    ) -> None:
+        self.rig, self.alpha, self.seed = rig, alpha, seed
+        super().__init__(
+            _textures(photos, seed), RigDistribution(), hw=rig[alpha].hw, layers=(layers, layers), seed=seed
+        )
+        near, far = (torch.tensor([d], dtype=torch.float64) for d in depths)
+        rigs = RigBatch([self.camera(name) for name in (alpha, *rig.betas(alpha))], near, far)
+        self.scene = draw_layers(rigs, self.layers, self.photos, len(self.outlines), self.generator("scene"))
+
+    def generator(self, purpose: str) -> Generator:
+        """Randomness for one purpose, the same each time."""
+        return Generator().manual_seed(self.seed * 1_000_003 + sum(ord(c) * 31**i for i, c in enumerate(purpose)))
+
+    def camera(self, name: str) -> Camera:
+        """A camera of the rig as a batch of one, in alpha's frame."""
+        camera, alpha = self.rig[name], self.rig[self.alpha]
+        if not (isinstance(camera, Camera) and isinstance(alpha, Camera)):
+            raise ValueError(f"'{name}' is not calibrated: a scene is rendered for calibrated cameras")
+        pose = camera.cam_from_world @ alpha.cam_from_world.inverse()
+        return camera.replace(K=camera.K[None], cam_from_world=Pose(pose.R[None], pose.t[None]), distortion=None)
+
+    @torch.no_grad()
+    def seen(self, name: str, layers: Layers | None = None) -> Seen:
+        """The picture (sRGB) and the depth that a camera sees, of the scene itself or of it changed."""
+        camera = self.camera(name)
+        finest = max(float(self.camera(n).K[0, 0, 0]) for n in self.rig.names)
+        factor = min(max(round(finest / float(camera.K[0, 0, 0])), 2), 4)
+        image, depth = self._seen(layers or self.scene, camera, factor)[:2]
+        return image, depth[0]
+
+    def painted(self, values: Sequence[float]) -> Layers:
+        """The scene with each layer of one grey value, 0..1, instead of its texture."""
+        paint = torch.zeros_like(self.scene.colour)
+        paint[..., 3] = torch.tensor(values, dtype=paint.dtype)[None, :, None]
+        return dataclasses.replace(self.scene, colour=paint)
+
+    def mixed(self, weights: Float[Tensor, "l 4"]) -> Layers:
+        """The scene in grey: for each layer weights of its texture's red, green and blue, and a constant."""
+        grey = (weights[None, :, None, :3].to(self.scene.colour) @ self.scene.colour).expand(-1, -1, 3, -1).clone()
+        grey[..., 3] += weights[None, :, None, 3].to(grey)
+        return dataclasses.replace(self.scene, colour=grey)
+
+    def moved(self, layer: int, step: Float[Tensor, "3"]) -> Layers:
+        """The scene with one layer moved, metres in alpha's frame."""
+        planes, moving = self.scene.plane_from_world, torch.zeros_like(self.scene.plane_from_world.t)
+        moving[:, layer] = step.to(moving)
+        return dataclasses.replace(self.scene, plane_from_world=Pose(planes.R, planes.t - matvec(planes.R, moving)))
+
+    def shares(self) -> Float[Tensor, " l"]:
+        """The part of alpha's picture that each layer covers."""
+        count = self.scene.present.shape[1]
+        image, _ = self.seen(self.alpha, self.painted([(i + 1) / 32 for i in range(count)]))
+        index = (image[0, 0] * 32).round().long().clamp(1, count) - 1
+        return torch.bincount(index.flatten(), minlength=count) / index.numel()
+
+
+def _textures(photos: Path | None, seed: int) -> PhotoBank:
+    if photos is not None:
+        return PhotoBank.load(photos, seed=seed)
+    from pat.synthesis.sample import photographs
+
+    pictures = photographs()
+    return PhotoBank(pictures + patterns(np.random.default_rng(seed), 10), photos=len(pictures))

@@ -1,0 +1,50 @@
+"""Visible - near infrared: alpha sees 800 to 1000 nm, beta colours; neither sees the same materials alike.
+
+The weights know nothing of the near infrared. Here each surface reflects it in a way of its own: the farthest (the
+sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes the visible
+picture alone. The truth is alpha's brightness with the colour differences that beta's colours have at alpha's view.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from pat.images import from_luma_chroma, to_luma_chroma
+from pat.sensors import Clip, Linear, Noise, record
+from pat.systems.stage import Stage
+from pat.systems.system import Recording, coded
+
+TITLE = "near infrared alpha, colour beta: the same materials look different"
+REDUCED = 1 / 5
+DEPTHS, LAYERS, SEED = (12.0, 150.0), 10, 10
+HAZE = 0.002
+"""Part of the light lost in a metre."""
+
+
+def record_scene(stage: Stage) -> Recording:
+    """One frame."""
+    generator = stage.generator("record")
+    infrared = record(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1], (Linear(),), generator).image
+    own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
+    nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
+    colour = record(other, (Noise(6_000, 3), Clip()), generator).image
+    truth = from_luma_chroma(coded(infrared[0]), to_luma_chroma(coded(own[0]))[1])
+    return Recording({"nir": [nir[0]], "colour": [colour[0]]}, [truth.clamp(0, 1)])
+
+
+def infrared_weights(stage: Stage) -> torch.Tensor:
+    """Of each layer: how its near infrared comes of its visible colours, and brighter or darker by how much."""
+    count, g = stage.scene.present.shape[1], stage.generator("infrared")
+    mixture = torch.rand(count, 3, generator=g)
+    contrast = torch.where(torch.rand(count, 1, generator=g) < 0.25, -0.6, 0.9)
+    weights = contrast * mixture / mixture.sum(1, keepdim=True)
+    offset = torch.where(contrast < 0, 0.75, 0.0) + 0.25 * torch.rand(count, 1, generator=g)
+    weights = torch.cat([weights, offset], 1)
+    weights[0] *= 0.4
+    return weights
+
+
+def hazed(picture: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+    """Linear light of a visible picture, with the air's own light in it by distance."""
+    clear = record(picture, (Linear(),), torch.Generator()).image
+    return torch.lerp(torch.full_like(clear, 0.6), clear, torch.exp(-HAZE * depth))

@@ -1,0 +1,107 @@
+"""Checkpoints: all that a run needs to go on as if it had not stopped. Tensors and JSON, nothing pickled."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.swa_utils import AveragedModel
+
+from pat.images import write_atomically
+from pat.weights import misfit
+
+FORMAT = "pat-checkpoint 1"
+KEPT = 2
+
+
+class Checkpoint(NamedTuple):
+    """Tensors by name, and facts: the step, the best score so far, minutes spent, the recipe."""
+
+    tensors: dict[str, Tensor]
+    facts: dict[str, Any]
+
+
+def collect(network: nn.Module, optimiser: Optimizer, average: AveragedModel, facts: Mapping[str, Any]) -> Checkpoint:
+    """The state of a run."""
+    tensors = {f"network/{k}": v for k, v in network.state_dict().items()}
+    tensors |= {f"average/{k}": v for k, v in average.state_dict().items()}
+    for i, state in optimiser.state_dict()["state"].items():
+        tensors |= {f"optimiser/{i}/{k}": v for k, v in state.items()}
+    return Checkpoint(tensors, dict(facts))
+
+
+def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, average: AveragedModel) -> None:
+    """Put the state of a run back. Raises ValueError if it is another network's."""
+    parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
+    for name, tensor in checkpoint.tensors.items():
+        part, _, rest = name.partition("/")
+        parts[part][rest] = tensor
+    wrong = misfit(network, parts["network"])
+    if wrong:
+        raise ValueError(f"the checkpoint is of another network ({wrong}): give its own recipe, or another --out")
+    network.load_state_dict(parts["network"])
+    average.load_state_dict(parts["average"])
+    state: dict[int, dict[str, Tensor]] = {}
+    for name, tensor in parts["optimiser"].items():
+        i, _, key = name.partition("/")
+        state.setdefault(int(i), {})[key] = tensor
+    optimiser.load_state_dict(optimiser.state_dict() | {"state": state})
+
+
+def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
+    """Write a checkpoint, whole or not at all, and remove all but it and the one before.
+
+    Raises OSError, the older ones intact, where there is no room.
+    """
+    step = checkpoint.facts["step"]
+    path = folder / f"step-{step:08d}.safetensors"
+    tensors = {k: v.detach().cpu().contiguous() for k, v in checkpoint.tensors.items()}
+    try:
+        with write_atomically(path) as temporary:
+            save_file(tensors, temporary, {"format": FORMAT, "facts": json.dumps(checkpoint.facts)})
+    except (SafetensorError, OSError) as error:
+        raise OSError(_no_room(folder, step, tensors, error)) from None
+    for old in _files(folder)[KEPT:]:
+        old.unlink()
+    return path
+
+
+def newest_checkpoint(folder: Path) -> Checkpoint | None:
+    """The newest checkpoint that can be read whole; None if there is none."""
+    found = (read_checkpoint(path) for path in _files(folder))
+    return next((checkpoint for checkpoint in found if checkpoint), None)
+
+
+def read_checkpoint(path: Path) -> Checkpoint | None:
+    """A checkpoint, or None for a file that is not a whole one."""
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata() or {}
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+    except (SafetensorError, OSError):
+        return None
+    return Checkpoint(tensors, json.loads(metadata["facts"])) if metadata.get("format") == FORMAT else None
+
+
+def _files(folder: Path) -> list[Path]:
+    """Checkpoints, newest first."""
+    return sorted((p for p in folder.glob("step-*.safetensors") if re.fullmatch(r"step-\d+", p.stem)), reverse=True)
+
+
+def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exception) -> str:
+    wanted = sum(t.numel() * t.element_size() for t in tensors.values()) / 2**20
+    free = shutil.disk_usage(folder if folder.is_dir() else folder.parent).free / 2**20
+    last = next((f"the last good one, {p}, is as it was" for p in _files(folder)), "there is no older one")
+    reason = " ".join(str(error).split())
+    return (
+        f"the checkpoint of step {step} ({wanted:.0f} MiB) could not be written to {folder} ({free:.0f} MiB free): "
+        f"{reason}; {last}: make room and give the same command again"
+    )

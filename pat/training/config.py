@@ -1,0 +1,203 @@
+"""What a training run is made of: one typed recipe, a YAML file that people write, and the command line over it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+import yaml
+
+from pat.bandwise import BandwisePATConfig
+from pat.guided import GuidedPATConfig
+from pat.images import write_text
+from pat.model import PATConfig
+from pat.synthesis.rigs import RigDistribution
+from pat.weights import NETWORKS
+
+from .plain import from_plain, nearest, to_plain
+
+RECIPES = Path(__file__).parent / "recipes"
+RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
+GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
+FieldName = Literal["epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
+UNSEEN = ("out", "device", "save", "tensorboard", "cache")
+"""What may differ between a run and its continuation: the samples and the steps do not depend on it."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How each camera degrades what it sees."""
+
+    gain: float = 0.3
+    """Chance of another gain, gamma and white balance."""
+    blur: float = 0.25
+    """Chance of Gaussian blur."""
+    noise: float = 0.6
+    """Chance of shot and read noise."""
+    paper: float = 0.3
+    """Chance of one of the paper's four degradations on top, for one beta."""
+    miscalibrated: float = 0.0
+    """Error of the poses that fields are made from: how far it moves points, root mean square, pixels."""
+    ideal: bool = False
+    """The truth is the scene itself; else it has alpha's luminance as recorded, noise and all."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or as many as fit into `minutes`.
+
+    Raises ValueError for numbers that make no run.
+    """
+
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs that scenes are textured with."""
+    out: Path = Path("runs/mono-colour")
+    """Folder for weights, checkpoints, figures and pictures."""
+    start: Path | None = None
+    """File of weights to go on from."""
+    network: GuidedPATConfig | PATConfig | BandwisePATConfig = dataclasses.field(default_factory=GuidedPATConfig)
+    steps: int = 4000
+    """Steps of the whole run."""
+    minutes: float = float("inf")
+    """Minutes of the whole run, if they are over before its steps."""
+    batch: int = 4
+    """Scenes made and seen together."""
+    groups: int = 1
+    """Batches a step, shared out among processes."""
+    hw: tuple[int, int] = (96, 192)
+    """Height and width of alpha in the scenes."""
+    loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
+    """On the picture: minus the mean PSNR, or the mean squared error."""
+    rate: float = 8e-4
+    """Learning rate of Adam."""
+    momenta: tuple[float, float] = (0.9, 0.99)
+    """Decay rates of Adam's two averages."""
+    schedule: Literal["cosine", "halving"] = "cosine"
+    """The rate falls along half a cosine, or is halved every 30/80 of the way."""
+    warmup: int = 100
+    """Steps over which the rate rises at first."""
+    clip: float = 1.0
+    """Norm that gradients are cut to; inf for none."""
+    reuse: float = 2.0
+    """How often a batch of scenes is recorded, at random moments and differently."""
+    average: int = 300
+    """Over about how many steps the weights are averaged that are validated and kept."""
+    validate: int = 250
+    """Validate every so many steps, and keep the weights if they are the best so far."""
+    save: int = 250
+    """Write a checkpoint every so many steps."""
+    filtered: float = 0.15
+    """Share of the batches in which beta is three cameras, one a band."""
+    rectified: float = 0.5
+    """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
+    rectified_rigs: RigDistribution = RECTIFIED
+    general_rigs: RigDistribution = GENERAL
+    recording: Recording = Recording()
+    field: FieldName = "epipolar"
+    """Where the network looks."""
+    held_out: int = 12
+    """Every so many photographs one is for validation only."""
+    seed: int = 0
+    """Of everything random."""
+    cache: Path | None = None
+    """File (.npz) of photographs read before, or to be written."""
+    device: str = "auto"
+    """Like cuda or cpu; auto takes a GPU if there is one."""
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of convolutions; attention and geometry are in float32."""
+    compile: bool = False
+    """Compile convolutions by torch.compile."""
+    tensorboard: bool = False
+    """Write figures and pictures for TensorBoard, too."""
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("minutes", "rate", "reuse", "clip"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
+        if min(self.hw) < 16 or any(side % 16 for side in self.hw):
+            raise ValueError(f"hw must be multiples of 16, got {self.hw[0]} x {self.hw[1]}")
+
+
+def recipes() -> tuple[str, ...]:
+    """Names of the recipes in the package."""
+    return tuple(sorted(p.stem for p in RECIPES.glob("*.yaml")))
+
+
+def load_config(name: str | Path) -> TrainConfig:
+    """A recipe of the package by name, or a YAML file.
+
+    Raises FileNotFoundError for neither, ValueError naming the entry for what a recipe cannot be.
+    """
+    path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
+    if path is None:
+        near = nearest(str(name), recipes())
+        hint = f"; did you mean '{near}'?" if near else ""
+        raise FileNotFoundError(f"no recipe '{name}'{hint} (a file, or one of {', '.join(recipes())})")
+    return parse_config(path.read_text(encoding="utf-8"), str(path))
+
+
+def parse_config(text: str, name: str = "config") -> TrainConfig:
+    """A recipe from YAML text. Raises ValueError naming the entry."""
+    try:
+        values = yaml.safe_load(text) or {}
+    except yaml.YAMLError as error:
+        raise ValueError(f"{name}: not YAML: {' '.join(str(error).split())}") from None
+    return from_plain(TrainConfig, values, f"{name}: ", union=_network_config)
+
+
+def config_text(config: TrainConfig) -> str:
+    """The recipe as YAML, every value written out; `parse_config` reads it back."""
+    plain = to_plain(config)
+    kind = next(name for name, (_, made_of) in NETWORKS.items() if type(config.network) is made_of)
+    values = plain | {"network": {"kind": kind} | plain["network"]}
+    return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=118)
+
+
+def save_config(config: TrainConfig, path: Path) -> None:
+    """Write `config_text`; the file appears whole or not at all."""
+    write_text(path, config_text(config))
+
+
+def command_line(arguments: list[str]) -> TrainConfig:
+    """`[RECIPE] [--name value ...]`: a recipe by name or file, and anything in it given anew."""
+    base = TrainConfig()
+    if arguments and not arguments[0].startswith("-"):
+        base, arguments = load_config(arguments[0]), arguments[1:]
+    return tyro.cli(
+        TrainConfig,
+        prog="pat train [RECIPE]",
+        description=(
+            "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of "
+            f"{', '.join(recipes())}; the options below change it. The same command again goes on where a run "
+            "stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
+        ),
+        default=base,
+        args=arguments,
+        config=(tyro.conf.AvoidSubcommands,),
+    )
+
+
+def difference(config: TrainConfig, other: TrainConfig) -> str | None:
+    """The first entry, as "name: a, b", that makes two recipes different runs; None if none does."""
+    for entry in dataclasses.fields(TrainConfig):
+        ours, theirs = getattr(config, entry.name), getattr(other, entry.name)
+        if entry.name not in UNSEEN and ours != theirs:
+            return f"{entry.name}: {ours}, {theirs}"
+    return None
+
+
+def _network_config(values: Any, where: str) -> Any:
+    """The configuration of a network from its entries and its `kind`."""
+    if not isinstance(values, Mapping):
+        raise ValueError(f"{where}: wanted entries such as kind: GuidedPAT, got {values!r}")
+    kind = values.get("kind", "GuidedPAT")
+    if kind not in NETWORKS:
+        raise ValueError(f"{where}.kind: no network '{kind}' (there are: {', '.join(NETWORKS)})")
+    return from_plain(NETWORKS[kind][1], {k: v for k, v in values.items() if k != "kind"}, f"{where}.")

@@ -1,0 +1,262 @@
+"""The loop: steps, validations and checkpoints, on one process or several."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from contextlib import nullcontext
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, cast
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.utils._pytree import tree_map
+
+from arraygeom import ReceptiveField
+from pat.images import write_atomically
+from pat.model import AttentionEngine
+from pat.weights import NETWORKS, Network, load_weights, save_weights
+
+from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
+from .config import TrainConfig, config_text, difference, parse_config, save_config
+from .losses import Objective, validation
+from .processes import Process, process
+from .samples import Sample, Source, alone, scenes
+from .watch import Watch
+
+BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
+EARLY = 16
+"""From this step on, at each doubling until the first validation, pictures are written."""
+
+
+def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
+    """Train, looking where `field` (or `config.field`) says; returns the file of the best weights.
+
+    In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for
+    each step), pictures/ and checkpoints/. Where that folder holds the same run, stopped, it goes on: with
+    `steps` the result is that of a run never stopped, bit for bit; with `minutes` the time spent counts.
+
+    Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
+    the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run.
+    """
+    former = former_run(config)
+    if former and former.facts["done"]:
+        return config.out / BEST
+    with process(config.device) as here:
+        run = Run(config, here, field, former)
+        try:
+            run.work()
+        finally:
+            run.watch.close()
+        here.wait()
+    return config.out / BEST
+
+
+class Run:
+    """The state of a training run."""
+
+    def __init__(
+        self, config: TrainConfig, here: Process, field: ReceptiveField | None, checkpoint: Checkpoint | None
+    ) -> None:
+        self.config, self.here = config, here
+        self.groups = here.share(config.groups)
+        torch.manual_seed(config.seed)
+        self.network = new_network(config).to(here.device)
+        self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
+        self.adam = torch.optim.Adam(self.network.parameters(), lr=config.rate, betas=config.momenta)
+        self.step, self.best, minutes = 0, -math.inf, 0.0
+        self.learn, examine = self._scenes(field)
+        self.examination = [] if not here.first else list(examine(8))
+        if checkpoint:
+            restore(checkpoint, self.network, self.adam, self.average)
+            self.step, self.best, minutes = (checkpoint.facts[k] for k in ("step", "best", "minutes"))
+        self.began = time.monotonic() - 60 * minutes
+        if here.first:
+            save_config(config, config.out / "config.yaml")
+        self.watch = Watch(config if here.first else None, step=self.step)
+        for part in convolutions(self.network):
+            if config.precision == "bfloat16":
+                in_bfloat16(part)
+            if config.compile:
+                part.compile()
+        self.objective = here.together(Objective(self.network, config.loss))
+        self.loss, self.ticked = math.nan, time.monotonic()
+
+    @property
+    def averaged(self) -> Network:
+        """The network with averaged weights."""
+        return cast(Network, self.average.module)
+
+    @property
+    def done(self) -> float:
+        """How much of the run is done, 1 at the end."""
+        return max(self.step / self.config.steps, (time.monotonic() - self.began) / 60 / self.config.minutes)
+
+    def work(self) -> None:
+        """Step until done."""
+        for given in self.learn.steps(self.groups, start=self.step):
+            self.step += 1
+            done = self.here.agreed(self.done)
+            self._advance(given, done)
+            if self.step % self.config.validate == 0 or done >= 1:
+                self._validate()
+            elif self.step < self.config.validate and self.step >= EARLY and self.step & (self.step - 1) == 0:
+                self.watch.show(self.averaged, self.examination, self.step)
+            if self.step % self.config.save == 0 or done >= 1:
+                self._save(done=done >= 1)
+            if done >= 1:
+                return
+
+    def _advance(self, given: list[Sample], done: float) -> None:
+        """One step of the optimiser."""
+        config, here = self.config, self.here
+        rate = config.rate * shape(config, self.step, done)
+        for group in self.adam.param_groups:
+            group["lr"] = rate
+        self.adam.zero_grad()
+        losses = [self._backward(part, last=part is given[-1]) for part in given]
+        norm = torch.nn.utils.clip_grad_norm_(self.network.parameters(), config.clip)
+        loss = here.mean(torch.stack(losses).mean())
+        if not (torch.isfinite(norm) and torch.isfinite(loss)):
+            raise FloatingPointError(self._offence(given))
+        self.adam.step()
+        self.average.update_parameters(self.network)
+        self.loss = float(loss)
+        now = time.monotonic()
+        speed, self.ticked = config.batch * config.groups / (now - self.ticked), now
+        self.watch.step(self.step, self.loss, float(norm), rate, done=done, speed=speed)
+
+    def _backward(self, given: Sample, *, last: bool) -> Tensor:
+        """Add the gradients of one group to the others'; processes exchange them with the last."""
+        wait = isinstance(self.objective, DistributedDataParallel) and not last
+        with self.objective.no_sync() if wait else nullcontext():  # type: ignore[operator]
+            loss = self.objective(given)
+            (loss / len(self.groups)).backward()
+        return loss.detach()
+
+    def _validate(self) -> None:
+        """Measure, show, and keep the weights if they are the best so far."""
+        if not self.here.first:
+            return
+        facts = validation(self.averaged, self.examination)
+        facts |= {"step": self.step, "loss": self.loss, "minutes": self._minutes()}
+        self.watch.validated(facts)
+        self.watch.show(self.averaged, self.examination, self.step)
+        if facts["psnr"] > self.best:
+            self.best = facts["psnr"]
+            recipe = {"recipe": json.dumps(asdict(self.config), default=str), "validation": json.dumps(facts)}
+            save_weights(self.averaged, self.config.out / BEST, facts=recipe)
+
+    def _save(self, *, done: bool) -> None:
+        if self.here.first:
+            self.watch.flush()
+            facts = {"step": self.step, "best": self.best, "minutes": self._minutes(), "done": done}
+            state = collect(self.network, self.adam, self.average, facts | {"recipe": config_text(self.config)})
+            write_checkpoint(self.config.out / CHECKPOINTS, state)
+
+    def _minutes(self) -> float:
+        return (time.monotonic() - self.began) / 60
+
+    def _scenes(self, field: ReceptiveField | None) -> tuple[Source, Source]:
+        """Photographs are read by the first process first, which may leave a cache to the others."""
+        if not self.here.first:
+            self.here.wait()
+        sources = scenes(self.config, field=field, device=str(self.here.device))
+        if self.here.first:
+            self.here.wait()
+        return sources
+
+    def _offence(self, given: list[Sample]) -> str:
+        """Save the groups of a step that went wrong, and say which samples did it."""
+        objective = Objective(self.network, self.config.loss)
+        found = []
+        for group, part in zip(self.groups, given):
+            bad = [i for i in range(len(part.alpha)) if not finite(objective, alone(part, i))]
+            found += [f"sample {i} of group {group}" for i in bad]
+            if bad or len(given) == 1:
+                path = self.config.out / f"offending-step-{self.step}-group-{group}.safetensors"
+                save_sample(part, path, facts={"step": str(self.step), "samples": str(bad)})
+        who = ", ".join(found) or "no single sample of this process"
+        return (
+            f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "
+            f"{self.config.out}/offending-step-{self.step}-*.safetensors: look at it, or lower `rate` "
+            f"(now {self.config.rate:g}); the last checkpoint and the best weights are as they were"
+        )
+
+
+def shape(config: TrainConfig, step: int, done: float) -> float:
+    """The share of `rate` that a step has.
+
+    >>> shape(TrainConfig(schedule="halving", warmup=0), 1, 0.5)
+    0.5
+    """
+    if config.schedule == "halving":
+        fall = 0.5 ** int(min(done, 1) * 80 / 30)
+    else:
+        fall = 0.5 + 0.5 * math.cos(math.pi * min(done, 1))
+    return min(step / config.warmup, fall) if config.warmup else fall
+
+
+def new_network(config: TrainConfig) -> Network:
+    """The network of a recipe, with the weights it starts from. Raises ValueError if those are another network's."""
+    network = next(made for made, of in NETWORKS.values() if type(config.network) is of)(config.network)
+    if config.start is not None:
+        weights = load_weights(config.start)
+        if type(weights) is not type(network) or weights.config != config.network:
+            raise ValueError(
+                f"start: {config.start} holds a {type(weights).__name__} of {weights.config}, the recipe is for a "
+                f"{type(network).__name__} of {config.network}: give its own recipe, or leave `start` out"
+            )
+        network.load_state_dict(weights.state_dict())
+    return network
+
+
+def convolutions(network: nn.Module) -> list[nn.Module]:
+    """The parts without attention. Where to look is a function, which torch.compile would break at, and geometry."""
+    return [part for part in network.children() if not isinstance(part, (AttentionEngine, nn.ModuleList))]
+
+
+def in_bfloat16(part: nn.Module) -> None:
+    """Let a part compute in bfloat16 where autocast does, and answer in float32."""
+    forward = part.forward
+
+    def cast(*pictures: Tensor) -> Any:
+        with torch.autocast(pictures[0].device.type, torch.bfloat16):
+            answer = forward(*pictures)
+        return tree_map(lambda t: t.float(), answer)
+
+    part.forward = cast
+
+
+def finite(objective: Objective, given: Sample) -> bool:
+    """Whether the loss of a sample and its gradients are."""
+    objective.zero_grad()
+    loss = objective(given)
+    loss.backward()
+    gradients = [p.grad for p in objective.parameters() if p.grad is not None]
+    return bool(loss.isfinite()) and all(bool(g.isfinite().all()) for g in gradients)
+
+
+def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
+    """All tensors of a group of samples: alpha, truth, and beta, position, visible of each beta by number."""
+    tensors = {"alpha": given.alpha, "truth": given.truth}
+    for name in ("betas", "position", "visible"):
+        tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
+    with write_atomically(path) as temporary:
+        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, facts)
+
+
+def former_run(config: TrainConfig) -> Checkpoint | None:
+    """Where the same run stopped, if it did. Raises ValueError if the folder holds another run."""
+    checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
+    if checkpoint is None:
+        return None
+    other = difference(config, parse_config(checkpoint.facts["recipe"], f"{config.out}: checkpoint"))
+    if other:
+        raise ValueError(f"{config.out} holds a run of another recipe ({other} there): give another --out")
+    return checkpoint

@@ -1,0 +1,92 @@
+"""What training minimises, and what tells how far it is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
+
+from pat.bandwise import BandwisePAT
+from pat.guided import GuidedPAT, Seen
+from pat.model import Fused
+from pat.weights import Network
+
+from .samples import Sample
+
+
+def picture_loss(image: Tensor, truth: Tensor) -> Tensor:
+    """Minus the mean PSNR over 10, but for a floor under the error: every sample pulls alike."""
+    return ((image - truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
+
+
+def structure_loss(image: Tensor, truth: Tensor) -> Tensor:
+    """One minus the mean structural similarity in windows of 7x7 pixels (Wang et al. 2004)."""
+
+    def mean(x: Tensor) -> Tensor:
+        return avg_pool2d(x, 7, 1)
+
+    a, b = mean(image), mean(truth)
+    spread = mean(image * image) - a * a + mean(truth * truth) - b * b
+    common = mean(image * truth) - a * b
+    likeness = (2 * a * b + 1e-4) * (2 * common + 9e-4) / ((a * a + b * b + 1e-4) * (spread + 9e-4))
+    return 1 - likeness.mean()
+
+
+def picture_and_structure_loss(image: Tensor, truth: Tensor) -> Tensor:
+    """`picture_loss` and `structure_loss` together."""
+    return picture_loss(image, truth) + structure_loss(image, truth)
+
+
+PICTURE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "psnr": picture_loss,
+    "psnr-ssim": picture_and_structure_loss,
+    "mse": mse_loss,
+}
+
+
+class Objective(nn.Module):
+    """A network and its loss in one module, so that DistributedDataParallel sees one forward."""
+
+    def __init__(self, network: Network, loss: str) -> None:
+        super().__init__()
+        self.network = network
+        self.picture_loss = PICTURE_LOSSES[loss]
+
+    def forward(self, given: Sample) -> Tensor:
+        """The loss of a group of samples."""
+        fused, seen = explained(self.network, given)
+        loss = self.picture_loss(fused.image, given.truth)
+        return loss + match_loss(seen, given) if seen else loss
+
+
+def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Seen]]:
+    """The network's answer, and what each beta told where it says."""
+    if isinstance(network, (GuidedPAT, BandwisePAT)):
+        return network.explain(given.alpha, given.betas, given.looks)
+    return network(given.alpha, given.betas, given.looks), []
+
+
+def match_loss(seen: list[Seen], given: Sample) -> Tensor:
+    """How far off the looks were where beta sees the point, pixels, and how wrong the confidence."""
+    total = given.truth.new_zeros(())
+    for told, truth, visible in zip(seen, given.position, given.visible):
+        off = (told.attended.position - truth.movedim(-1, 1)).abs().sum(1)
+        total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
+        good = (visible & (off.detach() < 1.5)).to(off)
+        total = total + 0.05 * binary_cross_entropy_with_logits(told.logit[:, 0], good)
+    return total / len(seen)
+
+
+@torch.no_grad()
+def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
+    """Mean PSNR, and the share of visible pixels matched within a pixel and a half."""
+    psnr, near = [], []
+    for given in samples:
+        fused = network(given.alpha, given.betas, given.looks)
+        error = (fused.image.clamp(0, 1) - given.truth).square().flatten(1).mean(1)
+        psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
+        off = (fused.position[0] - given.position[0].movedim(-1, 1)).norm(dim=1)
+        near.append((off[given.visible[0]] < 1.5).float().mean())
+    return {"psnr": float(torch.stack(psnr).mean()), "matched": float(torch.stack(near).mean())}

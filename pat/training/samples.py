@@ -1,0 +1,265 @@
+"""Samples made while training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
+
+What a step sees is a pure function of the seed and the number of the step, so that a run goes on where it
+stopped, and so that processes share out a step without talking to each other.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields, replace
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Generator, Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import (
+    Camera,
+    Dense,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    Pair,
+    Pose,
+    Positions,
+    ReceptiveField,
+    Rectified,
+    Segments,
+    pixel_grid,
+    rotation_from_vector,
+    sample,
+)
+from arraygeom.fields import pinhole_track
+from pat.images import luminance
+from pat.model import Look
+from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
+from pat.synthesis.layered import ArrayBatch, LayeredScenes
+from pat.synthesis.photos import PhotoBank
+
+from .config import FieldName, Recording, TrainConfig
+
+KEPT = 48
+"""Groups of scenes that wait to be recorded again."""
+FEW = 8
+"""With fewer than this many waiting, a new one is always made."""
+SCENE, RECORDING = 0, 1
+"""What randomness is for, besides the seed and a number."""
+
+FIELDS: dict[FieldName, Callable[[], ReceptiveField]] = {
+    "epipolar": Epipolar,
+    "line": EpipolarLine,
+    "homography": HomographyDisplacement,
+    "rectified": lambda: Rectified(alpha_is="either"),
+    "nearest": NearestVoxels,
+    "local": Local,
+    "dense": Dense,
+}
+"""Where samples may look, by name."""
+
+
+class Sample(NamedTuple):
+    """What a network is given, what it should answer, and where in each beta it should have looked."""
+
+    alpha: Tensor
+    betas: list[Tensor]
+    looks: list[Look]
+    truth: Tensor
+    position: list[Tensor]
+    visible: list[Tensor]
+
+
+class Planned(NamedTuple):
+    """Which scenes a step records: their number, and what kind of rig they are seen by."""
+
+    scenes: int
+    kind: str
+    betas: int
+    dropped: int | None
+    """The number of the scenes that are not wanted any more."""
+
+
+def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
+    """What each step records, from step 0: new scenes, or some of the last `KEPT` again."""
+    draw = random.Random(seed)
+    kept: list[Planned] = []
+    for number in range(2**62):
+        new = len(kept) < FEW or draw.random() < 1 / config.reuse
+        if new:
+            kind = "rectified" if draw.random() < config.rectified else "general"
+            betas = 3 if draw.random() < config.filtered else 1
+            dropped = kept.pop() if len(kept) > KEPT else None
+            kept.insert(0, Planned(number, kind, betas, None))
+            yield kept[0]._replace(dropped=dropped.scenes if dropped else None)
+        else:
+            yield kept[int(draw.random() * len(kept))]
+
+
+class Source:
+    """Samples by the number of the step: called with a count it gives the first group of that many steps."""
+
+    def __init__(self, photos: PhotoBank, config: TrainConfig, seed: int, field: ReceptiveField, device: str = "cpu"):
+        self.config, self.seed, self.field = config, seed, field
+        kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
+        self.makers = {
+            (kind, betas): LayeredScenes(photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device)
+            for kind, rigs in kinds.items()
+            for betas in (1, 3)
+        }
+        self.kept: dict[tuple[int, int], ArrayBatch] = {}
+
+    def __call__(self, count: int) -> Iterator[Sample]:
+        """The first group of the first `count` steps."""
+        return (group[0] for group in islice(self.steps([0]), count))
+
+    def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
+        """The samples of these groups, step by step, from step `start` on."""
+        for step, planned in enumerate(plan(self.config, self.seed)):
+            self._forget(planned.dropped)
+            if step >= start:
+                yield [self.sample(planned, step, group) for group in groups]
+
+    def sample(self, planned: Planned, step: int, group: int) -> Sample:
+        """One group of one step."""
+        if (planned.scenes, group) not in self.kept:
+            g = _generator(self.seed, SCENE, planned.scenes, group)
+            made = self.makers[planned.kind, planned.betas].sample(self.config.batch, g)
+            self.kept[planned.scenes, group] = made
+        g = _generator(self.seed, RECORDING, step, group)
+        scene = self.kept[planned.scenes, group]
+        return degraded(scene, g, field=self.field, recording=self.config.recording)
+
+    def _forget(self, scenes: int | None) -> None:
+        for key in [key for key in self.kept if key[0] == scenes]:
+            del self.kept[key]
+
+
+def scenes(config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu") -> tuple[Source, Source]:
+    """Sources of samples to learn from and to validate on, from different photographs."""
+    bank, unseen = photographs(config)
+    look = field or FIELDS[config.field]()
+    learn, examine = config.seed + 1, config.seed + 2
+    return Source(bank, config, learn, look, device), Source(unseen, config, examine, look, device)
+
+
+def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
+    """Photographs to learn from, and every `held_out`-th for validation.
+
+    Raises ValueError where there are none, or too few to hold some out.
+    """
+    if not config.photos and not (config.cache and config.cache.exists()):
+        raise ValueError("no photographs: give `photos` one or more folders with pictures")
+    n = config.held_out
+
+    def bank(choose: Callable[[int], bool]) -> PhotoBank:
+        return PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed, choose=choose)
+
+    return bank(lambda i: i % n != 0), bank(lambda i: i % n == 0)
+
+
+def degraded(
+    scene: ArrayBatch,
+    g: Generator,
+    *,
+    field: ReceptiveField = Epipolar(),  # noqa: B008
+    recording: Recording = Recording(),  # noqa: B008
+) -> Sample:
+    """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
+    ideal = scene.images[0]
+    alpha = record(luminance(ideal), steps(g, recording), g).image
+    betas, looks, position, visible = [], [], [], []
+    for i, picture in enumerate(scene.images[1:], 1):
+        band = picture if len(scene.images) == 2 else picture[:, i - 1 : i]
+        betas.append(_enlarged(record(band, steps(g, recording), g).image, scene.hw[0]))
+        if len(scene.images) == 2 and _chance(recording.paper, g):
+            alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
+        pair = pair_of(scene, i, g)
+        looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
+        where, seen = truth_in(pair, scene.depth[0], scene.depth[i])
+        position.append(where)
+        visible.append(seen)
+    truth = ideal if recording.ideal else ideal + (alpha - luminance(ideal))
+    return Sample(alpha, betas, looks, truth, position, visible)
+
+
+def steps(g: Generator, recording: Recording) -> list[Step]:
+    """Gain, blur and noise of one camera; each with its own chance."""
+    steps: list[Step] = []
+    if _chance(recording.gain, g):
+        steps.append(Jitter(0.04, 0.04, 0.01))
+    if _chance(recording.blur, g):
+        steps.append(GaussianBlur(0.3 + float(torch.rand((), generator=g))))
+    if _chance(recording.noise, g):
+        steps.append(Noise(10 ** (3 + 1.5 * float(torch.rand((), generator=g))), 4.0))
+    return [*steps, Clip(), Quantise(8)]
+
+
+def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
+    """The batch of pairs (alpha, beta), beta at alpha's pitch, with bounds looser than the scenes' own."""
+    near, far = scene.depth_range.double().unbind(-1)
+    loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
+    depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
+    cameras = [c.to(torch.float64) for c in scene.cameras]
+    return Pair(cameras[0], cameras[beta].resize(scene.hw[0]), depth)
+
+
+def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
+    """The pairs with beta turned at random so that points move by about `pixels`, root mean square, on each axis."""
+    if pixels == 0:
+        return pair
+    alpha, beta = pair.cameras
+    drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
+    turn = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
+    moved: Camera = beta.replace(cam_from_world=Pose(turn, torch.zeros_like(beta.t)) @ beta.cam_from_world)
+    return Pair(alpha, moved, pair.depth)
+
+
+def truth_in(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Where alpha's pixels are in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w)."""
+    hw = pair.alpha.hw
+    track = pinhole_track(pair, pixel_grid(hw, device=depth.device).reshape(1, -1, 2))
+    z = depth.reshape(len(depth), -1)
+    x = track.at(1 / z)
+    expected = (track.a[..., 2] + track.b[..., 2] / z) * z
+    native = beta_depth[:, None].reciprocal()
+    scale = x.new_tensor([beta_depth.shape[-1] / pair.beta.hw[1], beta_depth.shape[-2] / pair.beta.hw[0]])
+    found = sample(native, (x + 0.5) * scale - 0.5, interpolation="nearest")
+    visible = found.valid & ((found.values[:, 0] * expected - 1).abs() < 0.02)
+    return x.reshape(-1, *hw, 2), visible.reshape(-1, *hw)
+
+
+def alone(given: Sample, i: int) -> Sample:
+    """The i-th of a group of samples by itself."""
+
+    def one(parts: Sequence[Tensor]) -> list[Tensor]:
+        return [part if len(part) == 1 else part[i : i + 1] for part in parts]
+
+    def look(old: Look) -> Look:
+        def at(x: Tensor) -> Segments | Positions:
+            found = old.at(x)
+            return type(found)(*one([getattr(found, entry.name) for entry in fields(found)]))
+
+        return Look(at, old.samples)
+
+    (alpha, truth), looks = one([given.alpha, given.truth]), [look(old) for old in given.looks]
+    return Sample(alpha, one(given.betas), looks, truth, one(given.position), one(given.visible))
+
+
+def _enlarged(picture: Tensor, hw: tuple[int, int]) -> Tensor:
+    if picture.shape[-2:] == hw:
+        return picture
+    return interpolate(picture, size=hw, mode="bicubic", align_corners=False).clamp(0, 1)
+
+
+def _chance(p: float, g: Generator) -> bool:
+    return bool(torch.rand((), generator=g) < p)
+
+
+def _generator(*numbers: int) -> Generator:
+    """A generator of its own for each sequence of numbers."""
+    return Generator().manual_seed(int(np.random.SeedSequence(numbers).generate_state(1)[0]))

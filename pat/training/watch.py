@@ -1,0 +1,132 @@
+"""What a run shows while it goes on: a bar, a line for each step and each validation, pictures, TensorBoard."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from torch import Tensor, nn
+from torch.nn.functional import interpolate
+
+from pat.images import write_image, write_text
+
+from .config import TrainConfig
+from .losses import explained
+from .samples import Sample
+
+SHOWN = 3
+"""Groups of the validation of which the first scene is shown."""
+HEADER = "step,loss,gradient,rate\n"
+
+
+class Watch:
+    """The first process's eyes; the others have none (`Watch(None, ...)` does nothing).
+
+    `steps.csv` has a line for each step and `log.jsonl` one for each validation. What they say of steps after
+    `step`, where the run goes on, is taken out.
+    """
+
+    def __init__(self, config: TrainConfig | None, *, step: int = 0) -> None:
+        self.config = config
+        if config is None:
+            return
+        self.out = config.out
+        self.board = _board(config.out / "tensorboard") if config.tensorboard else None
+        _keep_lines(self.out / "steps.csv", step, lambda line: int(line.partition(",")[0]), header=HEADER)
+        _keep_lines(self.out / "log.jsonl", step, lambda line: json.loads(line)["step"])
+        self.steps = (self.out / "steps.csv").open("a", encoding="utf-8")
+        self.bar = Progress(
+            TextColumn("step {task.fields[step]}"),
+            BarColumn(),
+            TaskProgressColumn(),
+            TextColumn("loss {task.fields[loss]:.4f}  {task.fields[speed]:.1f} scenes/s"),
+            TimeElapsedColumn(),
+            TimeRemainingColumn(),
+            console=Console(stderr=True),
+            disable=not Console(stderr=True).is_terminal,
+        )
+        self.task = self.bar.add_task("training", total=1.0, step=step, loss=0.0, speed=0.0)
+        self.bar.start()
+
+    def step(self, step: int, loss: float, norm: float, rate: float, *, done: float, speed: float) -> None:
+        """Note one step; `done` is how much of the run is, `speed` in scenes a second."""
+        if self.config is None:
+            return
+        self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
+        self.bar.update(self.task, completed=min(done, 1.0), step=step, loss=loss, speed=speed)
+        if self.board and step % 10 == 0:
+            for name, value in {"loss": loss, "gradient": norm, "rate": rate, "scenes a second": speed}.items():
+                self.board.add_scalar(name, value, step)
+
+    def validated(self, facts: Mapping[str, float]) -> None:
+        """Print and keep what a validation found."""
+        if self.config is None:
+            return
+        line = json.dumps({k: round(v, 4) for k, v in facts.items()})
+        self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)
+        self.flush()
+        with (self.out / "log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(line + "\n")
+        if self.board:
+            for name in ("psnr", "matched"):
+                self.board.add_scalar(f"validation/{name}", facts[name], int(facts["step"]))
+
+    def show(self, network: nn.Module, samples: list[Sample], step: int) -> None:
+        """Pictures of the validation: beta, alpha, fused, truth, confidence, side by side."""
+        if self.config is None:
+            return
+        sheet = contact_sheet(network, samples[:SHOWN])
+        write_image(self.out / "pictures" / f"step-{step:06d}.png", sheet)
+        if self.board:
+            self.board.add_image("validation", sheet, step)
+
+    def flush(self) -> None:
+        """Put what was noted on disk."""
+        if self.config is not None:
+            self.steps.flush()
+
+    def close(self) -> None:
+        """Put the bar away."""
+        if self.config is None:
+            return
+        self.bar.stop()
+        self.steps.close()
+        if self.board:
+            self.board.close()
+
+
+@torch.no_grad()
+def contact_sheet(network: nn.Module, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
+    """One row for the first scene of each group: beta (or its three bands), alpha, fused, truth, confidence."""
+    return torch.cat([_row(network, given) for given in samples], -2).cpu()
+
+
+def _row(network: nn.Module, given: Sample) -> Tensor:
+    fused, _ = explained(network, given)
+    beta = torch.cat([b[:1] for b in given.betas], 1)
+    confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)
+    hw = (given.truth.shape[-2], given.truth.shape[-1])
+    columns = [beta, given.alpha[:1], fused.image[:1], given.truth[:1], confidence]
+    row = [interpolate(c.float(), hw, mode="bilinear", align_corners=False).expand(-1, 3, -1, -1) for c in columns]
+    return torch.cat(row, -1)[0].clamp(0, 1)
+
+
+def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
+    """Take out what a file says of steps after `step`, and a last line cut short."""
+    lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
+    kept = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
+    write_text(path, header + "".join(kept))
+
+
+def _board(folder: Path) -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise ValueError("tensorboard is not installed: pip install 'arraygeom-pat[tensorboard]'") from None
+    return SummaryWriter(folder)

@@ -1,0 +1,45 @@
+"""Real pictures of real rigs: what the benchmarks measure at length."""
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Rig
+from calib.doctor import diagnose, diagnose_matches
+from calib.matches import match_cameras
+from calib.refine import refine_matches
+from tests.benchmarks.bench_doctor import MISTAKES
+from tests.benchmarks.bench_refine import worse
+from tests.calib.real import bumblebee, syntim
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["resized", "turned or mirrored", "cameras swapped", "pose inverted", "distortion"])
+def test_mistakes_with_a_stereo_head_are_named(shared_data, kind):
+    (pair, *_) = bumblebee(shared_data, ("chair01",))
+    rig, images = MISTAKES[kind](pair.rig, pair.images, np.random.default_rng(3))
+    found = diagnose(rig, images)
+    assert kind in (found.named.kind, *(remedy.kind for remedy in found.equal)), found.verdict
+
+
+@pytest.mark.slow
+def test_the_rig_of_another_experiment_is_found_out(shared_data):
+    """The published poses of SYNTIM's BatSynt fit its pictures only when inverted."""
+    (pair,) = syntim(shared_data, ("BatSynt",))
+    found = diagnose(pair.rig, pair.images)
+    assert found.named.kind == "pose inverted"
+    assert found.after.misfit < 0.05 * found.before.misfit
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "source", [lambda data: syntim(data, ("BatInria",)), lambda data: bumblebee(data, ("chair02",))]
+)
+def test_real_rigs_return(shared_data, source):
+    (pair, *_) = source(shared_data)
+    matches = match_cameras(pair.images)
+    rig = Rig({name: pair.rig[name] for name in pair.images})
+    found = refine_matches(worse(rig, torch.Generator().manual_seed(0)), [matches])
+    assert found.accepted
+    assert found.held_out[1].median < 0.3 < 1 < found.held_out[0].median
+    assert diagnose_matches(found.rig, {n: c.hw for n, c in rig.cameras.items()}, matches).before.misfit < 0.2

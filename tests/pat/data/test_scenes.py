@@ -1,0 +1,259 @@
+"""Patches of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
+
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
+from arraygeom.fields import look
+from pat.cli import main
+from pat.data import (
+    Patches,
+    RenderedScenes,
+    ScenePatches,
+    SceneShuffle,
+    agreement,
+    collate,
+    index_files,
+    read_indices,
+    scene_folders,
+    write_indices,
+)
+from pat.data.patches import cut, reduced_depth, select
+from pat.farm.backends import LayeredSettings
+from pat.images import read_image
+from pat.sensors import BoxBlur, Case, Clip, Resample
+from pat.synthesis.check import Limits, look_across
+
+SMALL = Patches(hw=(32, 48), grid=(2, 3), reduce=2)
+
+
+def make_rig(width: int = 128) -> Rig:
+    turned = rotation_from_vector(torch.tensor([0.005, 0.02, 0.01]).double())
+    mono = Camera(
+        K=intrinsics(130.0, (96, width)), cam_from_world=Pose.identity(), hw=(96, width), sensor=Sensor("mono")
+    )
+    colour = Camera(
+        K=intrinsics((100.0, 104.0), (80, 112)),
+        cam_from_world=Pose(turned, torch.tensor([-0.1, 0.01, 0.0]).double()),
+        hw=(80, 112),
+    )
+    return Rig({"mono": mono, "colour": colour}, depth=(2.0, 12.0))
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Three layered scenes of patterns; copy what you break."""
+    root = tmp_path_factory.mktemp("data")
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    for seed in range(3):
+        renderer.render(seed, root / "scenes" / f"{seed:06d}")
+    return root
+
+
+@pytest.fixture
+def broken(rendered, tmp_path):
+    shutil.copytree(rendered, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def test_the_papers_windows_reach_from_edge_to_edge():
+    corners = Patches().corners((1536, 2048))
+    assert len(corners) == Patches().count == 49
+    assert corners[0] == (0, 0)
+    assert corners[-1] == (1536 - 128, 2048 - 384)
+    assert Patches.like_the_papers((1536, 2048)) == Patches()
+    with pytest.raises(ValueError, match="patches of 384x128 do not fit into a picture of 300x200"):
+        Patches().corners((200, 300))
+    with pytest.raises(ValueError, match="cannot be reduced 3 times"):
+        Patches(reduce=3)
+
+
+def test_points_of_the_whole_picture_are_where_the_patches_cameras_project_them(rendered):
+    stack = cut(rendered / "scenes" / "000000", SMALL, alpha="mono")
+    X = torch.tensor([[0.1, -0.2, 5.0], [-0.4, 0.3, 8.0]]).double()
+    whole = make_rig()["mono"].project(X).x
+    for i, (top, left) in enumerate(SMALL.corners((96, 128))):
+        wanted = (whole - torch.tensor([left, top]).double() + 0.5) / 2 - 0.5
+        torch.testing.assert_close(select(stack.rig, i)["mono"].project(X).x, wanted)
+    assert stack.rgb["mono"].shape == (6, 3, 16, 24)
+    assert stack.rgb["colour"].shape[0] == 6
+
+
+def test_depth_and_cameras_of_patches_foretell_the_other_view(rendered):
+    batch = RenderedScenes(rendered, patches=SMALL).sample(12, generator())
+    across = look_across(batch)
+    assert across.visible.float().mean() > 0.6
+    error = (across.image - batch.images[0]).abs().amax(1)[across.visible]
+    assert error.median() < 0.02
+    shifted = batch.images[0].roll(1, -1)
+    assert (across.image - shifted).abs().amax(1)[across.visible].mean() > 1.3 * error.mean()
+
+
+def test_samples_are_seeded_and_mix_scenes(rendered):
+    one, two, other = (RenderedScenes(rendered, patches=SMALL).sample(8, generator(s)) for s in (1, 1, 2))
+    assert torch.equal(one.images[0], two.images[0])
+    assert not torch.equal(one.images[0], other.images[0])
+    assert one.K[0].shape == (8, 3, 3)
+    assert len({round(float(d.max()), 4) for d in one.depth[0]}) > 3
+
+
+def test_reduced_depth_is_exact_on_planes_and_takes_sides_at_edges():
+    plane = (1 / (0.2 + 0.001 * torch.arange(16.0))).expand(1, 8, 16).clone()
+    wanted = 1 / (0.2 + 0.001 * ((torch.arange(4.0) + 0.5) * 4 - 0.5))
+    torch.testing.assert_close(reduced_depth(plane, (2, 4))[0, 0], wanted)
+    near = plane[0, 0, 5].item()
+    plane[..., 6:] = 1.0
+    found = reduced_depth(plane, (2, 4))[0, 0]
+    assert found[1].item() in (pytest.approx(near), 1.0)
+    torch.testing.assert_close(found[2:], torch.ones(2))
+
+
+def test_patches_are_recorded_as_responses_say_and_anew_each_epoch(rendered):
+    data = ScenePatches(rendered, patches=SMALL, seed=3)
+    assert len(data) == 18
+    patch = data[7]
+    assert list(patch.images) == ["mono", "colour"]
+    assert patch.images["mono"].shape == (1, 16, 24)
+    assert patch.images["colour"].shape[0] == patch.truth.shape[0] == 3
+    grey = (patch.truth * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0)
+    assert (patch.images["mono"][0] - grey).abs().mean() < 0.06
+    assert torch.equal(data[7].images["mono"], patch.images["mono"])
+    data.set_epoch(1)
+    assert not torch.equal(data[7].images["mono"], patch.images["mono"])
+    assert torch.equal(data[7].truth, patch.truth)
+    with pytest.raises(IndexError):
+        data[18]
+
+
+def test_a_batch_says_where_to_look(rendered):
+    data = ScenePatches(rendered, patches=SMALL)
+    loader = DataLoader(data, batch_size=6, sampler=SceneShuffle(data), collate_fn=collate)
+    batch = next(iter(loader))
+    assert batch.images["mono"].shape == (6, 1, 16, 24)
+    pair = batch.rig.pair("mono", "colour")
+    (where,) = batch.looks(Epipolar())
+    X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
+    found = where.at(torch.tensor([[12.0, 8.0]]))
+    seen = pair.cameras[1].project(X).x[:, 0].float()
+    inside = found.valid[:, 0] & pair.beta.contains(seen)
+    along = found.fraction(seen[:, None])[:, 0]
+    off = (found.at(along[:, None])[:, 0] - seen).norm(dim=-1)
+    assert inside.sum() >= 4
+    assert off[inside].max() < 0.01
+    assert ((along > -0.01) & (along < 1.01))[inside].all()
+
+
+def test_the_rig_follows_the_chains(rendered):
+    data = ScenePatches(rendered, patches=SMALL, chains={"colour": [Resample(0.5), Clip()]})
+    patch, plain = data[4], ScenePatches(rendered, patches=SMALL, chains={})[4]
+    X = torch.tensor([0.05, 0.02, 4.0]).double()
+    x, whole = (p.rig["colour"].project(X).x for p in (patch, plain))
+    assert patch.images["colour"].shape[-2:] == patch.rig["colour"].hw
+    (h, w), (h0, w0) = patch.rig["colour"].hw, plain.rig["colour"].hw
+    torch.testing.assert_close(x, (whole + 0.5) * torch.tensor([w / w0, h / h0]).double() - 0.5)
+
+
+def test_cases_degrade_alpha_or_the_betas(rendered):
+    cases = (Case("alpha", alpha=(BoxBlur(5),)), Case("beta", beta=(BoxBlur(5),)))
+    data = ScenePatches(rendered, patches=SMALL, chains={}, cases=cases)
+    plain = ScenePatches(rendered, patches=SMALL, chains={})
+    changed = [
+        tuple(not torch.equal(data[i].images[n], plain[i].images[n]) for n in ("mono", "colour")) for i in range(18)
+    ]
+    assert set(changed) == {(True, False), (False, True)}
+
+
+def test_shuffling_takes_every_patch_once_and_few_scenes_at_a_time(rendered):
+    data = ScenePatches(rendered, patches=SMALL)
+    order = list(SceneShuffle(data, mixed=2))
+    assert sorted(order) == list(range(18))
+    assert len({i // 6 for i in order[:12]}) == 2
+    assert order != sorted(order)
+
+
+def test_folders_without_whole_scenes_are_told(broken, tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such folder"):
+        scene_folders(tmp_path / "none")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ValueError, match="holds no rendered scene: make some with 'pat render"):
+        scene_folders(tmp_path / "empty")
+    (broken / "scenes/000001/render.json").unlink()
+    with pytest.raises(ValueError, match=r"000001: is not a whole scene \(no render.json\): remove it"):
+        ScenePatches(broken)
+
+
+def test_scenes_that_cannot_be_read_are_told(broken):
+    file = broken / "scenes/000001/colour-0000.npz"
+    file.write_bytes(file.read_bytes()[:500])
+    data = ScenePatches(broken, patches=SMALL)
+    assert data[0].truth.shape == (3, 16, 24)
+    with pytest.raises(ValueError, match=r"000001: cannot be read \(.*\): remove it and run 'pat render' again"):
+        data[6]
+
+
+def test_pictures_of_changing_size_are_told(broken):
+    shutil.rmtree(broken / "scenes/000002")
+    LayeredSettings(oversampling=1).renderer(make_rig(160), Limits()).render(2, broken / "scenes/000002")
+    with pytest.raises(
+        ValueError, match=r"000002: has pictures of other sizes than the first \(mono 160x96, .*mono 128x96"
+    ):
+        ScenePatches(broken, patches=SMALL)[12]
+
+
+def test_names_that_the_rig_lacks_are_told(rendered):
+    with pytest.raises(ValueError, match="no camera 'mno'; did you mean 'mono'"):
+        ScenePatches(rendered, alpha="mno")
+    with pytest.raises(ValueError, match="no camera 'color'; did you mean 'colour'"):
+        ScenePatches(rendered, chains={"color": []})
+
+
+def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
+    sensors = tmp_path / "sensors.yaml"
+    sensors.write_text("mono: [{spectral: luminance}, clip, coded]\ncolour: [{box-blur: 3}, clip, coded]\n")
+    main(["data", "show", str(rendered), "--out", str(tmp_path / "x.png"), "--samples", "2", "--sensors", str(sensors)])
+    assert read_image(tmp_path / "x.png").std() > 0.1
+    assert "147 patches of 3 scenes" in " ".join(capsys.readouterr().err.split())
+    main(["data", "info", str(rendered)])
+    assert "3 scenes of mono 128x96, colour 112x80" in capsys.readouterr().out
+    sensors.write_text("mono: [{spectrl: luminance}]\n")
+    with pytest.raises(SystemExit):
+        main(["data", "show", str(rendered), "--sensors", str(sensors)])
+    assert "no step is called 'spectrl'; did you mean 'spectral'" in " ".join(capsys.readouterr().err.split())
+
+
+def test_index_files_give_back_what_was_written(tmp_path):
+    pair = make_rig().crop("mono", 0, 0, (10, 12)).pair("mono", "colour")
+    field = look(NearestVoxels(count=12, window=8), pair)
+    written = write_indices(tmp_path, "rig", field, beta=2)
+    assert [f.name for f in written] == ["xxs_rig_2.npy", "yys_rig_2.npy"]
+    back = read_indices(tmp_path, "rig", (10, 12), beta=2)
+    assert torch.equal(torch.where(field.mask[..., None], back.xy, 0.0), field.xy)
+    assert agreement(field, back).min() == 1
+    moved = write_indices(tmp_path, "moved", type(field)(field.xy + 1, field.mask))
+    assert agreement(field, read_indices(tmp_path, "moved", (10, 12))).mean() < 0.9
+    assert index_files(tmp_path, "moved") == tuple(moved)
+
+
+def test_index_files_that_are_not_as_documented_are_told(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"xxs_a\.npy: no such index file"):
+        read_indices(tmp_path, "a", (2, 3))
+    np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4), np.int16))
+    np.save(tmp_path / "yys_a.npy", np.zeros((6, 5), np.int16))
+    with pytest.raises(ValueError, match="not of one field"):
+        read_indices(tmp_path, "a", (2, 3))
+    with pytest.raises(ValueError, match="has 6 lines; an alpha of 3x3 pixels has 9"):
+        read_indices(tmp_path, "a", (3, 3))
+    np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4)))
+    with pytest.raises(ValueError, match="holds float64"):
+        read_indices(tmp_path, "a", (2, 3))
+    (tmp_path / "xxs_a.npy").write_bytes(b"no")
+    with pytest.raises(ValueError, match="not a NumPy file"):
+        read_indices(tmp_path, "a", (2, 3))

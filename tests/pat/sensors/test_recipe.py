@@ -1,0 +1,108 @@
+import pytest
+import torch
+import yaml
+
+from arraygeom.sensor import Band, Curve
+from pat.sensors import (
+    STEPS,
+    BoxBlur,
+    Case,
+    Clip,
+    Crop,
+    Defocus,
+    Demosaic,
+    Linear,
+    Noise,
+    Quantise,
+    Resample,
+    Spectral,
+    paper_cases,
+    read_cases,
+    read_chain,
+    read_chains,
+    record,
+)
+
+TEXT = """
+mono:
+  - linear
+  - spectral: luminance
+  - defocus: {focus: 3, f_number: 2.8, lens: 25, shape: gaussian}
+  - resample: 0.5
+  - noise: {full_well: 8e3, read: 3, counts: poisson}
+  - clip
+  - quantise: 12
+blue:
+  - spectral: {centre: 450, width: 40}
+  - crop: {top: 2, left: 4, hw: [20, 30]}
+  - resample: {to: [10, 12], method: bicubic}
+  - demosaic: {pattern: BGGR, method: edge-aware}
+  - spectral: {response: {wavelength: [400, 500], response: [1, 1]}}
+"""
+
+
+def test_a_file_says_what_each_camera_does():
+    chains = read_chains(yaml.safe_load(TEXT))
+    assert chains["mono"] == (
+        *(Linear(), Spectral("luminance"), Defocus(3.0, 2.8, 25.0, "gaussian"), Resample(0.5)),
+        *(Noise(8000.0, 3.0, "poisson"), Clip(), Quantise(12)),
+    )
+    assert chains["blue"] == (
+        *(Spectral(Band(450.0, 40.0)), Crop(2, 4, (20, 30)), Resample((10, 12), "bicubic")),
+        *(Demosaic("BGGR", "edge-aware"), Spectral(Curve((400.0, 500.0), (1.0, 1.0)))),
+    )
+
+
+def test_the_papers_cases_as_a_list():
+    reduced = [{"resample": {"to": 0.5, "method": "bicubic"}}, {"resample": {"to": 2, "method": "bicubic"}}, "clip"]
+    listed = [
+        {"name": "blur alpha", "alpha": [{"box-blur": 5}]},
+        {"name": "blur beta", "beta": [{"box-blur": 5}]},
+        {"name": "reduce beta", "beta": reduced},
+        {"name": "blur and reduce beta", "beta": [{"box-blur": 5}, *reduced]},
+    ]
+    assert read_cases(listed) == paper_cases()
+    assert read_cases([{"name": "one", "alpha": [{"box-blur": 3}]}]) == (Case("one", alpha=(BoxBlur(3),)),)
+
+
+def test_every_step_has_a_name():
+    assert set(STEPS) >= {"box-blur", "motion-blur", "vignetting", "mosaic", "demosaic", "noise", "gamma"}
+
+
+def test_a_chain_from_a_file_runs():
+    chain = read_chain(
+        yaml.safe_load("[linear, {vignetting: {falloff: [-0.2]}}, mosaic, demosaic, coded, {quantise: 8}]")
+    )
+    assert record(torch.rand(1, 3, 8, 8), chain, torch.Generator()).image.shape == (1, 3, 8, 8)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("[{nois: {full_well: 3}}]", r"chain\[0\]: no step is called 'nois'; did you mean 'noise'"),
+        ("[linear, {noise: {fullwell: 3}}]", r"chain\[1\].noise.fullwell: unknown key; did you mean 'full_well'"),
+        ("[{noise: {read: 3}}]", r"full_well: missing"),
+        ("[{noise: {full_well: many}}]", r"noise.full_well: is 'many'; wanted a number"),
+        ("[{noise: {full_well: -3}}]", r"full_well > 0"),
+        ("[{resample: {to: 0.5, method: cubic}}]", r"method: is 'cubic'; did you mean 'bicubic'"),
+        ("[{box-blur: 4}]", r"box-blur: the width of a box blur must be an odd"),
+        ("[{box-blur: 2.5}]", r"width: is 2.5; wanted a whole number"),
+        ("[{spectral: lumnance}]", r"did you mean 'luminance'"),
+        ("[{spectral: {center: 450, width: 3}}]", r"did you mean 'centre'"),
+        ("[{crop: {top: 0, left: 0, hw: [3]}}]", r"hw: has 1 entries; wanted 2"),
+        ("[{mosaic: RGBG}]", r"pattern: is 'RGBG'; did you mean 'RGGB'"),
+        ("[{clip: 3}]", r"clip: takes no options"),
+        ("[[linear]]", r"wanted a step's name"),
+        ("{linear: 1}", r"wanted a list of steps"),
+    ],
+)
+def test_typos_are_told_with_their_place(text, words):
+    with pytest.raises(ValueError, match=words):
+        read_chain(yaml.safe_load(text))
+
+
+def test_typos_of_cases_are_told():
+    with pytest.raises(ValueError, match="did you mean 'beta'"):
+        read_cases([{"name": "x", "bta": []}])
+    with pytest.raises(ValueError, match="list of cases"):
+        read_cases([])

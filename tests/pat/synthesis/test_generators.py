@@ -1,0 +1,106 @@
+import numpy as np
+import pytest
+import torch
+
+from arraygeom.camera import Camera, View, intrinsics
+from arraygeom.rig import Rig
+from pat.images import write_image
+from pat.synthesis.boards import PIXELS, draw_board, inner_corners, opencv_board
+from pat.synthesis.furnish import Setting
+from pat.synthesis.generators import GENERATORS, abstract, board, photographs, random_board_poses
+from pat.synthesis.scene import Board, Scene
+from pat.synthesis.shapes import inside, mesh
+from tests.pat.synthesis.scenes import posed, unlike_cameras
+
+BOARD = Board(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
+
+
+def depths(scene: Scene, camera: Camera) -> torch.Tensor:
+    """Depths of all vertices that the camera's picture holds."""
+    found = []
+    for thing in scene.objects:
+        place = thing.motion.at(0)
+        scale = place.extent / np.asarray(thing.motion.keys[0].extent)
+        X = torch.from_numpy((mesh(thing).vertices * scale) @ place.R.T + place.position)
+        x, depth, valid = camera.project(X)
+        found.append(depth[valid & camera.contains(x)])
+    return torch.cat(found)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_abstract_scenes_are_within_the_depths_and_around_the_cameras(seed):
+    rig = unlike_cameras()
+    scene = abstract(seed, rig)
+    assert 10 <= len(scene.objects) - 1 <= 20
+    assert len({o.shape for o in scene.objects}) > 3
+    assert Scene.from_yaml(scene.to_yaml()) == scene == abstract(seed, rig) != abstract(seed + 1, rig)
+    for camera in rig.cameras.values():
+        seen = depths(scene, camera)
+        assert seen.min() > 0.7 * 2
+        centre = camera.centre.numpy()
+        assert not any(inside(o, centre, 0.0) for o in scene.objects)
+
+
+def test_moving_scenes_move():
+    scene = abstract(3, unlike_cameras(), moving=2.0)
+    moving = [o for o in scene.objects if not o.motion.still]
+    assert len(moving) == len(scene.objects) - 1
+    assert {o.motion.keys[-1].time for o in moving} == {2.0}
+
+
+def test_a_rig_without_depths_gets_those_of_the_paper():
+    camera = Camera(K=intrinsics(60.0, (48, 64)), cam_from_world=posed(), hw=(48, 64))
+    assert abstract(0, Rig({"a": camera})).depth == (2.0, 20.0)
+    assert abstract(0, Rig({"a": camera}, depth=(1.0, torch.inf))).depth == (1.0, 10.0)
+
+
+def test_photographs_come_from_the_folder(tmp_path):
+    for name in ("a", "b"):
+        write_image(tmp_path / f"{name}.png", torch.rand(3, 40, 60))
+    scene = photographs(1, unlike_cameras(), tmp_path)
+    used = {o.material.texture.picture for o in scene.objects}
+    assert used == {str(tmp_path / "a.png"), str(tmp_path / "b.png")}
+
+
+def test_what_cannot_be_generated_is_said(tmp_path):
+    with pytest.raises(ValueError, match="no pictures"):
+        photographs(0, unlike_cameras(), tmp_path)
+    with pytest.raises(ValueError, match="no calibrated camera"):
+        abstract(0, Rig({"a": View(hw=(4, 4))}))
+    with pytest.raises(ValueError, match="at least one pose"):
+        board([], BOARD)
+    with pytest.raises(ValueError, match="unknown marker dictionary 'DICT_9'"):
+        draw_board(Board(dictionary="DICT_9"))
+    assert set(GENERATORS) == {"abstract", "photographs", "board"}
+
+
+def test_the_drawn_board_is_the_one_opencv_knows():
+    sheet = draw_board(BOARD)
+    margin = round(BOARD.margin / BOARD.square * PIXELS)
+    assert sheet.shape == (5 * PIXELS + 2 * margin, 7 * PIXELS + 2 * margin)
+    np.testing.assert_allclose(opencv_board(BOARD).getChessboardCorners(), inner_corners(BOARD), atol=1e-7)
+    inner = sheet[margin:-margin, margin:-margin]
+    for x, y, _ in (inner_corners(BOARD) / BOARD.square * PIXELS).round().astype(int):
+        a, b, c, d = (int(inner[y + j, x + i]) for i, j in ((-2, -2), (1, -2), (-2, 1), (1, 1)))
+        assert a == d != b == c
+
+
+def test_a_board_is_where_its_poses_say():
+    rig = unlike_cameras(640)
+    poses = random_board_poses(rig, BOARD, 5, seed=2)
+    scene = board(poses, BOARD)
+    sheet = scene.objects[0]
+    for k, pose in enumerate(poses):
+        place = sheet.motion.at(float(k))
+        local = torch.tensor([-BOARD.margin, -BOARD.margin, 0.0], dtype=torch.float64)
+        corner = place.R @ (np.array([-0.5, -0.5, 0]) * place.extent) + place.position
+        np.testing.assert_allclose(pose.apply(local[None])[0], corner, atol=1e-12)
+        middle = pose.apply(torch.tensor([[3.5 * 0.05, 2.5 * 0.05, 0.0]], dtype=torch.float64))
+        for camera in rig.cameras.values():
+            x, _, valid = camera.project(middle)
+            assert bool(valid.all() & camera.contains(x).all())
+
+
+def test_a_setting_measures_pixels_in_the_finest_camera():
+    setting = Setting(unlike_cameras(), np.random.default_rng(0))
+    assert setting.metres(2.0, 10) == pytest.approx(20 / (1.15 * 64))

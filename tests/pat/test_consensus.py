@@ -1,0 +1,156 @@
+"""Consensus: a slow twin of its aggregation, true depths of a scene found again, the same bits by any road."""
+
+import numpy as np
+import pytest
+import torch
+
+import pat.consensus
+from arraygeom import Camera, Epipolar, Pair, Pose, Segments, intrinsics, lazily, pixel_grid, rotation_from_vector
+from pat import consensus_kernels as kernels
+from pat.consensus import Consensus, consensus
+
+HW = (64, 96)
+
+
+def slow_aggregate(cost: np.ndarray, guide: np.ndarray) -> np.ndarray:
+    """Semi-global matching as it is written down: one path at a time, from each pixel's predecessor."""
+    height, width, _ = cost.shape
+    total = np.zeros(cost.shape)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        path = np.zeros(cost.shape)
+        rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                path[y, x] = cost[y, x]
+                y0, x0 = y - dy, x - dx
+                if 0 <= y0 < height and 0 <= x0 < width:
+                    before = path[y0, x0]
+                    jump = max(kernels.SMALL + 1, kernels.LARGE / (1 + abs(guide[y, x] - guide[y0, x0]) / kernels.EDGE))
+                    up, down = np.append(before[1:], np.inf), np.append(np.inf, before[:-1])
+                    best = np.minimum.reduce([before, up + kernels.SMALL, down + kernels.SMALL])
+                    path[y, x] += np.minimum(best, before.min() + jump) - before.min()
+        total += path
+    return total
+
+
+def test_aggregation_is_that_of_its_slow_twin():
+    rng = np.random.default_rng(0)
+    cost = rng.integers(0, 68, (7, 9, 6)).astype(np.uint8)
+    guide = rng.random((7, 9)).astype(np.float32)
+    total = np.zeros(cost.shape, np.float32)
+    kernels.aggregate(cost, guide, total)
+    assert np.abs(total - slow_aggregate(cost, guide)).max() < 1e-2
+
+
+def test_census_is_which_of_48_neighbours_are_darker():
+    picture = np.random.default_rng(1).random((9, 11)).astype(np.float32)
+    bits = np.empty(picture.shape, np.uint64)
+    kernels.census(picture, bits)
+    y, x = 4, 5
+    window = picture[y - 3 : y + 4, x - 3 : x + 4].ravel()
+    darker = np.delete(window, 24) < picture[y, x]
+    assert f"{int(bits[y, x]):048b}" == "".join(str(int(d)) for d in darker)
+
+
+def pair_of(turn: float) -> Pair:
+    """Two cameras, the second beside the first, turned about the axis and smaller in field."""
+    camera = Camera(K=intrinsics(80.0, HW), cam_from_world=Pose.identity(), hw=HW)
+    R = rotation_from_vector(torch.tensor([0.01, -0.02, turn], dtype=torch.float64))
+    beta = Camera(
+        K=intrinsics(85.0, (80, 112)),
+        cam_from_world=Pose(R, torch.tensor([-0.25, 0.05, 0.0], dtype=torch.float64)),
+        hw=(80, 112),
+    )
+    return Pair(camera, beta, (torch.tensor(1.0).double(), torch.tensor(10.0).double()))
+
+
+def looked_at(pair: Pair, step: int) -> Segments:
+    hw = HW[0] // step, HW[1] // step
+    x = (pixel_grid(hw, dtype=torch.float64) + 0.5) * step - 0.5
+    found = lazily(Epipolar(), pair)(x.reshape(-1, 2))
+    return Segments(found.start.reshape(1, *hw, 2), found.end.reshape(1, *hw, 2), found.valid.reshape(1, *hw))
+
+
+def plane_seen(pair: Pair, depth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Alpha and beta pictures (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in beta."""
+    rough = torch.rand(1, 1, 40, 60, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def texture(X):
+        at = (X[..., :2] / depth * torch.tensor([0.6, 0.9]))[None]
+        return torch.nn.functional.grid_sample(rough, at, mode="bicubic", padding_mode="reflection", align_corners=True)
+
+    x = pixel_grid(HW, dtype=torch.float64).reshape(-1, 2)
+    X = pair.alpha.unproject(x, torch.full((len(x),), depth, dtype=torch.float64))
+    where = pair.beta.project(X)[0]
+    alpha = texture(X.reshape(*HW, 3))
+    beta_hw = pair.beta.hw
+    y = pixel_grid(beta_hw, dtype=torch.float64).reshape(-1, 2)
+    ray = pair.beta.unproject(y, torch.ones(len(y), dtype=torch.float64))
+    centre = pair.beta.cam_from_world.inverse().t
+    along = ray - centre
+    beta = texture((centre + along * ((depth - centre[2]) / along[:, 2])[:, None]).reshape(*beta_hw, 3))
+    return alpha, beta, where.reshape(*HW, 2)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, -0.6])
+def test_a_plane_is_found_again_by_unrectified_cameras(turn):
+    """To half a pixel where beta sees it, though every segment has its own direction; colours too."""
+    pair = pair_of(turn)
+    alpha, beta, where = plane_seen(pair, 2.0)
+    colours = beta * torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1).double()
+    segments = looked_at(pair, 1)
+    found = consensus(alpha, beta, colours, segments, looked_at(pair, 2))
+    position = pat.consensus._position(segments, found.reach)[0]
+    inner = torch.zeros(HW, dtype=torch.bool)
+    inner[8:-8, 8:-8] = True
+    seen = inner & (where > 4).all(-1) & (where < torch.tensor([107.0, 75.0])).all(-1)
+    off = (position - where).norm(dim=-1)[seen]
+    assert seen.float().mean() > 0.3
+    assert off.median() < 0.5
+    assert (off < 1.5).float().mean() > 0.95
+    wanted = alpha[0] * torch.tensor([1.0, 0.6, 0.3]).view(3, 1, 1).double() - alpha[0]
+    assert (found.colour[0, 0] - wanted)[:, seen].abs().mean() < 0.03
+
+
+def test_threads_and_blocks_change_nothing(monkeypatch):
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    call = alpha, beta, beta, looked_at(pair, 1), looked_at(pair, 2)
+    whole = consensus(*call)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1 if threads > 1 else 3)
+        again = consensus(*call)
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(whole, again))
+    monkeypatch.setattr(pat.consensus, "BLOCK", 16)
+    pieces = consensus(*call)
+    assert (pieces.reach - whole.reach).abs().median() < 1e-3
+
+
+def test_a_batch_is_its_pictures_one_by_one():
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    fine, coarse = looked_at(pair, 1), looked_at(pair, 2)
+    one = consensus(alpha, beta, beta, fine, coarse)
+    other = consensus(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
+    both = consensus(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
+    for a, b, c in zip(one, other, both):
+        assert torch.equal(torch.cat([a, b]), c)
+
+
+def test_nowhere_to_look_is_nothing_found():
+    x = torch.zeros(1, 32, 48, 2)
+    nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
+    found = consensus(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
+    assert found.reach.abs().max() == 0
+    assert found.colour.isfinite().all()
+
+
+def test_a_cut_is_where_it_says():
+    half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
+    cut = Consensus(half, half, whole).cut((4, 10, 2, 16))
+    assert torch.equal(cut.reach, half[..., 2:5, 1:8])
+    assert torch.equal(cut.colour, whole[..., 4:10, 2:16])

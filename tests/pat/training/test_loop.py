@@ -1,0 +1,226 @@
+"""Runs: what they leave, going on after any stop, several processes, numbers that are not finite."""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors import safe_open
+
+from pat.model import PATConfig
+from pat.train import save_config, train
+from pat.training import loop
+from pat.training.checkpoints import newest_checkpoint
+from pat.training.loop import new_network, shape
+from pat.training.processes import Process
+from pat.weights import load_weights, save_weights
+
+from .runs import SMALL, losses, short_run
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("training")
+
+
+@pytest.fixture(scope="module")
+def whole(folder):
+    """A run that was never stopped."""
+    config = short_run(folder, out=folder / "whole")
+    train(config)
+    return config
+
+
+class Stopped(Exception):
+    pass
+
+
+def stopped(config, step, monkeypatch, what="_advance"):
+    """Train until about to do something of that step, as if the machine went off."""
+    ordinary = getattr(loop.Run, what)
+
+    def stopping(self, *args, **kwargs):
+        if self.step == step:
+            raise Stopped
+        return ordinary(self, *args, **kwargs)
+
+    with monkeypatch.context() as context:
+        context.setattr(loop.Run, what, stopping)
+        with pytest.raises(Stopped):
+            train(config)
+
+
+def test_a_run_leaves_what_it_says(whole):
+    assert load_weights(whole.out / "best.safetensors").config == SMALL
+    lines = [json.loads(line) for line in (whole.out / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [4, 8]
+    assert len(losses(whole.out)) == 1 + 8
+    assert sorted(p.name for p in (whole.out / "pictures").iterdir()) == ["step-000004.png", "step-000008.png"]
+    assert len(list((whole.out / "checkpoints").iterdir())) == 2
+    again = load_weights(whole.out / "best.safetensors").state_dict()
+    assert train(whole) == whole.out / "best.safetensors"
+    assert all(torch.equal(v, again[k]) for k, v in load_weights(whole.out / "best.safetensors").state_dict().items())
+
+
+@pytest.mark.parametrize(
+    ("step", "what"),
+    [
+        (5, "_advance"),
+        (6, "_save"),
+        pytest.param(2, "_advance", marks=pytest.mark.slow),
+        pytest.param(8, "_validate", marks=pytest.mark.slow),
+    ],
+)
+def test_a_stopped_run_goes_on_bit_for_bit(step, what, folder, whole, monkeypatch):
+    config = replace(whole, out=folder / f"stopped-{step}")
+    stopped(config, step, monkeypatch, what)
+    train(config)
+    assert losses(config.out) == losses(whole.out)
+    ours, theirs = (load_weights(c.out / "best.safetensors").state_dict() for c in (config, whole))
+    assert all(torch.equal(ours[k], theirs[k]) for k in theirs)
+    ours, theirs = (newest_checkpoint(c.out / "checkpoints") for c in (config, whole))
+    assert all(torch.equal(ours.tensors[k], v) for k, v in theirs.tensors.items())
+
+
+def command(*arguments, processes=1):
+    torchrun = ["-m", "torch.distributed.run", "--nproc_per_node", str(processes)] if processes > 1 else []
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
+    return subprocess.Popen(
+        [sys.executable, *torchrun, "-m", "pat", "train", *map(str, arguments)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+@pytest.mark.slow
+def test_killed_at_any_moment_and_started_again(folder, whole):
+    """kill -9 at moments that nobody chose, until a run gets through."""
+    config = replace(whole, out=folder / "killed")
+    save_config(config, folder / "killed.yaml")
+    for seconds in (0.5, 1.3, 2.1):
+        running = command(folder / "killed.yaml")
+        begun = config.out / "steps.csv"
+        while running.poll() is None and not begun.exists():
+            time.sleep(0.1)
+        time.sleep(seconds)
+        os.kill(running.pid, signal.SIGKILL)
+        running.communicate()
+        begun.unlink(missing_ok=True) if newest_checkpoint(config.out / "checkpoints") is None else None
+    running = command(folder / "killed.yaml")
+    assert running.wait() == 0, running.communicate()[0]
+    running.communicate()
+    assert losses(config.out) == losses(whole.out)
+
+
+def test_two_processes_are_as_one(folder, whole):
+    config = replace(whole, out=folder / "two")
+    save_config(config, folder / "two.yaml")
+    running = command(folder / "two.yaml", processes=2)
+    said, _ = running.communicate()
+    assert running.returncode == 0, said
+    ours, theirs = ([[float(x) for x in row] for row in losses(c.out)[1:]] for c in (config, whole))
+    torch.testing.assert_close(torch.tensor(ours), torch.tensor(theirs), rtol=0, atol=1e-4)
+    ours, theirs = (newest_checkpoint(c.out / "checkpoints").tensors for c in (config, whole))
+    for name in theirs:
+        torch.testing.assert_close(ours[name], theirs[name], rtol=0, atol=1e-4)
+
+
+def test_groups_must_be_shared_evenly():
+    assert [Process(rank, 2).share(4) for rank in (0, 1)] == [[0, 2], [1, 3]]
+    with pytest.raises(ValueError, match="3 groups cannot be shared by 2 processes"):
+        Process(0, 2).share(3)
+
+
+def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatch):
+    config = replace(whole, out=folder / "nan")
+    ordinary = loop.Source.sample
+
+    def poisoned(self, planned, step, group):
+        given = ordinary(self, planned, step, group)
+        if (step, group) == (4, 1):
+            given.truth[1, :, 5, 5] = torch.nan
+        return given
+
+    monkeypatch.setattr(loop.Source, "sample", poisoned)
+    with pytest.raises(FloatingPointError, match=r"step 5: .*, by sample 1 of group 1; "):
+        train(config)
+    (file,) = config.out.glob("offending-*")
+    assert file.name == "offending-step-5-group-1.safetensors"
+    with safe_open(file, "pt") as kept:
+        assert kept.get_tensor("truth")[1].isnan().any()
+        assert kept.get_tensor("betas/0").isfinite().all()
+        assert kept.metadata()["samples"] == "[1]"
+    assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
+
+
+def test_no_room_for_a_checkpoint(folder, whole, monkeypatch):
+    """The system refuses to write, as on a full disk; the older checkpoint stays, and the run can go on from it."""
+    config = replace(whole, out=folder / "full")
+    stopped(config, 5, monkeypatch)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    room = 2 * (whole.out / "best.safetensors").stat().st_size
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"checkpoint of step 6 .* could not be written.*step-00000003") as caught:
+            train(config)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert "\n" not in str(caught.value)
+    assert [p.name for p in (config.out / "checkpoints").iterdir()] == ["step-00000003.safetensors"]
+    train(config)
+    assert losses(config.out) == losses(whole.out)
+
+
+def test_another_recipe_is_not_mixed_in(whole):
+    with pytest.raises(ValueError, match=r"holds a run of another recipe \(rate: 0.02, 0.01 there\)"):
+        train(replace(whole, rate=2e-2))
+
+
+def test_starting_from_weights(folder, whole):
+    network = new_network(replace(whole, start=whole.out / "best.safetensors"))
+    theirs = load_weights(whole.out / "best.safetensors").state_dict()
+    assert all(torch.equal(v, theirs[k]) for k, v in network.state_dict().items())
+    with pytest.raises(ValueError, match=r"holds a GuidedPAT of .*, the recipe is for a PAT of"):
+        new_network(replace(whole, network=PATConfig(), start=whole.out / "best.safetensors"))
+    save_weights(new_network(replace(whole, network=replace(SMALL, taps=7))), folder / "other.safetensors")
+    with pytest.raises(ValueError, match="give its own recipe"):
+        new_network(replace(whole, start=folder / "other.safetensors"))
+
+
+def test_no_photographs(folder, whole):
+    (folder / "empty").mkdir()
+    for photos, message in (((folder / "empty",), "no picture found under"), ((), "no photographs: give `photos`")):
+        with pytest.raises(ValueError, match=message):
+            train(replace(whole, photos=photos, cache=None, out=folder / "none"))
+
+
+def test_the_papers_network_trains_on_nearest_pixels(folder, whole):
+    network = PATConfig(dim=4)
+    config = replace(whole, network=network, loss="mse", field="nearest", out=folder / "paper", steps=2, filtered=0.0)
+    assert load_weights(train(config)).config == network
+
+
+def test_half_precision_and_compiled_parts_train(folder, whole):
+    config = replace(whole, out=folder / "half", steps=2, precision="bfloat16")
+    train(config)
+    full, half = (float(losses(c.out)[1][1]) for c in (whole, config))
+    assert full != half
+    assert full == pytest.approx(half, abs=0.05)
+
+
+def test_schedules(whole):
+    assert [shape(replace(whole, warmup=4), s, s / 100) for s in (1, 2)] == [0.25, 0.5]
+    assert shape(whole, 50, 0.5) == pytest.approx(0.5)
+    halving = replace(whole, schedule="halving", warmup=0)
+    assert [shape(halving, 1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
