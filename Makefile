@@ -80,7 +80,7 @@ drawings: $(READY)
 	@$(BIN)/python docs/drawings.py
 
 wheel: $(READY)
-	@rm -rf out/wheel
+	@rm -rf out/wheel build
 	@$(BIN)/python -m pip wheel -qq --no-deps --wheel-dir out/wheel .
 	@$(PYTHON) -m venv out/wheel/venv
 	@echo "== installing it and what it needs into out/wheel/venv"

@@ -48,6 +48,14 @@ def test_weights_are_those_of_attention(scene, sample):
     assert float(found.peak) == pytest.approx(seen.peak)
 
 
+def test_windows_of_beta_are_of_its_scale(sample):
+    """A step in alpha is one of 460 / 820 in beta, whichever way, and is turned as the cameras are."""
+    J = core.jacobian(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
+    assert float(J.det().sqrt()) == pytest.approx(460 / 820, rel=0.05)
+    turn = math.degrees(torch.atan2(J[1, 0], J[0, 0]))
+    assert turn == pytest.approx(math.degrees(math.asin(0.0349)), abs=0.3)
+
+
 def test_the_windows_find_the_colour_and_the_depth(scene, sample):
     """At most places of the sample array the colour found is near the true one, nearer than grey is."""
     errors = []
