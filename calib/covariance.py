@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 
 from arraygeom import Camera, Rig
-from pat.images import write_text
+from arraygeom.io.whole import write_text
 
 from .bundle import camera_jacobian, parameter_names
 

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 from matplotlib import rc_context
 
+from arraygeom.io.whole import write_atomically, write_text
 from arraygeom.rig import depth_range
-from pat.images import write_atomically, write_text
 
 from .boards import draw_board, parse_board
 from .calibrate import Calibration, calibrate

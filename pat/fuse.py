@@ -25,6 +25,7 @@ from arraygeom import (
     Camera,
     Curved,
     Epipolar,
+    EpipolarLine,
     HomographyDisplacement,
     Moved,
     Pair,
@@ -42,7 +43,7 @@ from arraygeom import (
     retaken,
 )
 from arraygeom.fields import pinhole_track
-from arraygeom.pixels import HW, map_homogeneous, shift_matrix
+from arraygeom.pixels import HW, coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
 from .images import luminance, write_atomically
@@ -421,11 +422,15 @@ def _prepare(
 def _common_part(
     pair: Pair, picture: Tensor, field: ReceptiveField | None, network: FusionNetwork
 ) -> tuple[Pair, Tensor]:
-    """A calibrated beta without what alpha never looks at, if that is much: it would be enlarged for nothing."""
+    """A calibrated beta without what alpha never looks at, if that is much: it would be enlarged for nothing.
+
+    Not where the field may go by the pictures' sizes.
+    """
     h, w = pair.beta.hw
-    if pair.link is not None or not pair.calibrated or pitch_ratio(pair) > 0.8:
+    follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
+    if not follows or pair.link is not None or not pair.calibrated or pitch_ratio(pair) > 0.8:
         return pair, picture
-    found = Look.along(field or default_field(pair), pair).at(pixel_grid(pair.alpha.hw)[::8, ::8].reshape(-1, 2))
+    found = Look.along(field or default_field(pair), pair).at(coarse_grid(pair.alpha.hw).reshape(-1, 2))
     top, bottom, left, right = _touched(found, (h, w), network)
     if (bottom - top) * (right - left) > 0.75 * h * w:
         return pair, picture

@@ -7,8 +7,6 @@ one line as `CONVENTION`.
 from __future__ import annotations
 
 import dataclasses
-import os
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -35,6 +33,7 @@ from . import (
 )
 from .errors import RigFileError
 from .source import RigFileWarning, Source, unit_doubt
+from .whole import write_text
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -104,9 +103,9 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     if isinstance(contents, Mapping):
         path.mkdir(parents=True, exist_ok=True)
         for name, text in contents.items():
-            _write_whole(path / name, text)
+            write_text(path / name, text)
     else:
-        _write_whole(path, contents)
+        write_text(path, contents)
 
 
 def recognise(path: str | Path) -> str:
@@ -134,14 +133,3 @@ def _scaled(rig: Rig, scale: float) -> Rig:
     }
     depth = None if rig.depth is None else tuple(bound * scale for bound in rig.depth)
     return dataclasses.replace(rig, cameras=cameras, depth=depth)
-
-
-def _write_whole(path: Path, text: str) -> None:
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=path.name, suffix=".part")
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-import pat.images
+import arraygeom.io.whole
 from arraygeom import Rig
 from pat.batch import Batch, find_pictures
 from pat.cli import main
@@ -23,7 +23,7 @@ def material(tmp_path_factory) -> Path:
     """A folder with weights of a tiny network, a rig, and seven fast and two slow pictures."""
     folder = tmp_path_factory.mktemp("material")
     torch.manual_seed(0)
-    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), coarse_dim=8, coarse_value=4))
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))
     save_weights(network, folder / "tiny.safetensors")
     frames, _ = moving.recording(7, 0.003)
     for name, pictures in frames.items():
@@ -114,14 +114,14 @@ def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp
 
 def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
     """The third file to be flushed does not fit."""
-    flush, count = pat.images._flush, iter(range(100))
+    flush, count = arraygeom.io.whole._flush, iter(range(100))
 
     def full(path):
         if "fused" in path.name and next(count) == 2:
             raise OSError(errno.ENOSPC, "No space left on device")
         flush(path)
 
-    monkeypatch.setattr(pat.images, "_flush", full)
+    monkeypatch.setattr(arraygeom.io.whole, "_flush", full)
     job = batch(material, tmp_path / "out")
     with pytest.raises(JobError, match="No space left"):
         job.run()

@@ -119,6 +119,9 @@ class Matcher:
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
 
+    def survey(self, alpha, beta, look):
+        return None
+
     def __call__(self, alpha, betas, looks):
         self.betas.append([(b.shape[1], float(b.mean())) for b in betas])
         self.looks = looks
@@ -206,6 +209,9 @@ class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
     halo, beta_halo, multiple, bytes_per_pixel, equal_pitch = 0, 2, 1, 1.0, True
+
+    def survey(self, alpha, beta, look):
+        return None
 
     def __call__(self, alpha, betas, looks):
         found = looks[0].at(torch.tensor([[20.0, 7.0]]))

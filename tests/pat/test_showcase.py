@@ -211,8 +211,8 @@ def test_evaluate_writes_and_prints_the_tables(data, tmp_path, capsys):
     )
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "scores.md").read_text()
-    assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | classical | fusion |")
-    assert len((tmp_path / "scores.csv").read_text().splitlines()) == 4
+    assert printed.startswith("#### kitti\n\n| beta reduced 2x | alpha | beta | classical | fusion | the paper")
+    assert len((tmp_path / "scores.csv").read_text().splitlines()) == 5
     assert len(list((tmp_path / "kitti").glob("*_x2.png"))) == 1
 
 
