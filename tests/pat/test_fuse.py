@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from pat.matches import match_points, seen_depths
 
 import pat.fuse
 from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
+from calib.matches import match_points, seen_depths
 from pat.demo import load_sample
 from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, quarter_turns, tiles_of, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
