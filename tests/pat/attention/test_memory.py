@@ -17,4 +17,5 @@ def test_memory_is_that_of_the_pictures(interpolation, backward, most):
         measure(job("cpu", "cpu", interpolation, 128, 512, samples, backward) | {"repeats": 1}) for samples in (40, 640)
     )
     assert few["extra"] < most * few["unit"]
-    assert many["extra"] < 1.1 * few["extra"] + 2**21
+    # Sixteen times the samples; what the allocator keeps differs by some 30 MiB from run to run.
+    assert many["extra"] < 1.1 * few["extra"] + 2**25
