@@ -154,3 +154,15 @@ def test_a_cut_is_where_it_says():
     cut = Consensus(half, half, whole).cut((4, 10, 2, 16))
     assert torch.equal(cut.reach, half[..., 2:5, 1:8])
     assert torch.equal(cut.colour, whole[..., 4:10, 2:16])
+
+
+def test_what_nothing_sees_varies_with_brightness_as_nearby():
+    rng = np.random.default_rng(0)
+    brightness = (0.4 + 0.2 * rng.random((24, 32))).astype(np.float32)
+    colour = (0.8 * brightness - 0.3)[None]
+    weight = np.full(brightness.shape, 1e-4, np.float32)
+    weight[:, :16] = 1
+    guide = np.full(brightness.shape, 100, np.uint8)
+    unseen = np.where(weight < 1, 0, colour).astype(np.float32)
+    found = pat.consensus._regressed(unseen, brightness, weight, guide, (1000.0, 20.0))
+    assert np.abs(found - colour)[:, :, 16:].mean() < 0.6 * np.abs(colour - colour.mean()).mean()
