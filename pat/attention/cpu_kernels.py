@@ -1113,12 +1113,29 @@ def _slopes(j, course, samples, by_tap):
 
 @compiled
 def _unpack(array, at, n, out):
-    for c in range(n):
+    whole = n // LANES * LANES
+    for c in range(0, whole, LANES):
+        store(out, c, load(array, at + c))
+    for c in range(whole, n):
         out[c] = load_one(array, at + c)
 
 
-@compiled
+def pack(numbers, n, array, at):
+    """array[at + c] = numbers[c], narrowed."""
+
+
+@overload(pack)
 def _pack(numbers, n, array, at):
+    return _pack_same if array.dtype == numbers.dtype else _pack_narrower
+
+
+@unwrap
+def _pack_same(numbers, n, array, at):
+    _unpack(numbers, 0, n, from_index(array, at))
+
+
+@unwrap
+def _pack_narrower(numbers, n, array, at):
     for c in range(n):
         array[at + c] = narrow(array, numbers[c])
 
@@ -1153,16 +1170,15 @@ def _plain_sum(numbers, n):
 
 
 @compiled
-def _softmax(n, samples):
+def _softmax(n, score, weight):
     """Weights of n scores, and the logarithm of the sum of exponentials (-inf if there is none)."""
-    score, weight = samples.score, samples.weight
     best = load(score, 0)
     for j in range(LANES, n, LANES):
         best = larger(load(score, j), best)
     top = largest(best)
     if top == -np.inf and not math.isnan(_plain_sum(score, n)):
         return top
-    mass = _exponentiate(n, samples, top)
+    mass = _exponentiate(n, score, weight, top)
     scale = splat(ONE / mass)
     for j in range(0, n, LANES):
         store(weight, j, mul(load(weight, j), scale))
@@ -1170,13 +1186,13 @@ def _softmax(n, samples):
 
 
 @compiled
-def _exponentiate(n, samples, top):
+def _exponentiate(n, score, weight, top):
     """weight = exp(score - top), and the sum; scores are padded with -inf."""
     minus_top = splat(-top)
-    mass = splat(zero(samples.score))
+    mass = splat(zero(score))
     for j in range(0, n, LANES):
-        e = exponentials(add(load(samples.score, j), minus_top))
-        store(samples.weight, j, e)
+        e = exponentials(add(load(score, j), minus_top))
+        store(weight, j, e)
         mass = add(mass, e)
     return total(mass)
 
@@ -1232,28 +1248,46 @@ def _forward(first, pixels, call, biased, measured, block, out, statistics, logs
     _block_products(pixels, counts, block.query, block.rows, call.key, d, block.by_key)
     for i in range(pixels):
         p = first + i
-        logsum[p] = _weigh(p, i, call, biased, block)
+        logsum[p] = _weigh(p, i, call, biased, measured, block)
         if measured:
             _measure(i, call.look, block, from_index(statistics, 4 * p))
     _block_sums(pixels, counts, block.by_key, block.rows, call.value, dv, block.query)
     for i in range(pixels):
-        _pack(_of(block.query, i), dv, out, (first + i) * dv)
+        pack(_of(block.query, i), dv, out, (first + i) * dv)
 
 
 @compiled
-def _weigh(p, slot, call, biased, block):
+def _weigh(p, slot, call, biased, measured, block):
     """From the inner products of pixel p's taps to their weights, in the same place; gives the logarithm of
     the sum of exponentials."""
     look, by_tap = call.look, _of(block.by_key, slot)
     samples, n = _samples(block, slot, look.samples), block.sample_counts[slot]
     logsum = zero(by_tap) - np.float32(np.inf)
+    if look.nearest and n == block.tap_counts[slot] and n > 0:
+        return _weigh_taps(p, slot, n, call, biased, measured, block)
     if n > 0:
         _score(p, slot, call, biased, block)
-        logsum = _softmax(n, samples)
+        logsum = _softmax(n, samples.score, samples.weight)
     if logsum == -np.inf:
         block.tap_counts[slot] = 0
     else:
         _distribute(n, block.tap_counts[slot], look, samples, samples.weight, by_tap)
+    return logsum
+
+
+@compiled
+def _weigh_taps(p, slot, n, call, biased, measured, block):
+    """`_weigh` where each sample has a tap of its own: no need to go from taps to samples and back."""
+    samples, by_tap = _samples(block, slot, call.look.samples), _of(block.by_key, slot)
+    if biased:
+        for j in range(n):
+            by_tap[j] += call.bias[p * call.look.samples + samples.index[j]]
+    _fill(by_tap, n, n + LANES, zero(by_tap) - np.float32(np.inf))
+    logsum = _softmax(n, by_tap, by_tap)
+    if logsum == -np.inf:
+        block.tap_counts[slot] = 0
+    elif measured:
+        _unpack(by_tap, 0, n + LANES, samples.weight)
     return logsum
 
 
@@ -1356,7 +1390,7 @@ def _backward(first, pixels, call, biased, saved, step, block, scratch, gradient
     if len(gradients.query) > 0:
         _block_sums(pixels, block.tap_counts, by_key, block.rows, call.key, d, block.query)
         for i in range(pixels):
-            _pack(_of(block.query, i), d, pointer(gradients.query), (first + i) * d)
+            pack(_of(block.query, i), d, pointer(gradients.query), (first + i) * d)
 
 
 @compiled
@@ -1384,7 +1418,7 @@ def _blame_pixel(p, slot, call, biased, saved, step, block, gradients):
     samples, n = _samples(block, slot, call.look.samples), block.sample_counts[slot]
     statistics, upstream = from_index(saved.statistics, step * p), from_index(saved.statistics_upstream, step * p)
     _score(p, slot, call, biased, block)
-    _exponentiate(n, samples, saved.logsum[p])
+    _exponentiate(n, samples.score, samples.weight, saved.logsum[p])
     _interpolate(n, block.tap_counts[slot], call.look, samples, _of(block.by_value, slot), samples.slope)
     _blame(n, samples, statistics, upstream)
     if len(gradients.points) > 0:
