@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -37,6 +37,7 @@ from .studio import NOTHING, Studio
 
 _RATE = 30.0
 _SHARED_MEMORY = Path("/dev/shm")
+_SCRATCH = "pat-render-"
 
 
 class Shot(NamedTuple):
@@ -59,8 +60,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
     refuse_inside(scene, rig, planned)
-    with _staged(out) as folder, _scratch() as scratch:
-        studio = Studio(scene, settings, scratch)
+    with _staged(out) as folder, _studio(scene, settings) as studio:
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
         first: dict[str, Frame] = {}
         for shot in planned:
@@ -192,8 +192,31 @@ def _staged(out: Path) -> Iterator[Path]:
 
 
 @contextmanager
+def _studio(scene: Scene, settings: RenderSettings) -> Iterator[Studio]:
+    with _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
+        yield studio
+
+
+@contextmanager
 def _scratch() -> Iterator[Path]:
-    """A folder in memory, where there is such a thing, for what Blender writes and we read at once."""
+    """A folder in memory, where there is such a thing, for what Blender writes and we read at once.
+
+    Its name tells whose it is: those of processes that were killed are removed.
+    """
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
-    with tempfile.TemporaryDirectory(dir=where, prefix="pat-") as folder:
+    for folder in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
+        owner = folder.name.removeprefix(_SCRATCH).partition("-")[0]
+        if owner.isdecimal() and not _alive(int(owner)):
+            shutil.rmtree(folder, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=where, prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
         yield Path(folder)
+
+
+def _alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    except PermissionError:
+        pass
+    return True

@@ -1,6 +1,9 @@
 """Blender's pictures against arraygeom and against theory. Each scene is rendered in the worker's process."""
 
+import os
 import sys
+import time
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -70,12 +73,25 @@ def test_a_tiny_scene_is_true_in_unlike_cameras(worker, tmp_path):
         grey = frame.rgb.mean(0)
         assert torch.corrcoef(torch.stack([grey.flatten(), frame.nir[0].flatten()]))[0, 1] < 0.98
     assert "bpy" not in sys.modules
+    assert idle_seconds(worker.pid, over=1.0) < 0.1
     with pytest.raises(ValueError, match="exists: give a new folder"):
         worker.render(scene, rig, tmp_path / "scene", settings=settings)
     away = Scene(objects=(glowing("behind", Motion((Key(position=(0, 0, -5)),))),))
     with pytest.raises(ValueError, match="camera 'oblong' sees nothing of the scene at 0 s"):
         worker.render(away, rig, tmp_path / "nothing", settings=settings)
     assert [p.name for p in tmp_path.iterdir()] == ["scene"]
+
+
+def idle_seconds(pid: int, *, over: float) -> float:
+    """Seconds of a core that a process takes that has nothing to do."""
+
+    def spent() -> float:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+    before = spent()
+    time.sleep(over)
+    return spent() - before
 
 
 def points(camera: Camera, frame, index: int) -> torch.Tensor:
