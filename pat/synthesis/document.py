@@ -16,16 +16,18 @@ import yaml
 T = TypeVar("T")
 
 
-def to_document(value: Any) -> Any:
-    """Dataclasses as mappings without what is at its default, tuples as lists, paths as text, the rest as it is."""
+def to_document(value: Any, *, whole: bool = False) -> Any:
+    """Dataclasses as mappings, tuples as lists, paths as text, the rest as it is.
+
+    What is at its default is left out, if not `whole`.
+    """
     if dataclasses.is_dataclass(value):
-        return {
-            f.name: to_document(v) for f in dataclasses.fields(value) if not _default(f, v := getattr(value, f.name))
-        }
+        entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
+        return {f.name: to_document(v, whole=whole) for f, v in entries.items() if whole or not _default(f, v)}
     if isinstance(value, tuple | list):
-        return [to_document(v) for v in value]
+        return [to_document(v, whole=whole) for v in value]
     if isinstance(value, dict):
-        return {k: to_document(v) for k, v in value.items()}
+        return {k: to_document(v, whole=whole) for k, v in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 
@@ -102,6 +104,8 @@ def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
 
 
 def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any, ...]:
+    if isinstance(value, str) and arguments[1:] == (...,):
+        value = [value]
     if not isinstance(value, list | tuple):
         raise ValueError(f"{entry}: is {value!r}; wanted a list")
     kinds = (arguments[0],) * len(value) if arguments[1:] == (...,) else arguments
@@ -138,8 +142,10 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
         return float(value)
     if kind is float and isinstance(value, str) and _is_number(value):
         return float(value)
+    if kind is int and isinstance(value, str) and _is_number(value) and float(value).is_integer():
+        return int(float(value))
     if kind is Path and isinstance(value, str):
-        return Path(value)
+        return Path(value).expanduser()
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
         raise ValueError(f"{entry}: is {value!r}; wanted {_PLAIN.get(kind, kind.__name__)}")
     return value

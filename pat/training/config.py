@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,14 +15,14 @@ from pat.bandwise import BandwisePATConfig
 from pat.guided import GuidedPATConfig
 from pat.images import write_text
 from pat.model import PATConfig
+from pat.synthesis.document import from_document, near, to_document
 from pat.synthesis.rigs import RigDistribution
 from pat.weights import NETWORKS
-
-from .plain import from_plain, nearest, to_plain
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
 GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
+NetworkConfig = GuidedPATConfig | PATConfig | BandwisePATConfig
 FieldName = Literal["epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 """What may differ between a run and its continuation: the samples and the steps do not depend on it."""
@@ -59,7 +59,7 @@ class TrainConfig:
     """Folder for weights, checkpoints, figures and pictures."""
     start: Path | None = None
     """File of weights to go on from."""
-    network: GuidedPATConfig | PATConfig | BandwisePATConfig = dataclasses.field(default_factory=GuidedPATConfig)
+    network: NetworkConfig = dataclasses.field(default_factory=GuidedPATConfig)
     steps: int = 4000
     """Steps of the whole run."""
     minutes: float = float("inf")
@@ -137,9 +137,7 @@ def load_config(name: str | Path) -> TrainConfig:
     """
     path = next((p for p in (RECIPES / f"{name}.yaml", Path(name)) if p.is_file()), None)
     if path is None:
-        near = nearest(str(name), recipes())
-        hint = f"; did you mean '{near}'?" if near else ""
-        raise FileNotFoundError(f"no recipe '{name}'{hint} (a file, or one of {', '.join(recipes())})")
+        raise FileNotFoundError(f"no recipe '{name}' (it is a file or a name of the package){near(name, recipes())}")
     return parse_config(path.read_text(encoding="utf-8"), str(path))
 
 
@@ -149,12 +147,23 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
         values = yaml.safe_load(text) or {}
     except yaml.YAMLError as error:
         raise ValueError(f"{name}: not YAML: {' '.join(str(error).split())}") from None
-    return from_plain(TrainConfig, values, f"{name}: ", union=_network_config)
+    try:
+        return _config(values)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from None
+
+
+def _config(values: Any) -> TrainConfig:
+    """All but the network first: which entries that may have depends on its kind."""
+    if not isinstance(values, Mapping):
+        raise ValueError(f"wanted entries (name: value), got {values!r}")
+    config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
+    return replace(config, network=_network_config(values["network"])) if "network" in values else config
 
 
 def config_text(config: TrainConfig) -> str:
     """The recipe as YAML, every value written out; `parse_config` reads it back."""
-    plain = to_plain(config)
+    plain = to_document(config, whole=True)
     kind = next(name for name, (_, made_of) in NETWORKS.items() if type(config.network) is made_of)
     values = plain | {"network": {"kind": kind} | plain["network"]}
     return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=118)
@@ -193,11 +202,11 @@ def difference(config: TrainConfig, other: TrainConfig) -> str | None:
     return None
 
 
-def _network_config(values: Any, where: str) -> Any:
+def _network_config(values: Any) -> NetworkConfig:
     """The configuration of a network from its entries and its `kind`."""
     if not isinstance(values, Mapping):
-        raise ValueError(f"{where}: wanted entries such as kind: GuidedPAT, got {values!r}")
+        raise ValueError(f"network: wanted entries such as kind: GuidedPAT, got {values!r}")
     kind = values.get("kind", "GuidedPAT")
     if kind not in NETWORKS:
-        raise ValueError(f"{where}.kind: no network '{kind}' (there are: {', '.join(NETWORKS)})")
-    return from_plain(NETWORKS[kind][1], {k: v for k, v in values.items() if k != "kind"}, f"{where}.")
+        raise ValueError(f"network.kind: no network '{kind}'{near(kind, NETWORKS)}")
+    return from_document(NETWORKS[kind][1], {k: v for k, v in values.items() if k != "kind"}, "network")

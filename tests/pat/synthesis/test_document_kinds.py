@@ -43,7 +43,7 @@ def test_plain_data_becomes_dataclasses():
         ({}, "file.rate: missing"),
         ({"rate": -1}, "file: rate must not be negative"),
         ({"rate": 1, "fodlers": []}, "file.fodlers: unknown key; did you mean 'folders'"),
-        ({"rate": 1, "folders": "a"}, "file.folders: is 'a'; wanted a list"),
+        ({"rate": 1, "folders": 3}, "file.folders: is 3; wanted a list"),
         ({"rate": 1, "inner": {"size": [1]}}, r"file.inner.size: has 1 entries; wanted 2"),
         ({"rate": 1, "inner": {"size": [1, 2.5]}}, r"file.inner.size\[1\]: is 2.5; wanted a whole number"),
         ({"rate": 1, "inner": {"mode": "fst"}}, "file.inner.mode: is 'fst'; did you mean 'fast'"),
