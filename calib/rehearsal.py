@@ -45,7 +45,9 @@ def rehearse(rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: fl
             pose = camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
             picture = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
             with write_atomically(folder / name / f"{i:03d}.png") as temporary:
-                temporary.write_bytes(cv2.imencode(".png", np.clip(picture.round(), 0, 255).astype(np.uint8))[1].tobytes())
+                temporary.write_bytes(
+                    cv2.imencode(".png", np.clip(picture.round(), 0, 255).astype(np.uint8))[1].tobytes()
+                )
     return boards
 
 

@@ -6,7 +6,7 @@ import html
 import math
 import socket
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import panel as pn
@@ -32,6 +32,9 @@ UNITS = {
 }
 """For each kind of number: shown units to one of the rig's, names of its parts, reach and step of the slider, unit."""
 
+RESTED = 150
+"""Milliseconds without a change after which the rig in space is drawn anew."""
+
 SHOWN_PIXELS = 2_000_000
 """Larger pictures are drawn reduced; what is worked out uses them as they are."""
 
@@ -50,11 +53,13 @@ class Explorer:
         self.space = pn.pane.Plotly(None, height=340, sizing_mode="stretch_width", config={"displaylogo": False})
         self.drawn: tuple[object, dict[str, Any]] = None, {}
         self.pointed: tuple[float, float] | None = None
+        self.waiting: Any = None
         self.controls = Controls(scene.rig, self.state, self.moved)
         self.alpha_figure = self._alpha_figure()
         self.figures = [self._beta_figure(i, name) for i, name in enumerate(self.betas)]
         self.depth_figure = self._depth_figure()
-        self.seen = self.show(self.state)
+        self.seen: Seen | None = None
+        self.show(self.state)
 
     def moved(self, **changes: object) -> None:
         """Draw what the controls now say."""
@@ -79,12 +84,28 @@ class Explorer:
             for source, data in zip(sources, beta_data(seen.betas.get(name))):
                 source.data = data
         self.facts.object = facts(state, seen)
-        self._show_space(seen)
+        self._once_settled()
         return seen
 
-    def _show_space(self, seen: Seen) -> None:
+    def _once_settled(self) -> None:
+        """Draw space when the controls have rested: it takes a browser longer than all the rest together.
+
+        At once the first time, and in a notebook, where no server can call back.
+        """
+        document = pn.state.curdoc
+        if self.space.object is None or document is None or document.session_context is None:
+            self._show_space()
+            return
+        if self.waiting is not None:
+            document.remove_timeout_callback(self.waiting)
+        self.waiting = document.add_timeout_callback(self._show_space, RESTED)
+
+    def _show_space(self) -> None:
         """The cameras, drawn anew only when the rig has changed, and the ray, only when the pixel has."""
-        state = self.state
+        self.waiting = None
+        state, seen = self.state, self.seen
+        if seen is None:
+            return
         key = (state.near, state.far, tuple(state.changes.items()))
         if key != self.drawn[0]:
             self.drawn = key, space(seen.rig, state.alpha)
@@ -123,17 +144,19 @@ class Explorer:
         drawn = figure(
             width=440,
             height=340,
-            title="weight against depth (m)",
+            title="weight against depth (m), the highest being 1",
             x_axis_type="log",
+            y_range=Range1d(start=0, end=1.05),  # labels that change size lay the whole page out anew
             tools="pan,wheel_zoom,reset",
             output_backend="canvas",
         )
         for index, name in enumerate(self.betas):
             colour = COLOURS[(index + 1) % len(COLOURS)]
-            drawn.line("depth", "weight", source=self.sources[name].samples, color=colour, legend_label=name)
-            drawn.scatter("depth", "weight", source=self.sources[name].samples, color=colour, size=4)
+            drawn.line("depth", "share", source=self.sources[name].samples, color=colour, legend_label=name)
+            drawn.scatter("depth", "share", source=self.sources[name].samples, color=colour, size=4)
         if self.betas:
             drawn.legend.location = "top_left"
+            drawn.legend.background_fill_alpha = 0.4
         return drawn
 
 
@@ -197,13 +220,18 @@ def beta_sources(name: str) -> BetaSources:
 def beta_data(seen: SeenInBeta | None) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
     """Columns of the segment's ends (near, far), of the samples, and of where the match is expected."""
     if seen is None:
-        return {"x": [], "y": []}, {"x": [], "y": [], "weight": [], "depth": [], "size": []}, {"x": [], "y": []}
+        return (
+            {"x": [], "y": []},
+            {"x": [], "y": [], "weight": [], "share": [], "depth": [], "size": []},
+            {"x": [], "y": []},
+        )
     ends = np.empty((0, 2)) if seen.ends is None else seen.ends.numpy()
     counts = seen.counts
     x, y = seen.xy[counts].numpy().T
     weight = seen.weight[counts].numpy()
-    size = 2 + 12 * np.sqrt(weight / max(seen.peak, 1e-9))
-    samples = {"x": x, "y": y, "weight": weight, "depth": seen.depth[counts].numpy(), "size": size}
+    share = weight / max(float(weight.max(initial=0.0)), 1e-9)
+    size, depth = 2 + 12 * np.sqrt(share), seen.depth[counts].numpy()
+    samples = {"x": x, "y": y, "weight": weight, "share": share, "depth": depth, "size": size}
     where = [[float(v)] if bool(counts.any()) else [] for v in seen.position]
     return {"x": ends[:, 0], "y": ends[:, 1]}, samples, {"x": where[0], "y": where[1]}
 
@@ -213,8 +241,8 @@ def picture_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"
     h, w = hw
     drawn = figure(
         title=title,
-        width=480,
-        height=round(480 * h / w) + 50,
+        frame_width=450,
+        frame_height=round(450 * h / w),
         x_range=Range1d(start=-0.5, end=w - 0.5),
         y_range=Range1d(start=h - 0.5, end=-0.5),
         match_aspect=True,
@@ -222,7 +250,7 @@ def picture_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"
         active_scroll="wheel_zoom",
     )
     drawn.image_rgba([rgba(image)], x=-0.5, y=-0.5, dw=w, dh=h)
-    drawn.grid.visible = False
+    drawn.grid.visible = drawn.axis.visible = False  # measuring labels is a third of the time that painting takes
     return drawn
 
 
@@ -235,6 +263,12 @@ def rgba(image: Float[Tensor, "c h w"]) -> np.ndarray:
     opaque = torch.cat([colours.clamp(0, 1), torch.ones_like(colours[:1])])
     bytes_ = (255 * opaque).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
     return bytes_.view(np.uint32)[..., 0]
+
+
+class Slider(pn.widgets.FloatSlider):
+    """Panel's, but answered at once: its sliders wait 50 ms for more changes, which is half of what we allow."""
+
+    _debounce: ClassVar[int] = 5
 
 
 def depth_sliders(rig: Rig, moved: Any) -> list[Any]:
@@ -252,7 +286,7 @@ def logarithmic(name: str, value: float, ends: tuple[float, float], changed: Any
     """A slider of the decimal logarithm that shows the number itself."""
     low, high = (math.log10(e) for e in ends)
     shown = CustomJSTickFormatter(code="return (10 ** tick).toPrecision(3)")
-    made = pn.widgets.FloatSlider(label=name, start=low, end=high, step=0.005, value=math.log10(value), format=shown)
+    made = Slider(label=name, start=low, end=high, step=0.005, value=math.log10(value), format=shown)
     made.param.watch(lambda e: changed(10**e.new), "value")
     return made
 
@@ -269,7 +303,7 @@ def field_sliders(moved: Any) -> list[Any]:
 def slider(name: str, bounds: tuple[float, float, float], value: float, changed: Any) -> Any:
     """A slider that calls `changed` with its value."""
     start, end, step = bounds
-    made = pn.widgets.FloatSlider(label=name, start=start, end=end, step=step, value=value)
+    made = Slider(label=name, start=start, end=end, step=step, value=value)
     made.param.watch(lambda e: changed(e.new), "value")
     return made
 

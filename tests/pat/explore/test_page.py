@@ -118,9 +118,8 @@ def test_a_slider_moves_the_segment(page):
     torch.testing.assert_close(ends(page), segment(pair, (pixel["x"][0], pixel["y"][0]), near=4.0), atol=1e-6, rtol=0)
 
 
-@pytest.mark.xfail(reason="113 ms at best in headless chromium on two cores; the server's part is below 10")
 def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
-    """From a slider's move to the segment's in the page: the quickest of 15, on a machine with nothing else to do."""
+    """From a slider's move until the page is painted: the quickest of 15, on a machine with nothing else to do."""
     slower = slowed_by_others()
     times = page.execute_async_script(
         SCRIPT
@@ -129,17 +128,18 @@ def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
         const source = find('segment:colour');
         let start;
         const next = () => { start = performance.now(); slider.value = Math.log10(6 + times.length / 4); };
-        source.properties.data.change.connect(() => {
+        const painted = () => {
             times.push(performance.now() - start);
             times.length < 15 ? setTimeout(next, 50) : done(times);
-        });
+        };
+        source.properties.data.change.connect(() => requestAnimationFrame(() => setTimeout(painted, 0)));
         next();
         """
     )
     slower = max(1.0, min(slower, slowed_by_others()))
     record_property("milliseconds", times)
     record_property("slower", slower)
-    print(f"ms from slider to segment: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
+    print(f"ms from slider to picture: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
     assert min(times) < 100 * slower
 
 
