@@ -1,116 +1,97 @@
-"""Cameras with lenses in place of pictures that are known by fundamental matrices alone.
+"""Fundamental matrices through lenses: what F alone cannot fit where lenses bend lines.
 
-F has seven numbers: a pose up to its length has five, two focal lengths the rest. So cameras with unlike focal lengths
-say all that F says, and unlike F they can have lenses, through which lines are bent. What is unknowable stays open: the
-unit of length, and focal lengths that trade with depth.
+Two radial terms for each camera straighten pixels about the picture's middle, x' = x (1 + k1 r^2 + k2 r^4) with r in
+halves of the longer side, and F relates what is straight (Fitzgibbon 2001 has one term, as a quotient). Seven and four
+numbers, fitted together to matched points.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, triangulate
+from arraygeom import epipolar_distance
 from arraygeom.pixels import HW
 
-from .matches import ENOUGH, Matches, similarity
-from .residuals import epipolar_residuals
+from .matches import Matches, fit_fundamental
+from .refine import LEAST_NOISE
 
-GUESSES = 1.2, 0.8, 1.8
-"""Focal lengths of the first camera that are tried, in widths of its picture, likely ones first."""
-BETTER = 0.7
-"""A guess is taken before a likelier one if points are nearer to their lines by this factor."""
-SIGMA = {"rotation": 0.1, "translation": 0.2, "focal": 0.2, "distortion": 0.5}
-"""How well the numbers of such cameras are known, as `unknowns.SIGMA` counts them."""
-FREE = tuple(SIGMA)
+ROUNDS = 3
+"""The noise of points is estimated anew so often."""
 
-Pairs = Mapping[tuple[str, str], Matches]
+Array = np.ndarray
 
 
-def with_cameras(rig: Rig, pairs: Pairs) -> Rig:
-    """A rig of cameras, each with two terms of a lens that are still 0, that puts matches where the rig's links do.
+@dataclass(frozen=True)
+class BentLink:
+    """F between straightened pixels, and what straightens those of alpha and of beta (k1, k2)."""
 
-    The unit of length is the first link's baseline; the other baselines are such that points seen in both pairs of a
-    camera have one depth. Raises ValueError for cameras that no chain of pairs joins to the first.
+    F: Float[Tensor, "3 3"]
+    terms: tuple[tuple[float, float], tuple[float, float]]
+    sizes: tuple[HW, HW]
+
+    def straight(self, matches: Matches) -> Matches:
+        """The points as cameras without lenses would see them, pixels."""
+        parts = zip(matches, self.sizes, self.terms)
+        return Matches(*(torch.from_numpy(_straight(x.numpy(), hw, k)) for x, hw, k in parts))
+
+    def line_distance(self, matches: Matches) -> Float[Tensor, " n"]:
+        """How far points are from their lines, in beta's straightened pixels."""
+        return epipolar_distance(self.F, *self.straight(matches)).abs()
+
+
+def fit_bent(matches: Matches, alpha_hw: HW, beta_hw: HW) -> BentLink:
+    """F and lenses of points matched in two pictures; wrong ones have little say (Cauchy's loss, Sampson distances).
+
+    Raises ValueError if no F fits at all.
     """
-    cameras: dict[str, Camera] = {}
-    depths: dict[str, dict[tuple[float, float], float]] = {}
-    todo = {names: matches for names, matches in pairs.items() if len(matches.alpha) >= ENOUGH}
-    while todo:
-        names = next((n for n in todo if not cameras or set(n) & set(cameras)), None)
-        if names is None:
-            break
-        a, b = names
-        matches = todo.pop(names)
-        if b in cameras and a in cameras:
-            continue
-        if b in cameras:
-            a, b, matches = b, a, Matches(matches.beta, matches.alpha)
-        sizes = rig[a].hw, rig[b].hw
-        alpha, beta = _pair(matches, sizes, cameras.get(a))
-        depth = _depths(alpha, beta, matches)
-        scale = _scale(depth, depths.setdefault(a, {}))
-        depths[a] |= {x: scale * z for x, z in depth.items()}
-        from_world = cameras[a].cam_from_world if a in cameras else Pose.identity()
-        cameras.setdefault(a, alpha)
-        moved = Pose(beta.R, scale * beta.t) @ from_world
-        cameras[b] = beta.replace(cam_from_world=moved)
-    if left := [name for name in rig.names if name not in cameras and any(name in names for names in pairs)]:
-        raise ValueError(f"no pictures join {', '.join(map(repr, left))} to the others")
-    return Rig({**rig.cameras, **cameras}, links={n: v for n, v in rig.links.items() if not set(n) <= set(cameras)})
+    sizes = alpha_hw, beta_hw
+    x, y = (_unit(p.numpy(), hw) for p, hw in zip(matches, sizes))
+    A, B = (_from_unit(hw) for hw in sizes)
+    U, S, Vh = np.linalg.svd(B.T @ fit_fundamental(matches).numpy() @ A)
+
+    def unpacked(z: Array) -> tuple[Array, Array, Array]:
+        left, right = (Rotation.from_rotvec(v).as_matrix() for v in (z[:3], z[3:6]))
+        F = U @ left @ np.diag([1, S[1] / S[0] * (1 + z[6]), 0]) @ right @ Vh
+        return F, _bent(x, z[7:9]), _bent(y, z[9:11])
+
+    def residuals(z: Array) -> Array:
+        return _sampson(*unpacked(z)) * max(beta_hw) / 2
+
+    z = np.zeros(11)
+    for _ in range(ROUNDS):
+        scale = max(1.4826 * float(np.median(np.abs(residuals(z)))), LEAST_NOISE)
+        z = least_squares(residuals, z, loss="cauchy", f_scale=scale).x
+    F = np.linalg.inv(B).T @ unpacked(z)[0] @ np.linalg.inv(A)
+    return BentLink(torch.from_numpy(F), ((float(z[7]), float(z[8])), (float(z[9]), float(z[10]))), sizes)
 
 
-def _pair(matches: Matches, sizes: tuple[HW, HW], known: Camera | None) -> tuple[Camera, Camera]:
-    """Two cameras, the first at the origin; what is one pixel in the first is as many in the second as focal lengths
-    are to each other."""
-    firsts = [known.replace(cam_from_world=Pose.identity())] if known else [_camera(sizes[0], f) for f in GUESSES]
-    ratio = float(similarity(matches)[:2, :2].det().abs().sqrt())
-    tried = [(a, _posed(matches, a, _camera(sizes[1], ratio * float(a.K[0, 0]) / sizes[1][1]))) for a in firsts]
-    misfits = [_misfit(matches, *cameras) for cameras in tried]
-    return next(c for c, misfit in zip(tried, misfits) if misfit <= min(misfits) / BETTER)
+def _from_unit(hw: HW) -> Array:
+    """Pixels from coordinates about the middle in halves of the longer side."""
+    half = max(hw) / 2
+    return np.array([[half, 0, (hw[1] - 1) / 2], [0, half, (hw[0] - 1) / 2], [0, 0, 1]])
 
 
-def _camera(hw: HW, focal: float) -> Camera:
-    lens = Distortion("brown-conrady", torch.zeros(4, dtype=torch.float64))
-    K = intrinsics(focal * hw[1], hw).to(torch.float64)
-    return Camera(K=K, cam_from_world=Pose.identity(), hw=hw, distortion=lens)
+def _unit(x: Array, hw: HW) -> Array:
+    return (x - _from_unit(hw)[:2, 2]) / (max(hw) / 2)
 
 
-def _posed(matches: Matches, alpha: Camera, beta: Camera) -> Camera:
-    """Beta where the essential matrix of the matches has it, a unit away, most points in front."""
-    rays = [c.rays(x)[0] for c, x in zip((alpha, beta), matches)]
-    x, y = ((r[:, :2] / r[:, 2:]).numpy() for r in rays)
-    limit = 2.0 / float(beta.K[0, 0])
-    E, _ = cv2.findEssentialMat(x, y, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.999, threshold=limit)
-    if E is None or E.shape != (3, 3):
-        return beta.replace(cam_from_world=Pose(torch.eye(3).double(), torch.tensor([-1.0, 0, 0]).double()))
-    _, R, t, _ = cv2.recoverPose(E, x, y, np.eye(3))
-    return beta.replace(cam_from_world=Pose(torch.from_numpy(R), torch.from_numpy(t.reshape(3))))
+def _bent(q: Array, k: Array) -> Array:
+    square = (q**2).sum(1, keepdims=True)
+    return q * (1 + k[0] * square + k[1] * square**2)
 
 
-def _misfit(matches: Matches, alpha: Camera, beta: Camera) -> float:
-    pair = Rig({"a": alpha, "b": beta}).pair("a", "b")
-    return float(epipolar_residuals(pair, matches).sampson.detach().abs().median())
+def _straight(x: Array, hw: HW, k: tuple[float, float]) -> Array:
+    return _bent(_unit(x, hw), np.array(k)) * (max(hw) / 2) + _from_unit(hw)[:2, 2]
 
 
-def _depths(alpha: Camera, beta: Camera, matches: Matches) -> dict[tuple[float, float], float]:
-    """By alpha's points, which features of one picture share between pairs."""
-    found = triangulate([alpha, beta], torch.stack(list(matches)))
-    depth: Tensor = alpha.cam_from_world.apply(found.X)[:, 2]
-    kept = (found.valid & (depth > 0)).tolist()
-    places = [(float(x), float(y)) for x, y in matches.alpha.tolist()]
-    return {x: z for x, z, good in zip(places, depth.tolist(), kept) if good}
-
-
-def _scale(depth: Mapping[tuple[float, float], float], known: Mapping[tuple[float, float], float]) -> float:
-    """What brings depths to those known of the same points; of all points, if few are the same."""
-    if not known or not depth:
-        return 1.0
-    ratios = [known[x] / z for x, z in depth.items() if x in known]
-    if len(ratios) >= ENOUGH:
-        return float(np.median(ratios))
-    return float(np.median(list(known.values())) / np.median(list(depth.values())))
+def _sampson(F: Array, x: Array, y: Array) -> Array:
+    x, y = (np.c_[p, np.ones(len(p))] for p in (x, y))
+    there, back = x @ F.T, y @ F
+    return (y * there).sum(1) / np.sqrt((there[:, :2] ** 2).sum(1) + (back[:, :2] ** 2).sum(1))
