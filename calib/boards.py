@@ -14,6 +14,7 @@ Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the
 from __future__ import annotations
 
 import re
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -30,7 +31,7 @@ LARGEST = 100
 
 
 @dataclass(frozen=True)
-class Board:
+class Board(ABC):
     """A flat grid of points, `columns` x `rows` of them, `spacing` metres apart."""
 
     columns: int
@@ -60,13 +61,13 @@ class Board:
         return tuple(found)
 
     @property
+    @abstractmethod
     def extent(self) -> tuple[float, float]:
         """Width and height of what is printed without its margin, metres."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _draw(self, axes: Any) -> None:
         """Draw the board with its corner at (0, 0), in millimetres, y down."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

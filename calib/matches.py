@@ -17,6 +17,8 @@ from torch import Tensor
 from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
 from arraygeom.pixels import shift_matrix
 
+from .patches import sharpened
+
 RATIO = 0.75
 """The best match must be this much nearer than the second best (Lowe 2004, section 7.1)."""
 FEATURES = 6000
@@ -42,15 +44,24 @@ class Matches(NamedTuple):
 
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
-    """SIFT features of both pictures' luminance, contrast evened, that choose each other and pass the ratio test."""
-    return choose(detect(alpha), detect(beta))
+    """SIFT features of both pictures' luminance, contrast evened, that choose each other and pass the ratio test.
+
+    Where patches around them are alike, beta's are moved to where those fit best.
+    """
+    return _sharp(detect(alpha), detect(beta))
 
 
 class Features(NamedTuple):
-    """SIFT features of one picture: points (x, y) and their descriptors."""
+    """SIFT features of one picture: points (x, y), sizes (pixels) and directions (radians), their descriptors.
+
+    picture: its luminance, contrast evened, in which they were found.
+    """
 
     points: NDArray[np.float64]
+    sizes: NDArray[np.float64]
+    directions: NDArray[np.float64]
     descriptors: NDArray[np.float32]
+    picture: NDArray[np.uint8]
 
 
 def detect(picture: Float[Tensor, "_ h w"]) -> Features:
@@ -58,20 +69,30 @@ def detect(picture: Float[Tensor, "_ h w"]) -> Features:
     grey = rgb_to_grayscale(picture)[0] if picture.shape[0] == 3 else picture[0]
     even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
-    points, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
-    if not points:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32))
-    return Features(np.array([p.pt for p in points], np.float64), np.asarray(descriptors, np.float32))
+    found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
+    points = np.array([p.pt for p in found], np.float64).reshape(-1, 2)
+    sizes, angles = (np.array([getattr(p, name) for p in found], np.float64) for name in ("size", "angle"))
+    descriptors = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
+    return Features(points, sizes, np.radians(angles), descriptors, even)
 
 
-def choose(a: Features, b: Features) -> Matches:
-    """The features that choose each other and pass the ratio test."""
+def _chosen(a: Features, b: Features) -> tuple[list[int], list[int]]:
+    """The features, by their numbers in both, that choose each other and pass the ratio test."""
     if len(a.points) < 2 or len(b.points) < 2:
-        return Matches(*torch.zeros(2, 0, 2, dtype=torch.float64))
+        return [], []
     there, back = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
-    chosen = [(i, j) for i, j in there.items() if back.get(j) == i]
-    first, second = ([pair[k] for pair in chosen] for k in (0, 1))
-    return Matches(torch.from_numpy(a.points[first]), torch.from_numpy(b.points[second]))
+    pairs = [(i, j) for i, j in there.items() if back.get(j) == i]
+    return [i for i, _ in pairs], [j for _, j in pairs]
+
+
+def _sharp(a: Features, b: Features) -> Matches:
+    """Those features' points; beta's where patches around them fit best."""
+    i, j = _chosen(a, b)
+    ratio, turn = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
+    c, s = ratio * np.cos(turn), ratio * np.sin(turn)
+    maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
+    y = sharpened(a.picture, b.picture, a.points[i], b.points[j], maps)
+    return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y))
 
 
 def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:
@@ -99,10 +120,10 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
 
 def _agreeing(a: Features, b: Features, picture: Tensor) -> Matches:
     """Matches that some F puts within `AGREE` pixels of their lines; of the mirrored picture if those are more."""
-    straight = agreeing(choose(a, b))
+    straight = agreeing(_sharp(a, b))
     if len(straight.alpha) >= MANY:
         return straight
-    x, y = agreeing(choose(a, detect(picture.flip(-1))))
+    x, y = agreeing(_sharp(a, detect(picture.flip(-1))))
     mirrored = Matches(x, torch.stack([picture.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
     return max(straight, mirrored, key=lambda m: len(m.alpha))
 
@@ -157,7 +178,7 @@ def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) 
     kept = near_lines(near, fitted, within=3)
     if len(kept.alpha) < ENOUGH:
         raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
-    H = _similarity(kept)
+    H = similarity(kept)
     low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
     line = epipolar_lines(fitted, kept.alpha)
     shift = torch.stack([-line[:, 1], line[:, 0]], -1).mean(0) * (low + high) / 2
@@ -192,7 +213,7 @@ def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
     return torch.from_numpy(found)
 
 
-def _similarity(matches: Matches) -> Float[Tensor, "3 3"]:
+def similarity(matches: Matches) -> Float[Tensor, "3 3"]:
     """The similarity that most matches follow to 30 pixels of beta."""
     x, y = (points.numpy() for points in matches)
     found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)

@@ -14,9 +14,11 @@ from torch import Tensor
 from arraygeom import Camera, Link, Rig, rotation_from_vector
 from arraygeom.pixels import HW
 
+from .observability import NATURAL
+
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Standard deviations where none are stated: radians, a part of the longest baseline, a part of the focal length,
-pixels of the principal point, and a plain number."""
+pixels of the principal point, and a part of what coefficients of lenses usually are at most (`NATURAL`)."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
 AXES = {"rotation": "xyz", "translation": "xyz", "focal": "xy", "centre": "xy"}
 UNITS = {
@@ -102,6 +104,8 @@ def _unknown(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> U
     view = rig[camera]
     if kind == "focal" and isinstance(view, Camera):
         size = size * view.K[:2, :2].det().abs().sqrt()
+    if kind == "distortion" and isinstance(view, Camera) and view.distortion is not None:
+        size = size * torch.tensor(NATURAL[view.distortion.model][: len(size)], dtype=torch.float64)
     if kind == "translation":
         size = size * _longest_baseline(rig)
     unit, factor = UNITS.get(kind, ("", 1.0))

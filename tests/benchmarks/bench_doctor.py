@@ -1,6 +1,6 @@
 """How often `pat rig doctor` names the right mistake, over real rigs and pictures: a table of confusions.
 
-    python -m tests.benchmarks.bench_doctor --data ../shared/data --cases 10
+    python -m tests.benchmarks.bench_doctor --data ../shared/data --cases 10 --out tests/benchmarks/RESULTS_doctor.md
 
 A case is a real pair and a random mistake made with its rig or its pictures. One that is no more than the rig's own
 misfit is drawn again: where lines move by less than 0.1 px, or by less than 3 times what the rig was off before, a
@@ -23,6 +23,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Distortion, Pose, Rig, pixel_grid, sample
+from arraygeom.io.whole import write_text
 from calib.doctor import Diagnosis, diagnose_matches
 from calib.matches import match_cameras, seen_depths
 from calib.mistakes import (
@@ -245,9 +246,14 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", choices=list(MISTAKES), default=list(MISTAKES))
+    parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     cv2.setRNGSeed(options.seed)
-    print(confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only))
+    text = confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only)
+    print(text)
+    if options.out:
+        told = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their pictures."
+        write_text(options.out, f"# Which mistakes the doctor names\n\n{told}\n\n{text}")
 
 
 if __name__ == "__main__":

