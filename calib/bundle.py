@@ -9,7 +9,7 @@ and a residual r beyond k = 3 standard deviations by (k / r)^2, so that a gross 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -126,13 +126,32 @@ Free = Mapping[str, Bool[np.ndarray, "_"]]
 """By camera, which of its numbers may change, in the order of `parameter_names`."""
 
 
+class Expected(NamedTuple):
+    """What is thought of a camera's intrinsics before any picture: each number's mean, and the inverse covariance.
+
+    In the order of `parameter_names`; poses have no part in it.
+    """
+
+    mean: Float[np.ndarray, " p"]
+    information: Float[np.ndarray, "p p"]
+
+    def slope(self, camera: Camera) -> Float[np.ndarray, " p"]:
+        """By how much a step of each number lowers half the squared deviations."""
+        return self.information @ (self.mean - intrinsic_numbers(camera))
+
+    def loss(self, camera: Camera) -> float:
+        """Half the sum of the squared deviations."""
+        return float(self.slope(camera) @ (self.mean - intrinsic_numbers(camera))) / 2
+
+
 @dataclass(frozen=True)
 class Scene:
-    """Cameras, what they look at, and what they saw of it."""
+    """Cameras, what they look at, what they saw of it; and, by camera, what is expected of it, if anything."""
 
     cameras: Mapping[str, Camera]
     structure: Structure
     seen: Mapping[str, Observations]
+    expected: Mapping[str, Expected] = field(default_factory=dict)
 
     def residuals(self) -> dict[str, Float[np.ndarray, "_ 2"]]:
         """By camera: measured minus projected, pixels."""
@@ -168,28 +187,37 @@ def parameter_names(camera: Camera) -> list[str]:
     return [f"{key.removeprefix('.')}.{i}" for key, size in parameter_sizes(camera).items() for i in range(size)]
 
 
+def intrinsic_numbers(camera: Camera) -> Float[np.ndarray, " p"]:
+    """Their values, in the order of `parameter_names`; 0 for those of the pose."""
+    lens = () if camera.distortion is None else camera.distortion.coefficients.tolist()
+    K = camera.K.detach().numpy()
+    return np.array([*(0.0,) * 6, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens])
+
+
 def parameter_sizes(camera: Camera) -> dict[str, int]:
     """How many numbers each of a camera's parameters has, by the name it has in a rig with one camera called ""."""
     lens = {} if camera.distortion is None else {".distortion": camera.distortion.coefficients.shape[-1]}
     return {".rotation": 3, ".translation": 3, ".focal": 2, ".centre": 2} | lens
 
 
-def adjust(scene: Scene, free: Free, *, rounds: int = 4, iterations: int = 50) -> Fit:
+def adjust(scene: Scene, free: Free, *, rounds: int = 4, iterations: int = 50, alike: bool = False) -> Fit:
     """The scene in which free numbers of cameras and all blocks are such that the pixels fit best.
 
     First by least squares that take every residual seriously, as the start may be far off; then `rounds` times with
     the noise estimated for each camera from what is left. (Cameras weighed by their noise from the beginning would
-    give up on the one that starts worst.)
+    give up on the one that starts worst.) With `alike` all cameras have the same noise: where what they see moves
+    between their exposures, a camera with a noise of its own would draw every board to itself.
     """
     parameters = _count(free) + len(scene.structure) * scene.structure.width
     scene, done, converged = _minimise(
         scene, free, dict.fromkeys(scene.cameras, max(scene.rms(), QUIETEST)), iterations
     )
-    sigma = dict.fromkeys(scene.cameras, float(np.sqrt(np.mean(np.square(list(noise(scene, parameters).values()))))))
+    sigma = _pooled(noise(scene, parameters))
     for _ in range(rounds):
         scene, used, converged = _minimise(scene, free, sigma, iterations)
         done += used
         before, sigma = sigma, noise(scene, parameters)
+        sigma = _pooled(sigma) if alike else sigma
         if all(abs(np.log(sigma[name] / before[name])) < 1e-2 for name in sigma):
             break
     names = tuple(
@@ -199,6 +227,11 @@ def adjust(scene: Scene, free: Free, *, rounds: int = 4, iterations: int = 50) -
         if is_free
     )
     return Fit(scene, sigma, names, _covariance(scene, free, sigma), done, converged)
+
+
+def _pooled(sigma: Mapping[str, float]) -> dict[str, float]:
+    """The same for all cameras."""
+    return dict.fromkeys(sigma, float(np.sqrt(np.mean(np.square(list(sigma.values()))))))
 
 
 def noise(scene: Scene, parameters: int) -> dict[str, float]:
@@ -226,7 +259,7 @@ def _weights(lengths: Array) -> Array:
 
 def _loss(scene: Scene, sigma: Mapping[str, float]) -> float:
     """Sum over residuals of s in standard deviations: s^2 / 2 up to k, k^2 (1/2 + log(s / k)) beyond."""
-    total = 0.0
+    total = sum(expected.loss(scene.cameras[name]) for name, expected in scene.expected.items())
     for name, r in scene.residuals().items():
         s = np.linalg.norm(r, axis=-1) / sigma[name]
         far = np.maximum(s, ROBUST)
@@ -336,6 +369,9 @@ def normal_equations(scene: Scene, free: Free, sigma: Mapping[str, float]) -> No
         by_camera = by_camera[..., free[name]]
         H[mine, mine] = np.einsum("nip,niq->pq", by_camera, by_camera)
         g[mine] = np.einsum("nip,ni->p", by_camera, r)
+        if (expected := scene.expected.get(name)) is not None:
+            H[mine, mine] += expected.information[np.ix_(free[name], free[name])]
+            g[mine] += expected.slope(scene.cameras[name])[free[name]]
         block = scene.seen[name].block
         np.add.at(B, block, np.einsum("nid,nie->nde", by_block, by_block))
         np.add.at(h, block, np.einsum("nid,ni->nd", by_block, r))

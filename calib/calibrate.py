@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import NamedTuple
 
@@ -15,9 +15,19 @@ from arraygeom import Camera, Pose, Rig, epipolar_distance
 from arraygeom.pixels import map_homogeneous
 
 from .boards import Board
-from .bundle import BoardPoses, Fit, Observations, Scene, adjust, noise, parameter_names
+from .bundle import (
+    BoardPoses,
+    Expected,
+    Fit,
+    Observations,
+    Scene,
+    adjust,
+    intrinsic_numbers,
+    noise,
+    parameter_names,
+)
 from .intrinsics import Lens, Start, Views, calibrate_camera, check_tilts
-from .observability import gate
+from .observability import gate, usual
 from .photos import FrameKey
 from .poses import Seen, initial_rig
 
@@ -82,7 +92,7 @@ def calibrate(
         views=begin.views,
         alone={name: a.fit.scene.rms() for name, a in alone.items()},
         epipolar=epipolar_errors(rig, begin.views),
-        held_out=_held_out(cameras, begin.world_from_board, begin.views, board, together.free),
+        held_out=_held_out(cameras, begin.world_from_board, begin.views, board, together),
         notes=(*_pictures_left_out(views, alone, begin.left_out), *together.notes),
     )
 
@@ -126,13 +136,20 @@ def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conr
 
 
 class _Together(NamedTuple):
+    """All cameras' fit, what was free in it, notes, and whether cameras were taken to be alike in noise."""
+
     fit: Fit
     free: dict[str, np.ndarray]
     notes: list[str]
+    alike: bool = False
+
+    def again(self, scene: Scene) -> Fit:
+        """The same fit to other frames."""
+        return adjust(replace(scene, expected=self.fit.scene.expected), self.free, alike=self.alike)
 
 
 def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
-    """All cameras at once; if they fit far worse so than alone, only their poses.
+    """All cameras at once; if they fit far worse so than alone, with what each alone tells of its intrinsics.
 
     Boards that move between the exposures of cameras that are not synchronised would bend the lenses otherwise.
     """
@@ -143,12 +160,23 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     fit, free, notes = _fitted(scene)
     if not (doubts := _doubts(fit, alone)):
         return _Together(fit, free, notes)
-    posed = {name: _free(c, index > 0, lens=0) for index, (name, c) in enumerate(scene.cameras.items())}
-    for mask in posed.values():
-        mask[6:] = False
-    fit = adjust(scene, posed)
-    kept = "so each camera's intrinsics are those from its own pictures, and their uncertainty is not in the report's"
-    return _Together(fit, posed, [*(note for a in alone.values() for note in a.notes), f"{doubts}; {kept}"])
+    known = {name: _as_expected(name, a) for name, a in alone.items()}
+    free = {name: known[name].information.diagonal() > 0 for name in scene.cameras}
+    for index, mask in enumerate(free.values()):
+        mask[:6] = index > 0
+    fit = adjust(replace(scene, expected=known), free, alike=True)
+    kept = "so each camera's intrinsics are held to what its own pictures tell"
+    return _Together(fit, free, [*(note for a in alone.values() for note in a.notes), f"{doubts}; {kept}"], alike=True)
+
+
+def _as_expected(name: str, alone: Alone) -> Expected:
+    """What a camera's own pictures tell of its intrinsics; nothing of the numbers that were kept fixed."""
+    fit, entries = alone.fit, parameter_names(alone.camera)
+    told = [entries.index(entry.removeprefix(f"{name}.")) for entry in fit.names]
+    information = np.zeros((len(entries), len(entries)))
+    if fit.covariance is not None:
+        information[np.ix_(told, told)] = np.linalg.inv(fit.covariance)
+    return Expected(intrinsic_numbers(alone.camera), information)
 
 
 def epipolar_errors(rig: Rig, views: Mapping[str, Views]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
@@ -207,7 +235,7 @@ def _scene(
     index = {key: i for i, key in enumerate(boards)}
     poses = Pose(torch.stack([p.R for p in boards.values()]), torch.stack([p.t for p in boards.values()]))
     seen = {name: _observations(v, index, board) for name, v in views.items()}
-    return Scene(cameras, BoardPoses(poses), seen)
+    return Scene(cameras, BoardPoses(poses), seen, {name: usual(camera) for name, camera in cameras.items()})
 
 
 def _observations(views: Views, index: Mapping[FrameKey, int], board: Board) -> Observations:
@@ -242,7 +270,7 @@ def _held_out(
     boards: Mapping[FrameKey, Pose],
     views: Mapping[str, Views],
     board: Board,
-    free: Mapping[str, np.ndarray],
+    together: _Together,
 ) -> dict[tuple[str, str], np.ndarray]:
     """Epipolar errors on one frame in five for a rig made from the others; empty if there are too few."""
     shared = [key for key in boards if sum(key in v.seen for v in views.values()) > 1]
@@ -254,7 +282,7 @@ def _held_out(
     if any(len(v.seen) < 3 for v in used.values()):
         return {}
     scene = _scene(cameras, {k: p for k, p in boards.items() if k not in out}, used, board)
-    return epipolar_errors(Rig(adjust(scene, free).scene.cameras), kept)
+    return epipolar_errors(Rig(together.again(scene).scene.cameras), kept)
 
 
 def _pictures_left_out(

@@ -15,11 +15,14 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from .boards import Board, Charuco, Chessboard, Circles, marker_dictionary
+from .corners import refine_corners
 
 Grey = UInt8[np.ndarray, "h w"]
 
 FEWEST = 8
 """Fewer points of a board than this in a picture are not used: a pose needs 4, a check of it more."""
+ENOUGH = 0.6
+"""If less than this share of a board's corners look like corners, the picture is not fit for fitting them."""
 CROOKED = 0.35
 """A board is refused if its points are this far (of their spacing) from a smoothly bent grid: a false detection."""
 SMALL = 640
@@ -38,8 +41,9 @@ def detect(grey: Grey, board: Board) -> Detection | None:
     """The board's points in a grey picture (uint8), or None if it is not found."""
     for candidate in _versions(grey):
         found = _FINDERS[type(board)](candidate, board)
-        if found is not None and len(found.ids) >= FEWEST and _spans_a_plane(found, board) and _smooth(found, board):
-            return found
+        if found is not None and _believable(found, board):
+            refined = _refined(grey, found, board)
+            return refined if _believable(refined, board) else found
     return None
 
 
@@ -88,22 +92,13 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
     if not done or len(corners) != len(board.points):
         return None
     x = _right_handed(corners.reshape(board.rows, board.columns, 2))
-    return Detection(np.arange(len(x)), _refined(grey, x))
+    return Detection(np.arange(len(x)), x.astype(np.float64))
 
 
 def _right_handed(grid: np.ndarray) -> np.ndarray:
     """The corners numbered so that x, y and the view into the board are a right-handed frame."""
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
-
-
-def _refined(grey: Grey, x: np.ndarray, reach: float = 0.3) -> np.ndarray:
-    """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
-    apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(reach * np.quantile(apart, 0.1), 2, 11))
-    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
-    refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
-    return refined.reshape(-1, 2).astype(np.float64)
 
 
 def _charuco(grey: Grey, board: Charuco) -> Detection | None:
@@ -113,8 +108,7 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
     corners, ids, _, _ = detector.detectBoard(grey)
     if ids is None or len(ids) < FEWEST:
         return None
-    gap = (1 - board.marker / board.spacing) / 2  # nothing but the crossing may be in the window
-    return Detection(ids.reshape(-1).astype(np.int64), _refined(grey, corners.reshape(-1, 2), 0.9 * gap))
+    return Detection(ids.reshape(-1).astype(np.int64), corners.reshape(-1, 2).astype(np.float64))
 
 
 def _circles(grey: Grey, board: Circles) -> Detection | None:
@@ -132,6 +126,36 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
     Charuco: _charuco,
     Circles: _circles,
 }
+
+
+def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
+    """Corners where they are to a hundredth of a pixel; of boards that may be seen in part, without those that hide.
+
+    Where few look as corners should, as in pictures too small for it, all are taken where gradients say.
+    """
+    if isinstance(board, Circles):
+        return found
+    clear = (1 - board.marker / board.spacing) / 2 if isinstance(board, Charuco) else 0.5
+    x, good = refine_corners(grey, found.x, board.points[found.ids, :2] / board.spacing, clear=clear)
+    if good.mean() < ENOUGH:
+        return Detection(found.ids, _by_gradients(grey, found.x, 0.9 * clear))
+    if isinstance(board, Charuco):
+        return Detection(found.ids[good], x[good])
+    return Detection(found.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
+
+
+def _by_gradients(grey: Grey, x: np.ndarray, reach: float) -> np.ndarray:
+    """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
+    apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
+    half = int(np.clip(reach * np.quantile(apart, 0.1), 2, 11))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
+    return refined.reshape(-1, 2).astype(np.float64)
+
+
+def _believable(found: Detection, board: Board) -> bool:
+    """Whether there are enough points, not on one line, and on a smoothly bent grid."""
+    return len(found.ids) >= FEWEST and _spans_a_plane(found, board) and _smooth(found, board)
 
 
 def _spans_a_plane(found: Detection, board: Board) -> bool:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
 from arraygeom import Camera
 
-from .bundle import Free, Scene, normal_equations, parameter_names
+from .bundle import Expected, Free, Scene, intrinsic_numbers, normal_equations, parameter_names
 
 NATURAL = {
     "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
@@ -21,6 +23,8 @@ LENS_TERMS = {
 """What the coefficients are called, in their order."""
 NATURAL_FOCAL, NATURAL_CENTRE = 0.1, 0.1
 """The same for the error of a guessed focal length, as a share of it, and of the principal point, of the width."""
+USUAL_CENTRE, USUAL_ASPECT = 0.03, 0.01
+"""Cameras tend to have the principal point so near to the middle (as a share of the width), and pixels so square."""
 UNTOLD = 0.5
 """A number whose deviation, all others unknown, stays above this share of its natural size is not told."""
 
@@ -31,6 +35,23 @@ def natural_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     lens = camera.distortion
     coefficients = () if lens is None else NATURAL[lens.model][: len(lens.coefficients)]
     return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [NATURAL_CENTRE * camera.hw[1]] * 2 + [*coefficients])
+
+
+def usual(camera: Camera) -> Expected:
+    """What cameras are like: square pixels, the principal point about the middle, a lens that does not bend wildly.
+
+    Next to nothing where boards were seen at many places and tilts; where they were not, it keeps a camera plausible.
+    """
+    h, w = camera.hw
+    mean = np.zeros(len(intrinsic_numbers(camera)))
+    mean[8:10] = (w - 1) / 2, (h - 1) / 2
+    deviation = natural_sizes(camera)
+    deviation[8:10] = USUAL_CENTRE * w
+    information = np.diag(deviation**-2.0)
+    information[:8, :8] = 0.0
+    focal = camera.K[:2, :2].det().abs().sqrt().item()
+    information[6:8, 6:8] = np.array([[1, -1], [-1, 1]]) / (USUAL_ASPECT * focal) ** 2
+    return Expected(mean, information)
 
 
 def gate(
@@ -65,7 +86,8 @@ def gate(
 def _relative_information(scene: Scene, free: Free, sigma: dict[str, float]) -> np.ndarray:
     """The inverse covariance of the free numbers in units of their natural sizes."""
     sizes = np.concatenate([natural_sizes(camera)[free[name]] for name, camera in scene.cameras.items()])
-    return normal_equations(scene, free, sigma).information() * sizes[:, None] * sizes
+    told = normal_equations(replace(scene, expected={}), free, sigma).information()
+    return told * sizes[:, None] * sizes
 
 
 def _worst(places: list[tuple[str, int]], information: np.ndarray) -> int | None:
@@ -89,7 +111,7 @@ def _plain(scene: Scene, name: str, entry: str) -> Scene:
         coefficients = camera.distortion.coefficients.clone()
         coefficients[int(index)] = 0.0
         camera = camera.replace(distortion=type(camera.distortion)(camera.distortion.model, coefficients))
-    return Scene({**scene.cameras, name: camera}, scene.structure, scene.seen)
+    return replace(scene, cameras={**scene.cameras, name: camera})
 
 
 def _described(camera: Camera, entry: str) -> str:

@@ -18,10 +18,10 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
-from arraygeom.sampling import sample
+from arraygeom.sampling import on_picture, sample
 
 from . import consensus_kernels as kernels
 from .threads import in_parallel
@@ -39,11 +39,16 @@ DOUBT = 0.25
 """Trust in a match on which the two views do not agree, before the likeness."""
 REACH_FILL = (50.0, 4.0)
 """Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
-COLOUR_FILLS = ((300.0, 3.0), (1000.0, 20.0))
-"""The same of colour: over what is smoothly connected, and over texture."""
+COLOUR_FILL = (300.0, 3.0)
+"""The same of colour."""
 FLOOR = 1e-3
-"""Regulariser (variance of brightness) of the regression of colour on brightness."""
-FILLS = len(COLOUR_FILLS)
+"""Regulariser (variance of brightness) of the regression of colour on brightness where colour is spread."""
+FILLS = 2
+"""Ways in which colour is spread: along its regression on brightness, and as it is."""
+DETAIL_RADIUS, DETAIL_FLOOR = 3, 3e-3
+"""Window and regulariser of the regression that gives matched colour the detail that beta lost."""
+BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
+"""Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
 
 
 class Consensus(NamedTuple):
@@ -53,23 +58,25 @@ class Consensus(NamedTuple):
         not trusted, spread from where it is.
     facts: (B, 3, H / 2, W / 2), how far a look back from beta disagrees, by how much the match is better than
         others, and its cost; each 0 to 1.
-    colour: (B, fills, C, H, W), beta's bands minus alpha, from pixels with trust spread to those without, once for
-        each of `COLOUR_FILLS`.
+    matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
+    colour: (B, fills, C, H, W), the same from pixels with trust spread to those without.
     """
 
     reach: Tensor
     facts: Tensor
+    matched: Tensor
     colour: Tensor
 
     def cut(self, box: tuple[int, int, int, int]) -> Consensus:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
-        return Consensus(self.reach[half], self.facts[half], self.colour[..., top:bottom, left:right])
+        whole = (..., slice(top, bottom), slice(left, right))
+        return Consensus(self.reach[half], self.facts[half], self.matched[whole], self.colour[whole])
 
     def band(self, i: int) -> Consensus:
         """The same of one band alone."""
-        return self._replace(colour=self.colour[:, :, i : i + 1])
+        return self._replace(matched=self.matched[:, i : i + 1], colour=self.colour[:, :, i : i + 1])
 
 
 class _Geometry(NamedTuple):
@@ -95,19 +102,16 @@ def consensus(
     same whatever their number.
     """
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    other = levelled(other, own)
+    own, other = equally_sharp(own, levelled(other, own))
     geometry = _geometry(blocks, len(alpha))
     reach, facts = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (facts[..., 0] < CONSISTENT).astype(np.float32)
-    planes = zip(reach, consistent, _bytes(own))
+    planes = zip(reach, consistent, _bytes(avg_pool2d(alpha, FINE)))
     spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
-    reach = np.where(consistent > 0, reach, spread)
-    found = Consensus(
-        FINE * torch.from_numpy(reach)[:, None].to(alpha),
-        torch.from_numpy(facts).movedim(-1, 1).to(alpha),
-        alpha.new_empty(0),
-    )
-    return found._replace(colour=_spread_colour(alpha, guide, beta, segments, found))
+    reach = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, reach, spread)])
+    reach = FINE * torch.from_numpy(reach)[:, None].to(alpha)
+    facts = torch.from_numpy(facts).movedim(-1, 1).to(alpha)
+    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts))
 
 
 def levelled(picture: Float[Tensor, "b 1 hb wb"], like: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 hb wb"]:
@@ -168,22 +172,76 @@ def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray
     reach[inner], facts[inner] = r[inside], f[inside]
 
 
-def _spread_colour(alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, found: Consensus) -> Tensor:
-    """Beta's bands minus alpha at the matches, spread by trust over what is connected in alpha."""
-    position = _position(segments, found.reach).reshape(len(beta), -1, 2)
-    seen = sample(torch.cat([beta, levelled(guide, alpha)], 1), position.to(beta))
-    bands, brightness = seen.values.reshape(len(beta), -1, *alpha.shape[-2:]).split([beta.shape[1], 1], 1)
-    unlike = avg_pool2d((brightness - alpha).abs(), 3, 1, 1, count_include_pad=False)
-    agreed = _enlarged(torch.where(found.facts[:, :1] < CONSISTENT, 1.0, DOUBT))
-    trust = agreed * seen.valid.reshape(unlike.shape) * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
-    planes = list(zip(_numpy(bands - alpha), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
-    filled = np.zeros((len(planes), FILLS, *bands.shape[1:]), np.float32)
+def equally_sharp(
+    picture: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
+) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 hb wb"]]:
+    """Both, the sharper one blurred until it is as sharp as the other: details that only one has cannot be matched.
 
-    def fill(picture: int, how: int) -> None:
-        filled[picture, how] = _regressed(*planes[picture], COLOUR_FILLS[how])
+    Sharpness is the mean difference of neighbouring pixels.
+    """
+    return _no_sharper(picture, other), _no_sharper(other, picture)
 
-    in_parallel([partial(fill, i, j) for i in range(len(planes)) for j in range(FILLS)])
-    return torch.from_numpy(filled).to(alpha)
+
+def _no_sharper(picture: Tensor, than: Tensor) -> Tensor:
+    return torch.cat([_blurred_to(p[None], float(_contrast(t))) for p, t in zip(picture, than)])
+
+
+def _blurred_to(picture: Tensor, contrast: float) -> Tensor:
+    """The least blurred of `BLURS` that has no more contrast; the picture itself if it has hardly more."""
+    blurred = picture
+    for blur in BLURS:
+        if float(_contrast(blurred[0])) <= 1.05 * contrast:
+            break
+        blurred = torch.from_numpy(cv2.GaussianBlur(_numpy(picture[0, 0]), (0, 0), blur))[None, None].to(picture)
+    return blurred
+
+
+def _contrast(picture: Float[Tensor, "1 h w"]) -> Tensor:
+    return picture.diff(dim=-1).abs().mean() + picture.diff(dim=-2).abs().mean()
+
+
+def _colours(
+    alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
+    hw, bands = alpha.shape[-2:], beta.shape[1]
+    position = matches(segments, reach).reshape(len(beta), -1, 2).to(beta)
+    valid = on_picture(position, (beta.shape[-2], beta.shape[-1])).reshape(-1, 1, *hw)
+    level = levelled(guide, alpha)
+    inside = position.clamp(min=0).minimum(position.new_tensor([beta.shape[-1] - 1, beta.shape[-2] - 1]))
+    seen = sample(torch.cat([beta, guide, level], 1), inside, interpolation="bicubic").values
+    values, own, brightness = seen.reshape(len(beta), -1, *hw).split([bands, 1, 1], 1)
+    matched = _detailed(values - own, brightness, alpha) + own - alpha
+    unlike = avg_pool2d((brightness - _no_sharper(alpha, level)).abs(), 3, 1, 1, count_include_pad=False)
+    agreed = _enlarged(torch.where(facts[:, :1] < CONSISTENT, 1.0, DOUBT))
+    trust = agreed * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
+    spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
+
+    def along_brightness(i: int) -> None:
+        spread[i, 0] = _regressed(*planes[i], COLOUR_FILL)
+
+    def as_it_is(i: int) -> None:
+        colour, _, weight, like = planes[i]
+        spread[i, 1] = _filled(colour, weight, like, COLOUR_FILL)
+
+    in_parallel([partial(how, i) for i in range(len(planes)) for how in (along_brightness, as_it_is)])
+    return matched, torch.from_numpy(spread).to(alpha)
+
+
+def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
+    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it.
+
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution.
+    """
+
+    def mean(x: Tensor) -> Tensor:
+        return avg_pool2d(x, 2 * DETAIL_RADIUS + 1, 1, DETAIL_RADIUS, count_include_pad=False)
+
+    middle = mean(brightness)
+    variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
+    slope = (mean(colour * brightness) - mean(colour) * middle) / (variance + DETAIL_FLOOR)
+    return colour + slope * (alpha - brightness).clamp(-0.2, 0.2)
 
 
 def _regressed(
@@ -200,11 +258,12 @@ def _regressed(
     return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
 
 
-def _position(segments: Segments, reach: Tensor) -> Tensor:
-    """The matches of all alpha pixels (B, H, W, 2), in beta's pixels."""
+def matches(segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `reach` from the ends, beta's pixels."""
     length = segments.length
     along = (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
-    return segments.end + _enlarged(reach)[:, 0, ..., None] * along
+    far = interpolate(reach, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
+    return segments.end + far.clamp(min=0).minimum(length)[..., None] * along
 
 
 def _enlarged(x: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 
 from .attention import Attended, attend, attend_with_statistics
 from .blocks import ResidualBlock, conv, enlarge
-from .consensus import FILLS, FINE, Consensus, consensus
+from .consensus import FILLS, FINE, Consensus, consensus, matches
 from .images import luminance
 from .model import Fused, Look, Looks
 
@@ -58,7 +58,7 @@ class GuidedPATConfig:
 class Seen(NamedTuple):
     """What one beta tells of alpha's view.
 
-    colour: (B, C, H, W), its bands minus alpha, where attention found them.
+    colour: (B, C, H, W), its bands minus alpha, where attention and the consensus found them, mixed.
     spread: (B, fills, C, H, W), the same spread by the consensus from pixels with trust.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
     choice: (B, 1 + fills, H, W), logits of taking, where it is not, what is carried within alpha or each `spread`.
@@ -163,12 +163,14 @@ class GuidedPAT(nn.Module):
         found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
         value = found.value.to(alpha)
         facts = torch.cat([_guide(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
-        logit, choice = self._judged(own, known, facts, segments.valid[:, None]).split([1, 1 + FILLS], 1)
+        judged = self._judged(own, known, facts, segments.valid[:, None])
+        logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
-        return Seen(found, value - alpha, known.colour, logit, choice)
+        colour = torch.lerp(value - alpha, known.matched, exact.sigmoid())
+        return Seen(found, colour, known.colour, logit, choice)
 
     def _judged(self, own: Encoded, known: Consensus, facts: Tensor, valid: Tensor) -> Tensor:
-        """Logits (B, 2 + fills, H, W) of the confidence and of the choices."""
+        """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the consensus's match."""
         agreed = torch.cat([known.reach / 64, known.facts], 1)
         told = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(agreed, 2), avg_pool2d(told, COARSE)], 1)
@@ -195,13 +197,13 @@ def hw_of(picture: Tensor) -> tuple[int, int]:
 
 
 class Trust(nn.Sequential):
-    """The logits of confidence and choices at full size, worked out at half of it."""
+    """The logits of confidence, choices and the better match at full size, worked out at half of it."""
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__(
             conv(inputs, width),
             ResidualBlock(width),
-            nn.Conv2d(width, 4 * (2 + FILLS), 3, padding=1),
+            nn.Conv2d(width, 4 * (3 + FILLS), 3, padding=1),
             nn.PixelShuffle(2),
         )
 
@@ -233,11 +235,8 @@ class Carry(nn.Module):
 
 def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
     """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `reach` from their end."""
-    length = segments.length
-    reach = reach[:, 0].repeat_interleave(FINE, -1).repeat_interleave(FINE, -2).to(length)
-    along = _along(segments)
-    middle = segments.end + reach.clamp(min=0).minimum(length)[..., None] * along
-    return Segments(middle + window * along, middle - window * along, segments.valid.expand(reach.shape))
+    middle, along = matches(segments, reach), _along(segments)
+    return Segments(middle + window * along, middle - window * along, segments.valid.expand(middle.shape[:-1]))
 
 
 def _segments(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:

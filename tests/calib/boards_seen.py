@@ -1,13 +1,10 @@
-"""Arrays of cameras with known truth, and what they see of a board: corners by projection, pictures by warping."""
+"""Arrays of cameras with known truth, and what they see of a board: corners by projection."""
 
-from functools import cache
-
-import cv2
 import numpy as np
 import torch
 
-from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, pixel_grid, rotation_from_vector
-from calib.boards import Board, Circles, draw_board, parse_board
+from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
+from calib.boards import Board, parse_board
 from calib.bundle import BoardPoses, Observations, Scene, parameter_names
 from calib.detect import Detection
 from calib.intrinsics import Views
@@ -80,43 +77,6 @@ def scene_of(rig, boards, views, board: Board = BOARD) -> Scene:
         parts = [(np.full(len(d.ids), frame), board.points[d.ids], d.x) for frame, d in v.seen.items()]
         seen[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
     return Scene(dict(rig.cameras), BoardPoses(boards), seen)
-
-
-def photograph(camera, cam_from_board: Pose, board: Board = BOARD, *, dpi=160, background=90, rays=None) -> np.ndarray:
-    """The picture (h, w) uint8 that a camera takes of a printed board, through its lens, twice oversampled."""
-    print_, per_metre, origin = printed(board, dpi)
-    directions, valid = fine_rays(camera) if rays is None else rays
-    hw = 2 * camera.hw[0], 2 * camera.hw[1]
-    R, t = cam_from_board.R, cam_from_board.t
-    distance = (R[:, 2] @ t) / (directions @ R[:, 2])
-    on_board = (directions * distance[:, None] - t) @ R
-    on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*hw, 2)
-    on_print[~valid.reshape(hw).numpy()] = -1
-    picture = cv2.remap(print_, on_print, None, cv2.INTER_LINEAR, borderValue=background)
-    return cv2.resize(picture, camera.hw[::-1], interpolation=cv2.INTER_AREA)
-
-
-def fine_rays(camera):
-    """The rays of a camera's pixels at twice its size, for photographs of many boards."""
-    fine = camera.resize((2 * camera.hw[0], 2 * camera.hw[1]))
-    return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
-
-
-@cache
-def printed(board: Board, dpi: int) -> tuple[np.ndarray, float, np.ndarray]:
-    """The board as it comes out of a printer: pixels, pixels a metre, the pixel of its first point."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
-    figure = draw_board(board, margin=0.012)
-    canvas = FigureCanvasAgg(figure)
-    figure.set_dpi(dpi)
-    canvas.draw()
-    grey = np.asarray(canvas.buffer_rgba())[..., 0]
-    per_metre = dpi / 0.0254
-    first = board.radius if isinstance(board, Circles) else board.spacing
-    origin = np.full(2, (0.012 + first) * per_metre - 0.5)
-    origin[1] += len(grey) - figure.get_size_inches()[1] * dpi  # the canvas is cut to whole pixels at its top
-    return np.ascontiguousarray(grey), per_metre, origin
 
 
 def errors_of(fit, rig):

@@ -7,8 +7,8 @@ import pytest
 
 from calib.boards import Charuco, draw_board, parse_board
 from calib.detect import detect
+from calib.rehearsal import printed
 from calib.run import write_board
-from tests.calib.boards_seen import printed
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import torch
 from arraygeom import Pose, rotation_from_vector
 from calib.boards import parse_board
 from calib.detect import detect, explain, other_size, to_grey
-from tests.calib.boards_seen import camera, photograph, tensor
+from calib.rehearsal import photograph
+from tests.calib.boards_seen import camera, tensor
 
 CAMERA = camera(700.0, (480, 640), lens=(-0.3, 0.1, 0.001, -0.001, 0.0))
 

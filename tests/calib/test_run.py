@@ -11,8 +11,9 @@ from arraygeom.io import read_rig
 from calib.boards import parse_board
 from calib.calibrate import calibrate, fit_alone
 from calib.collect import collect_folder
+from calib.rehearsal import fine_rays, photograph
 from pat.cli import main
-from tests.calib.boards_seen import board_poses, camera, errors_of, fine_rays, four_cameras, photograph, pose_errors
+from tests.calib.boards_seen import board_poses, camera, errors_of, four_cameras, pose_errors
 
 BOARD = "charuco:9x7:60mm"
 
@@ -145,7 +146,7 @@ def test_photographs_of_four_cameras(tmp_path):
         rays = fine_rays(c)
         for i in range(16):
             pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
-            picture = photograph(c, pose, dpi=100, rays=rays) + random.normal(0, 2, c.hw)
+            picture = photograph(c, pose, parse_board(BOARD), dpi=100, rays=rays) + random.normal(0, 2, c.hw)
             cv2.imwrite(str(tmp_path / name / f"{i}.png"), picture.clip(0, 255).round().astype(np.uint8))
     found = collect_folder(tmp_path, parse_board(BOARD))
     result = calibrate({name: found.views[name] for name in rig.names}, parse_board(BOARD))

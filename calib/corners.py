@@ -1,0 +1,202 @@
+"""Where chessboard corners are, to a hundredth of a pixel: the corner as it should look, laid over the picture.
+
+Four squares meet in a corner: grey is a + b S(d) S(e) with d, e the distances in pixels from the two edges, S the step
+from -1 to 1 blurred by a Gaussian. Position, levels and blur of each corner are fitted by least squares to the pixels
+beside its edges (Gauss-Newton); the edges' directions and how a lens bends them come from a smooth map of the whole
+board, as all its corners tell it. The pixels looked at are symmetric about the corner, so that gamma, glare and ink
+that spreads, which move every edge towards one colour, move no corner.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+from scipy.special import erf
+
+LONGEST = 12.0
+"""Edges are looked at up to so many pixels from their corner: bent by a lens, they are parabolas no further."""
+SHORTEST = 2.5
+"""Corners whose edges can be seen over fewer pixels than this are left where they are."""
+WIDEST = 5.0
+"""So many pixels to either side of an edge are looked at, at most."""
+THINNEST = 0.7
+"""And so many at least."""
+BLEED = 0.7
+"""The blur of what is beyond the corner's own squares reaches so many pixels into them."""
+STEPS = 12
+SETTLED = 1e-3
+"""Steps below this, in pixels, end the search."""
+BLUR = 0.4, 3.0
+"""Least and most standard deviation of the blur, pixels."""
+PASSES = 2
+"""The map of the board is made again from better corners."""
+FEWEST = 8
+"""With fewer corners there is no telling where the others should be."""
+MISFIT = 0.4
+"""A corner that looks this different from a corner (root mean square, in parts of its contrast) is none."""
+MOVED = 0.5
+"""A corner this far (of the reach of its edges) from where its neighbours expect it is none."""
+
+Array = np.ndarray
+Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
+
+
+class Shape(NamedTuple):
+    """The two edges through each corner: unit normals (pixels), and how they bend along themselves.
+
+    along: the direction of each edge, pixels a square; normal: across it, towards the next square; bend: how many
+    pixels along the normal the edge leaves its tangent per square pixel.
+    """
+
+    along: Float[np.ndarray, "n 2 2"]
+    normal: Float[np.ndarray, "n 2 2"]
+    bend: Float[np.ndarray, "n 2"]
+
+
+def refine_corners(
+    grey: UInt8[np.ndarray, "h w"], x: Float[np.ndarray, "n 2"], p: Float[np.ndarray, "n 2"], *, clear: float = 0.5
+) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
+    """Corners at about `x` where the picture has them, and which of them look like corners at all.
+
+    `p` is their place on the board, in squares; nothing but the corner's own squares is nearer to its edges than
+    `clear` squares.
+    """
+    found, good = x, np.ones(len(x), dtype=bool)
+    for _ in range(PASSES):
+        if good.sum() < FEWEST:
+            break
+        board = smooth_map(p, found, good)
+        shape = _shape(board, p)
+        found, good = _fitted(grey.astype(np.float32), board(p), shape, clear)
+    return np.where(good[:, None], found, x), good
+
+
+def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: Bool[np.ndarray, " n"]) -> Map:
+    """From the board to the picture: a homography and on top of it a polynomial, of degree 3 if the points allow.
+
+    Points that are far off the others' map have no say.
+    """
+    middle, size = p[good].mean(0), max(float(np.abs(p[good] - p[good].mean(0)).max()), 1e-9)
+    H, kept = cv2.findHomography(p[good], x[good], cv2.RANSAC, 3.0)
+    weight = kept[:, 0].astype(float) if kept.mean() > 0.5 else np.ones(int(good.sum()))
+    degree = 3 if good.sum() >= 30 else 1 if good.sum() >= 12 else 0
+    flat = cv2.perspectiveTransform(p[good][:, None], H)[:, 0]
+    basis = _powers((p[good] - middle) / size, degree)
+    for _ in range(4):
+        bend = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * (x[good] - flat), rcond=None)[0]
+        off = np.linalg.norm(x[good] - flat - basis @ bend, axis=-1)
+        weight = 1 / (1 + (off / max(3 * float(np.median(off)), 1e-3)) ** 2)
+    return lambda q: cv2.perspectiveTransform(q[:, None], H)[:, 0] + _powers((q - middle) / size, degree) @ bend
+
+
+def _powers(q: Array, degree: int) -> Array:
+    u, v = q.T
+    return np.stack([u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
+
+
+def _shape(board: Map, p: Array) -> Shape:
+    """Of the edges along the board's y (first) and x (second), by differences over a quarter of a square."""
+    step, middle = 0.25, board(p)
+    ends = [[board(p + s * step * np.eye(2)[axis]) for s in (1, -1)] for axis in (1, 0)]
+    along = np.stack([(a - b) / (2 * step) for a, b in ends], 1)
+    curve = np.stack([(a + b - 2 * middle) / step**2 for a, b in ends], 1)
+    length = np.linalg.norm(along, axis=-1)
+    normal = np.stack([along[..., 1], -along[..., 0]], -1) / length[..., None]
+    normal *= np.sign((normal * along[:, ::-1]).sum(-1, keepdims=True))
+    return Shape(along, normal, (curve * normal).sum(-1) / 2 / length**2)
+
+
+def _fitted(grey: Array, start: Array, shape: Shape, clear: float) -> tuple[Array, Array]:
+    """Corners from their expected places on."""
+    h, w = grey.shape
+    length = np.linalg.norm(shape.along, axis=-1).min(1)
+    inside = np.minimum(np.minimum(start[:, 0], w - 1 - start[:, 0]), np.minimum(start[:, 1], h - 1 - start[:, 1]))
+    reach = np.minimum(np.minimum(0.45 * length, LONGEST), inside - 1)
+    sine = np.abs(np.linalg.det(shape.normal))
+    width = np.minimum(clear * length * sine - BLEED, WIDEST)
+    usable = (reach >= SHORTEST) & (width >= THINNEST) & (sine > 0.2)
+    found, good = start.copy(), np.zeros(len(start), dtype=bool)
+    if usable.any():
+        part = Shape(*(v[usable] for v in shape))
+        at, misfit = _least_squares(grey, start[usable], part, reach[usable], width[usable])
+        near = np.linalg.norm(at - start[usable], axis=-1) < MOVED * reach[usable]
+        found[usable], good[usable] = at, near & (misfit < MISFIT)
+    return found, good
+
+
+class Look(NamedTuple):
+    """Corners as they are taken to look: place, mean grey, contrast (signed), blur; one row each."""
+
+    x: Float[np.ndarray, "n 2"]
+    level: Float[np.ndarray, "n 1"]
+    contrast: Float[np.ndarray, "n 1"]
+    blur: Float[np.ndarray, "n 1"]
+
+    def changed(self, step: Float[np.ndarray, "n 5"]) -> Look:
+        """After a step: at most a pixel, and by a factor of the blur between 0.6 and 1.6."""
+        blur = (self.blur * np.exp(step[:, 4:].clip(-0.5, 0.5))).clip(*BLUR)
+        return Look(self.x + step[:, :2].clip(-1, 1), self.level + step[:, 2:3], self.contrast + step[:, 3:4], blur)
+
+
+def _least_squares(grey: Array, start: Array, shape: Shape, reach: Array, width: Array) -> tuple[Array, Array]:
+    """Gauss-Newton on all corners at once: their places, and what is left (root mean square) in contrasts."""
+    pixels = _around(start, reach)
+    values = grey[pixels[..., 1].clip(0, grey.shape[0] - 1), pixels[..., 0].clip(0, grey.shape[1] - 1)]
+    look = _first_look(values, pixels, Look(start, *np.ones((3, len(start), 1))), shape, reach, width)
+    for _ in range(STEPS):
+        root, left, J = _linearised(values, pixels, look, shape, reach, width)
+        J *= root[..., None]
+        A = J.swapaxes(1, 2) @ J
+        A += 1e-6 * np.eye(5) * (np.trace(A, axis1=1, axis2=2)[:, None, None] / 5 + 1e-9)
+        step = np.linalg.solve(A, J.swapaxes(1, 2) @ (root * left)[..., None])[..., 0]
+        look = look.changed(step)
+        if np.abs(step[:, :2]).max() < SETTLED:
+            break
+    misfit = np.sqrt(((root * left) ** 2).sum(1) / (root**2).sum(1).clip(1e-9))
+    return look.x, misfit / np.abs(look.contrast[:, 0]).clip(1e-9)
+
+
+def _around(x: Array, reach: Array) -> Array:
+    """The pixels (n, m, 2) of a square about each corner."""
+    half = int(np.ceil(reach.max()))
+    row = np.arange(-half, half + 1)
+    return np.rint(x).astype(int)[:, None] + np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
+
+
+def _first_look(values: Array, pixels: Array, look: Look, shape: Shape, reach: Array, width: Array) -> Look:
+    """With the level and the contrast that fit at the places given."""
+    root, d, e = _distances(pixels - look.x[:, None], shape, reach, width)
+    pattern, weight = erf(d) * erf(e), root**2
+    level = np.average(values, weights=weight + 1e-9, axis=1)[:, None]
+    contrast = (weight * pattern * (values - level)).sum(1) / (weight * pattern**2).sum(1).clip(1e-9)
+    return look._replace(level=level, contrast=contrast[:, None])
+
+
+def _linearised(
+    values: Array, pixels: Array, look: Look, shape: Shape, reach: Array, width: Array
+) -> tuple[Array, Array, Array]:
+    """Roots of the weights (n, m), what is left of the values (n, m), derivatives by a step (n, m, 5)."""
+    root, d, e = _distances(pixels - look.x[:, None], shape, reach, width)
+    _, _, b, blur = look
+    S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
+    by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))
+    by_d, by_e = by_d * T, by_e * S
+    by_x = [-(by_d * shape.normal[:, :1, k] + by_e * shape.normal[:, 1:, k]) for k in (0, 1)]
+    J = np.stack([*by_x, np.ones_like(d), S * T, -(by_d * d + by_e * e)], -1)
+    return root, values - look.level - b * S * T, J
+
+
+def _distances(offset: Array, shape: Shape, reach: Array, width: Array) -> tuple[Array, Array, Array]:
+    """The root of how much each pixel counts, and its distances from the first and the second edge."""
+    unit = shape.along / np.linalg.norm(shape.along, axis=-1, keepdims=True)
+    straight = np.einsum("npk,njk->npj", offset, shape.normal)
+    run = np.einsum("npk,njk->npj", offset, unit)
+    d, e = np.moveaxis(straight - shape.bend[:, None] * run**2, -1, 0)
+    far = np.linalg.norm(offset, axis=-1)
+    beside = np.minimum(np.abs(d), np.abs(e))
+    weight = np.clip(reach[:, None] + 0.5 - far, 0, 1) * np.clip(width[:, None] + 0.5 - beside, 0, 1)
+    return np.sqrt(weight), d, e

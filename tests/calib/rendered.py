@@ -1,0 +1,104 @@
+"""Rendered photographs of a ChArUco board by an array whose every number is known.
+
+    python -m tests.calib.rendered --out out/boards
+
+renders them (some minutes on one core; needs `make synthesis`), as a folder of PNG pictures for each camera with the
+true rig beside them. Four cameras of different sizes, focal lengths and lenses stand 0.2 m apart and look at about
+2 m. The board is at 0.9 to 2.6 m, tilted by up to 40 degrees, so that every camera has it near, at its corners and
+in its middle, and two cameras or more see it in each frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from arraygeom import Camera, Pose, Rig, rotation_from_vector
+from arraygeom.sensor import Sensor
+from pat.synthesis.scene import Board, Key, Material, Motion, Object, Paint, Texture
+from tests.calib.boards_seen import camera, tensor
+
+SHEET = Board(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
+BOARD = "charuco:12x9:60mm:45mm:5x5_250"
+DEPTHS = 0.9, 2.6
+TILT = 40.0
+POSES = 20
+
+
+def rig() -> Rig:
+    """Four unlike cameras, the first at the world's origin."""
+    return Rig(
+        {
+            "mono": camera(1500.0, (960, 1280), lens=(-0.12, 0.03, 0.0005, -0.0003, 0.0)),
+            "colour": camera(
+                (1150.0, 1154.0), (768, 1024), (0.2, 0.02, 0.0), (0.5, -4.0, 0.8), (-0.2, 0.06, -0.0006, 0.0004, 0.0)
+            ),
+            "nir": camera(900.0, (720, 960), (-0.15, 0.0, 0.03), (-1.0, 3.0, -0.4), (-0.25, 0.08, 0.0, 0.0, 0.0)),
+            "wide": camera(680.0, (720, 960), (0.03, -0.2, 0.01), (-4.0, 0.0, 2.0), (-0.2, 0.05, 0.0, 0.0, 0.0)),
+        }
+    )
+
+
+def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose]:
+    """`world_from_board`: aimed by each camera in turn at some place of its picture, that it fills in good part."""
+    random = np.random.default_rng(seed)
+    names = list(cameras.names)
+    return [_pose(cameras[names[k % len(names)]], random) for k in range(count)]
+
+
+def _pose(view: Camera, random: np.random.Generator) -> Pose:
+    """A board that would fill 0.45 to 1.05 of the picture's width, its middle in the picture's middle 60 %."""
+    h, w = view.hw
+    columns, rows = SHEET.squares
+    depth = float(np.clip(view.K[0, 0] * SHEET.wh[0] / (w * random.uniform(0.45, 1.05)), *DEPTHS))
+    x = tensor(random.uniform(0.2, 0.8) * w, random.uniform(0.2, 0.8) * h)
+    middle = view.unproject(x[None], tensor(depth))[0]
+    turn = np.radians([*random.uniform(-TILT, TILT, 2), random.uniform(-30, 30)])
+    R = view.R.T @ rotation_from_vector(tensor(*turn))
+    return Pose(R, middle - R @ tensor(columns * SHEET.square / 2, rows * SHEET.square / 2, 0.0))
+
+
+def wall() -> Object:
+    """Grey, behind all boards: what a camera sees that has no board before it."""
+    paint = Texture(paints=(Paint((0.3, 0.3, 0.3), 0.3),))
+    place = Key(position=(0.0, 0.0, 6.0), extent=(40.0, 40.0, 1.0))
+    return Object(name="wall", shape="plane", motion=Motion((place,)), material=Material(texture=paint))
+
+
+def photograph(out: Path, *, count: int = POSES, samples: int = 16) -> None:
+    """The pictures, `out/<camera>/<frame>.png` (8 bits), and `out/true.yaml`."""
+    from pat.synthesis.blender import RenderSettings
+    from pat.synthesis.blender.client import render
+    from pat.synthesis.generators import board
+    from pat.synthesis.pictures import light, write_light
+
+    cameras = rig()
+    slow = {name: c.replace(sensor=Sensor(frame_rate=1.0)) for name, c in cameras.cameras.items()}
+    settings = RenderSettings(
+        samples=samples, denoise="none", fast_light=False, bounces=0, threads=1, duration=float(count)
+    )
+    with tempfile.TemporaryDirectory() as scratch:
+        scene = board(board_poses(cameras, count), SHEET)
+        scene = replace(scene, objects=(*scene.objects, wall()))
+        done = render(scene, Rig(slow), Path(scratch) / "rendered", settings=settings)
+        for name in cameras.names:
+            for number in range(done.frames(name)):
+                write_light(out / name / f"{number:03d}.png", light(done.frame(name, number), "bw"))
+    cameras.save(out / "true.yaml")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--out", type=Path, default=Path("out/boards"))
+    parser.add_argument("--count", type=int, default=POSES)
+    options = parser.parse_args()
+    photograph(options.out, count=options.count)
+
+
+if __name__ == "__main__":
+    main()
