@@ -798,7 +798,7 @@ class SystemsRun:
     weights: str = "mono-colour"
     """Name of weights in the package, or a file."""
     max_memory: str | None = None
-    """Working memory allowed, like 4GiB."""
+    """Memory that fusing may take in all, like 4GiB; a single frame is then fused in a process of its own, measured."""
 
     def run(self) -> None:
         """Do it."""

@@ -1,7 +1,7 @@
 """Whole frames: a rig and one picture a camera in, one fused picture out.
 
 Frames too large for the memory allowed are fused in tiles of alpha, each with just the part of every beta that
-its segments touch, and a halo as wide as the network sees. Tiled and whole results are equal to rounding.
+its segments touch, and a halo (`pat.tiles`). Tiled and whole results are equal to 1e-5.
 """
 
 from __future__ import annotations

@@ -27,6 +27,9 @@ from pat.farm.job import RenderConfig
 from pat.farm.run import render
 from pat.farm.worker import FACTS
 from pat.images import write_text
+from pat.synthesis.blender import RenderSettings
+from pat.synthesis.blender import render as render_scene
+from pat.synthesis.generators import abstract
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "fast preset": {},
@@ -103,6 +106,16 @@ def report(scenes: int, slow_scenes: int, workers: int) -> str:
     )
 
 
+def paper() -> str:
+    """One scene with the paper's preset on all cores."""
+    settings, begin = RenderSettings.preset("paper"), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        done = render_scene(abstract(1, rig()), rig(), Path(folder) / "scene", settings=settings)
+        sizes = ", ".join(f"{c.hw[1]}x{c.hw[0]}" for c in done.rig.cameras.values())
+        verdict = "accepted" if done.accepted else f"refused: {done.about['check']['reasons']}"
+    return f"paper preset, {sizes}: {time.monotonic() - begin:.0f} s on {os.cpu_count()} cores, {verdict}"
+
+
 def main() -> None:
     """Print the tables and keep them."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -110,7 +123,10 @@ def main() -> None:
     parser.add_argument("--slow-scenes", type=int, default=4, help="how many of them without the speed settings")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path(__file__).with_name("RENDERING.md"))
+    parser.add_argument("--paper", action="store_true", help="only one scene with the paper's preset, 15 minutes")
     given = parser.parse_args()
+    if given.paper:
+        return print(paper())
     found = report(given.scenes, given.slow_scenes, given.workers)
     print(found)
     write_text(given.out, f"# Rendering\n\n{found}")
