@@ -68,8 +68,8 @@ def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> View
     Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another size
     than the rig says, or is in colour where the rig says raw.
     """
-    files = ViewFiles(rig, files, alpha=alpha)
-    return Views(files.developed, dict(files))
+    views = ViewFiles(rig, files, alpha=alpha)
+    return Views(views.developed, dict(views))
 
 
 def check_size(picture: Float[Tensor, "c h w"], hw: tuple[int, int], label: str) -> None:

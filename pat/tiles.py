@@ -135,13 +135,13 @@ def survey_memory(surveys: list[Tile], probe: Probe | None) -> float:
 def _by_work(hw: HW, halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
     """Heights and widths of tiles of at most so many pixels with their halos, the least work first."""
     h, w = hw
-    sides = {}
+    sides: dict[tuple[int, int], int] = {}
     for rows in range(1, -(-h // 64) + 1):
         for columns in range(1, -(-w // 64) + 1):
-            side = tuple(max(-(-n // many // multiple) * multiple, 64) for n, many in ((h, rows), (w, columns)))
+            side = max(-(-h // rows // multiple) * multiple, 64), max(-(-w // columns // multiple) * multiple, 64)
             if side not in sides and math.prod(min(s + 2 * halo, n) for s, n in zip(side, hw)) <= most:
                 sides[side] = math.prod(_covered_length(n, s, halo) for n, s in zip(hw, side))
-    return sorted(sides, key=lambda side: sides[side])  # type: ignore[return-value]
+    return sorted(sides, key=lambda side: sides[side])
 
 
 def _covered_length(length: int, side: int, halo: int) -> int:

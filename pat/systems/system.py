@@ -199,9 +199,10 @@ def _still(
 ) -> tuple[list[str], Panels]:
     alpha, truth = system.alpha, recording.truth[0]
     first = {name: paths[0] for name, paths in files.items()}
+    memory: list[str] = []
     if how.max_memory is None:
         read, images = read_views(rig, first, alpha=alpha)
-        frame, memory = fuse(load_weights(how.weights), read, images, alpha=alpha), []
+        frame = fuse(load_weights(how.weights), read, images, alpha=alpha)
         save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
     else:
         frame, memory = fused_apart(how, out / "inputs" / "rig.yaml", first, alpha, out)
