@@ -25,7 +25,7 @@ from safetensors.torch import load_file, save_file
 from arraygeom import ReceptiveField, Rig
 from arraygeom.io.native import write as rig_text
 
-from .develop import read_views
+from .develop import ViewFiles
 from .fuse import fuse
 from .images import read_image, sweep, write_atomically, write_text
 from .jobs import HERE, OnError, Report, Task, Workers, run_tasks
@@ -170,10 +170,10 @@ class Batch:
     def fuse_one(self, i: int) -> None:
         """Write a frame."""
         if not self.sequence:
-            rig, images = read_views(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
+            images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
             frame = fuse(
                 _network(self.weights),
-                rig,
+                images.developed,
                 images,
                 alpha=self.alpha,
                 field=self.field,

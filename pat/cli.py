@@ -6,7 +6,7 @@ import math
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from json import dumps
 from pathlib import Path
@@ -109,7 +109,7 @@ class Fuse:
     field: FieldName = "auto"
     """Where to look in the other cameras; auto takes what the rig allows."""
     max_memory: str | None = None
-    """Working memory allowed, like 4GiB; larger frames are fused in tiles."""
+    """Memory that the process may take in all, like 4GiB; larger frames are fused in tiles."""
     match_levels: bool = False
     """Bring every beta to alpha's brightness and contrast first (other exposures, filters)."""
     bits: Literal[8, 16, 32] = 8
@@ -169,10 +169,11 @@ class Fuse:
         return rig
 
     def _one(self, rig: Rig, files: dict[str, Path]) -> None:
-        from .develop import read_views
+        from .develop import ViewFiles
         from .results import save_frame, view_of
 
-        rig, images = read_views(rig, files, alpha=rig.known(self.alpha))
+        images = ViewFiles(rig, files, alpha=rig.known(self.alpha))
+        rig = images.developed
         store = self.out / ".tiles"
         if not self.resume:
             shutil.rmtree(store, ignore_errors=True)
@@ -797,7 +798,7 @@ class SystemsRun:
     weights: str = "mono-colour"
     """Name of weights in the package, or a file."""
     max_memory: str | None = None
-    """Working memory allowed, like 4GiB."""
+    """Memory that fusing may take in all, like 4GiB; a single frame is then fused in a process of its own, measured."""
 
     def run(self) -> None:
         """Do it."""
@@ -861,7 +862,7 @@ Command = (
 )
 
 
-def fuse_frame(weights: str, rig: Rig, images: dict[str, Tensor], **options: Any) -> FusedFrame:
+def fuse_frame(weights: str, rig: Rig, images: Mapping[str, Tensor], **options: Any) -> FusedFrame:
     """`pat.fuse.fuse` with named weights, and a bar on the terminal."""
     from .fuse import fuse
     from .weights import load_weights

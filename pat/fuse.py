@@ -1,16 +1,14 @@
 """Whole frames: a rig and one picture a camera in, one fused picture out.
 
 Frames too large for the memory allowed are fused in tiles of alpha, each with just the part of every beta that
-its segments touch, and a halo as wide as the network sees. Tiled and whole results are equal to rounding.
+its segments touch, and a halo (`pat.tiles`). Tiled and whole results are equal to 1e-5.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -19,7 +17,7 @@ import torch
 from jaxtyping import Float
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, pad
+from torch.nn.functional import interpolate
 
 from arraygeom import (
     Camera,
@@ -33,7 +31,6 @@ from arraygeom import (
     ReceptiveField,
     Rectified,
     Rig,
-    Segments,
     View,
     Widened,
     apply_homography,
@@ -48,6 +45,24 @@ from arraygeom.undistortion import pixels_between
 
 from .images import luminance, write_atomically
 from .model import Fused, FusionNetwork, Look
+from .tiles import (
+    PROBE,
+    Beta,
+    Plan,
+    Probe,
+    Strip,
+    Tile,
+    held_memory,
+    padded,
+    parse_bytes,
+    plan,
+    strip,
+    survey_memory,
+    survey_tiles,
+    surveyed,
+    touched,
+    working_memory,
+)
 
 Progress = Callable[[Iterable["Tile"], int], Iterable["Tile"]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
@@ -64,26 +79,6 @@ class FusedFrame(NamedTuple):
     image: Float[Tensor, "c h w"]
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
-
-
-@dataclass(frozen=True)
-class Beta:
-    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look.
-
-    `points` says where alpha's pixels are when beta records: elsewhere only if they move (`Moved`).
-    """
-
-    picture: Tensor
-    pair: Pair
-    look: Look
-    points: Callable[[Tensor], Tensor]
-
-
-class Tile(NamedTuple):
-    """Rows and columns of the output, and of alpha's picture that they need: (top, bottom, left, right)."""
-
-    inner: tuple[int, int, int, int]
-    outer: tuple[int, int, int, int]
 
 
 def fuse(
@@ -110,13 +105,15 @@ def fuse(
     Args:
         network: `load_weights("mono-colour")`, say.
         rig: the cameras. Those without a picture in `images` are left out.
-        images: by camera name, (C, H, W) in 0..1, each of the size that the rig states.
+        images: by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping that reads them when
+            asked saves memory (`pat.develop.ViewFiles`).
         alpha: the camera whose view is wanted.
         depth: (near, far) in metres, instead of the rig's.
         field: where to look; by default the depth-bounded epipolar segment of calibrated cameras, the run of the
             epipolar line around H x of those known by F, and a row of beta of those known only by size. Or a field for
             each of some betas, by name.
-        max_memory: bytes, or like "4GiB"; about what the work may take on top of the pictures. Default: no limit.
+        max_memory: bytes, or like "4GiB": what the process may take in all, libraries and pictures included, if there
+            is nothing else in it. Default: no limit.
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
         progress: shows the tiles as they are done.
@@ -128,10 +125,11 @@ def fuse(
         ValueError: a camera that the rig lacks, a picture of another size, a rig whose views do not overlap.
     """
     rig = rig if depth is None else rig.replace(depth=depth)
-    _check(rig, images, alpha)
+    _check_names(rig, images, alpha)
+    picture = partial(_picture, rig, images)
     fields = field if isinstance(field, Mapping) else dict.fromkeys(rig.betas(alpha), field)
     if any(_has_lens(rig[name]) for name in images) and not any(map(_follows_lenses, fields.values())):
-        straight_rig, straight = without_lenses(rig, images)
+        straight_rig, straight = without_lenses(rig, {name: picture(name) for name in images})
         fields = {name: _straightened(f, rig[alpha], straight_rig[alpha]) for name, f in fields.items()}
         seen = fuse(
             network,
@@ -145,38 +143,42 @@ def fuse(
             announce=announce,
             store=store,
         )
-        return _bent(seen, straight[alpha], images[alpha], straight_rig[alpha], rig[alpha])
-    own = _grey(images[alpha])[None]
+        return _bent(seen, straight[alpha], picture(alpha), straight_rig[alpha], rig[alpha])
+    own = _grey(picture(alpha))[None]
+    levels = own if match_levels else None
     betas = [
-        _surveyed(
-            network,
-            own,
-            _prepare(
-                network,
-                rig.pair(alpha, name),
-                images[name][None],
-                fields.get(name),
-                own if match_levels else None,
-                name,
-            ),
-        )
+        _prepare(network, rig.pair(alpha, name), picture(name)[None], fields.get(name), levels, name)
         for name in rig.betas(alpha)
         if name in images
     ]
-    hw = rig[alpha].hw
-    tiles = plan(network, hw, betas, None if max_memory is None else parse_bytes(max_memory))
+    hw, surveys = rig[alpha].hw, survey_tiles(network, rig[alpha].hw)
+    large, limit = math.prod(hw) > 16 * PROBE**2, None if max_memory is None else parse_bytes(max_memory)
+    probe = Probe.of(network, own, betas, partial(_fuse_tile, network, own)) if large and (limit or announce) else None
+    held = held_memory(own, betas, probe.known if probe else 0.0, frame=store is None)
+    surveying = survey_memory(surveys, probe)
+    tiles = plan(network, hw, betas, limit, held, surveying)
     if announce:
-        memory = max(working_memory(network, tile, betas) for tile in tiles)
-        large = math.prod(hw) > 16 * PROBE**2
-        announce(Plan(tiles, memory, expected_seconds(network, own, betas, tiles) if large else None))
-    kept = TileStore.of(store, network, own, betas) if store and len(tiles) > 1 else None
+        work = max(surveying, *(working_memory(network, tile, betas) for tile in tiles))
+        seconds = probe.seconds(network, betas, surveys, tiles) if probe else None
+        announce(Plan(tiles, held + work, seconds, len(surveys)))
+    betas = [surveyed(network, own, beta, surveys) for beta in betas]
+    make = partial(_fuse_tile, network, own, betas)
+    shown = progress(tiles, len(tiles)) if progress else tiles
+    if not store or len(tiles) == 1:
+        return _assembled(hw, ((tile, make(tile)) for tile in shown))
+    kept = TileStore.of(store, network, own, betas)
+    for tile in shown:
+        kept.keep(tile, make)
+    betas.clear()
+    return _assembled(hw, ((tile, kept.fetch(tile)) for tile in tiles))
+
+
+def _assembled(hw: HW, parts: Iterable[tuple[Tile, FusedFrame]]) -> FusedFrame:
     frame: list[Tensor] = []
-    for tile in progress(tiles, len(tiles)) if progress else tiles:
-        make = partial(_fuse_tile, network, own, betas, tile)
-        parts = kept.fetch(tile, make) if kept else make()
-        frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in parts]
+    for tile, found in parts:
+        frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in found]
         top, bottom, left, right = tile.inner
-        for whole, part in zip(frame, parts):
+        for whole, part in zip(frame, found):
             whole[..., top:bottom, left:right] = part
     return FusedFrame(*frame)
 
@@ -193,21 +195,27 @@ class TileStore(NamedTuple):
         digest = hashlib.sha256(type(network).__name__.encode())
         parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
         for tensor in (*parameters, own, *(b.picture for b in betas)):
-            digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+            digest.update(tensor.detach().cpu().contiguous().numpy())
         x = pixel_grid((own.shape[-2], own.shape[-1]), dtype=torch.float64)[::64, ::64].reshape(-1, 2)
         for beta in betas:
             digest.update(b"".join(part.numpy().tobytes() for part in vars(beta.look.at(x)).values()))
         return cls(folder, digest.hexdigest()[:16])
 
-    def fetch(self, tile: Tile, make: Callable[[], FusedFrame]) -> FusedFrame:
-        """The tile as it was kept, or made and kept now."""
-        file = self.folder / f"{self.digest}_{'_'.join(map(str, tile.inner))}.safetensors"
+    def keep(self, tile: Tile, make: Callable[[Tile], FusedFrame]) -> None:
+        """Make a tile, unless it is there."""
+        file = self._file(tile)
         if file.exists():
-            return FusedFrame(**load_file(file))
-        frame = make()
+            return
+        frame = make(tile)
         with write_atomically(file) as temporary:
             save_file({name: part.contiguous() for name, part in frame._asdict().items()}, temporary)
-        return frame
+
+    def fetch(self, tile: Tile) -> FusedFrame:
+        """A tile that was kept."""
+        return FusedFrame(**load_file(self._file(tile)))
+
+    def _file(self, tile: Tile) -> Path:
+        return self.folder / f"{self.digest}_{'_'.join(map(str, (*tile.inner, *tile.outer)))}.safetensors"
 
 
 def without_lenses(rig: Rig, images: Mapping[str, Tensor]) -> tuple[Rig, dict[str, Tensor]]:
@@ -268,132 +276,26 @@ def default_field(pair: Pair) -> ReceptiveField:
     return Rectified(alpha_is="either", max_disparity=0.12 * pair.beta.hw[1])
 
 
-class Plan(NamedTuple):
-    """How a frame will be fused: tiles, working memory of the largest (bytes), and the time, if estimated (seconds)."""
-
-    tiles: list[Tile]
-    memory: float
-    seconds: float | None
-
-    def __str__(self) -> str:
-        time = "" if self.seconds is None else f", about {_duration(self.seconds)}"
-        many = "1 piece" if len(self.tiles) == 1 else f"{len(self.tiles)} tiles"
-        return f"{many}, {self.memory / 2**30:.2f} GiB of working memory{time}"
-
-
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-
-
-def plan(network: FusionNetwork, hw: HW, betas: list[Beta], limit: float | None) -> list[Tile]:
-    """The tiles with the least work (their halos overlap) of which none takes over `limit` bytes.
-
-    One tile if the whole frame does not. Raises ValueError if not even tiles of 64 pixels do.
-    """
-    whole = Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
-    if limit is None or working_memory(network, whole, betas) <= limit:
-        return [whole]
-    for sides in _by_work(hw, network, limit):
-        tiles = list(tiles_of(hw, sides, network.halo))
-        if max(working_memory(network, tile, betas) for tile in tiles) <= limit:
-            return tiles
-    least = max(working_memory(network, tile, betas) for tile in tiles_of(hw, 64, network.halo))
-    raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this network needs at least {least / 2**20:.0f} MiB")
-
-
-def working_memory(network: FusionNetwork, tile: Tile, betas: list[Beta]) -> float:
-    """Bytes that a tile takes: those for its part of alpha and for the part of each beta that it looks at."""
-    pixels = _area(tile.outer)
-    for beta in betas:
-        top, bottom, left, right = tile.outer
-        x = pixel_grid((-(-(bottom - top) // 32) + 1, -(-(right - left) // 32) + 1)) * 32
-        x = torch.minimum(x, x.new_tensor([right - left - 1, bottom - top - 1])) + x.new_tensor([left, top])
-        pixels += _area(_touched(beta.look.at(x.reshape(-1, 2)), beta.pair.beta.hw, network))
-    return network.bytes_per_pixel * pixels
-
-
-def _by_work(hw: HW, network: FusionNetwork, limit: float) -> list[tuple[int, int]]:
-    """Heights and widths of tiles, those that alpha's part alone does not forbid, the least work first."""
-    h, w = hw
-    sides = {}
-    for rows in range(1, -(-h // 64) + 1):
-        for columns in range(1, -(-w // 64) + 1):
-            m = network.multiple
-            side = (max(-(-h // rows // m) * m, 64), max(-(-w // columns // m) * m, 64))
-            outer = [min(s + 2 * network.halo, n) for s, n in zip(side, hw)]
-            if side not in sides and math.prod(outer) * network.bytes_per_pixel <= limit:
-                covered = [_covered_length(n, s, network.halo) for n, s in zip(hw, side)]
-                sides[side] = math.prod(covered)
-    return sorted(sides, key=lambda side: sides[side])
-
-
-def _covered_length(length: int, side: int, halo: int) -> int:
-    """What pieces of a length add up to with their halos."""
-    return sum(min(i + side + halo, length) - max(i - halo, 0) for i in range(0, length, side))
-
-
-def _area(box: tuple[int, int, int, int]) -> int:
-    top, bottom, left, right = box
-    return (bottom - top) * (right - left)
-
-
-PROBE = 192
-"""Side of the piece of alpha that is fused to estimate the time, pixels."""
-
-
-def expected_seconds(network: FusionNetwork, own: Tensor, betas: list[Beta], tiles: list[Tile]) -> float:
-    """About how long the tiles will take here, by fusing a small piece from the middle of alpha twice."""
-    h, w = own.shape[-2:]
-    m = network.multiple
-    top, left = (max((side - PROBE) // 2, 0) // m * m for side in (h, w))
-    box = (top, min(top + PROBE, h), left, min(left + PROBE, w))
-    piece = Tile(box, box)
-    _fuse_tile(network, own, betas, piece)
-    start = time.perf_counter()
-    _fuse_tile(network, own, betas, piece)
-    spent = time.perf_counter() - start
-    work = sum(working_memory(network, tile, betas) for tile in tiles)
-    return spent * work / working_memory(network, piece, betas)
-
-
-def tiles_of(hw: HW, side: int | tuple[int, int], halo: int) -> Iterator[Tile]:
-    """Tiles (square, or of a height and a width) with a halo, cut off at the frame's borders."""
-    (h, w), (rows, columns) = hw, side if isinstance(side, tuple) else (side, side)
-    for top in range(0, h, rows):
-        for left in range(0, w, columns):
-            bottom, right = min(top + rows, h), min(left + columns, w)
-            outer = (max(top - halo, 0), min(bottom + halo, h), max(left - halo, 0), min(right + halo, w))
-            yield Tile((top, bottom, left, right), outer)
-
-
-def parse_bytes(amount: float | str) -> float:
-    """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
-    if not isinstance(amount, str):
-        return float(amount)
-    units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-    number = amount.rstrip("BbKkMmGgIi ")
-    unit = amount[len(number) :].strip().upper() or "B"
-    try:
-        return float(number) * units[unit]
-    except (KeyError, ValueError):
-        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB") from None
-
-
-def _check(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
-    rig.known(alpha)
-    for name, image in images.items():
-        h, w = rig[name].hw
-        if tuple(image.shape[1:]) != (h, w):
-            got = f"{image.shape[2]}x{image.shape[1]}"
-            raise ValueError(
-                f"the picture of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right picture"
-            )
-        if not torch.isfinite(image).all():
-            raise ValueError(f"the picture of '{name}' has NaN or infinite values")
+def _check_names(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
+    for name in (alpha, *images):
+        rig.known(name)
     if alpha not in images:
         raise ValueError(f"no picture of alpha, '{alpha}'")
     if not set(images) - {alpha}:
         raise ValueError(f"no picture of any other camera than alpha, '{alpha}': fusion needs at least one beta")
+
+
+def _picture(rig: Rig, images: Mapping[str, Tensor], name: str) -> Tensor:
+    """The picture of a camera, which may be read from its file only now, found to be usable."""
+    image, (h, w) = images[name], rig[name].hw
+    if tuple(image.shape[1:]) != (h, w):
+        got = f"{image.shape[2]}x{image.shape[1]}"
+        raise ValueError(
+            f"the picture of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right picture"
+        )
+    if not torch.isfinite(image).all():
+        raise ValueError(f"the picture of '{name}' has NaN or infinite values")
+    return image
 
 
 def _grey(picture: Tensor) -> Tensor:
@@ -431,18 +333,11 @@ def _common_part(
     if not follows or pair.link is not None or not pair.calibrated or pitch_ratio(pair) > 0.8:
         return pair, picture
     found = Look.along(field or default_field(pair), pair).at(coarse_grid(pair.alpha.hw).reshape(-1, 2))
-    top, bottom, left, right = _touched(found, (h, w), network)
+    top, bottom, left, right = touched(found, (h, w), network)
     if (bottom - top) * (right - left) > 0.75 * h * w:
         return pair, picture
     part = pair.map_beta(shift_matrix(left, top), (bottom - top, right - left))
     return part, picture[..., top:bottom, left:right]
-
-
-def _surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta) -> Beta:
-    """The beta with what the network wants to know of whole pictures."""
-    with torch.no_grad():
-        known = network.survey(_padded(alpha, network.multiple), _padded(beta.picture, network.multiple), beta.look)
-    return replace(beta, look=replace(beta.look, known=known))
 
 
 def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
@@ -488,68 +383,17 @@ def _reaches(look: Look, pair: Pair) -> bool:
 def _fuse_tile(network: FusionNetwork, alpha: Tensor, betas: list[Beta], tile: Tile) -> FusedFrame:
     """The inner part of a tile."""
     top, bottom, left, right = tile.outer
-    pieces = [_strip(b, tile.outer, network) for b in betas]
-    pictures = [_padded(p.picture, network.multiple) for p in pieces]
+    pieces = [strip(b, tile.outer, network) for b in betas]
+    pictures = [padded(p.picture, network.multiple) for p in pieces]
     with torch.no_grad():
         fused = network(
-            _padded(alpha[..., top:bottom, left:right], network.multiple), pictures, [p.look for p in pieces]
+            padded(alpha[..., top:bottom, left:right], network.multiple), pictures, [p.look for p in pieces]
         )
     image = fused.image[0, :, : bottom - top, : right - left]
     depth, confidence = _depth(fused, pieces, (bottom - top, right - left), (left, top))
     rows = slice(tile.inner[0] - top, tile.inner[1] - top)
     columns = slice(tile.inner[2] - left, tile.inner[3] - left)
     return FusedFrame(image[:, rows, columns], depth[rows, columns], confidence[rows, columns])
-
-
-@dataclass(frozen=True)
-class Strip:
-    """The part of a beta that a tile needs. `look` maps the tile's pixels to the strip's; `offset` is its corner."""
-
-    picture: Tensor
-    look: Look
-    pair: Pair
-    offset: tuple[int, int]
-    points: Callable[[Tensor], Tensor]
-
-
-def _strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) -> Strip:
-    top, bottom, left, right = outer
-    corner = torch.tensor([float(left), float(top)])
-    x = pixel_grid((bottom - top, right - left)) + corner
-    y0, y1, x0, x1 = _touched(beta.look.at(x[::2, ::2].reshape(-1, 2)), beta.pair.beta.hw, network)
-    shift = torch.tensor([float(x0), float(y0)])
-
-    def at(x: Tensor) -> Segments | Positions:
-        found = beta.look.at(x + corner.to(x))
-        if isinstance(found, Positions):
-            return Positions(found.xy - shift.to(x), found.mask)
-        return Segments(found.start - shift.to(x), found.end - shift.to(x), found.valid)
-
-    m = network.multiple
-    known = beta.look.known
-    if known is not None:
-        known = known.cut((top, top - (top - bottom) // m * m, left, left - (left - right) // m * m))
-    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples, known), beta.pair, (x0, y0), beta.points)
-
-
-def _touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
-    """(top, bottom, left, right) of the part of beta that is looked at, with a halo; aligned to `multiple`."""
-    if isinstance(found, Positions):
-        points = found.xy[found.mask]
-    else:
-        points = torch.cat([found.start[found.valid], found.end[found.valid]])
-    if not len(points):
-        return 0, network.multiple, 0, network.multiple
-    low, high = points.amin(0) - network.beta_halo, points.amax(0) + network.beta_halo
-    m = network.multiple
-    (x0, y0), (x1, y1) = (torch.div(v, m, rounding_mode="floor").long() * m for v in (low, high + m))
-    return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
-
-
-def _padded(picture: Tensor, multiple: int) -> Tensor:
-    """The picture continued at the bottom and the right to whole multiples."""
-    h, w = picture.shape[-2:]
-    return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
 
 
 UNSEEN = 1e-4

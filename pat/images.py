@@ -23,6 +23,9 @@ from arraygeom.io.whole import write_text as write_text
 REC601 = (0.299, 0.587, 0.114)
 """Weights of red, green and blue in luminance, on coded values (ITU-R BT.601)."""
 
+_ROWS = 256
+"""Worked off at once, where copies of a whole picture would take much memory."""
+
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
 
@@ -193,4 +196,8 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
     if bits not in (8, 16):
         raise ValueError(f"bits must be 8, 16 or 32 (float), got {bits}")
     kind = np.uint8 if bits == 8 else np.uint16
-    return np.rint(np.clip(colours, 0, 1).astype(np.float64) * np.iinfo(kind).max).astype(kind)
+    counts = np.empty(colours.shape, kind)
+    for top in range(0, len(colours), _ROWS):
+        rows = np.clip(colours[top : top + _ROWS], 0, 1).astype(np.float64)
+        counts[top : top + _ROWS] = np.rint(rows * np.iinfo(kind).max)
+    return counts

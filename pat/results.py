@@ -69,9 +69,11 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     known = depth.isfinite()
     inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
     low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
-    scaled = ((inverse - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
-    colours = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)
-    return torch.where(known, colours, 0.0)
+    colours = torch.zeros(3, *depth.shape)
+    for rows, found, seen in zip(colours.split(256, 1), inverse.split(256), known.split(256)):
+        scaled = ((found - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
+        rows[:, seen] = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)[:, seen]
+    return colours
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:

@@ -87,6 +87,7 @@ class _Server:
             "seconds": round(time.monotonic() - started[0], 3),
             "cpu_seconds": round(time.process_time() - started[1], 3),
             "memory_mb": _resident_mb(),
+            "process": os.getpid(),
         }
         (partial / FACTS).write_text(json.dumps(facts, indent=1), encoding="utf-8")
         publish(partial, self.job.folder.scene(index))

@@ -22,6 +22,10 @@ from pat.synthesis.rigs import RigBatch, RigDistribution
 Seen = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
 
 
+BAND = 4_000_000
+"""Samples (pixels times oversampling) rendered at once: about 1.5 GiB with ten layers."""
+
+
 class Stage(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
@@ -53,12 +57,26 @@ class Stage(LayeredScenes):
 
     @torch.no_grad()
     def seen(self, name: str, layers: Layers | None = None) -> Seen:
-        """The picture (sRGB) and the depth that a camera sees, of the scene itself or of it changed."""
+        """The picture (sRGB) and the depth that a camera sees, of the scene itself or of it changed.
+
+        Large pictures are rendered in bands of rows, with a row around for the width of outlines.
+        """
         camera = self.camera(name)
         finest = max(float(self.camera(n).K[0, 0, 0]) for n in self.rig.names)
         factor = min(max(round(finest / float(camera.K[0, 0, 0])), 2), 4)
-        image, depth = self._seen(layers or self.scene, camera, factor)[:2]
-        return image, depth[0]
+        h, w = camera.hw
+        rows = max(BAND // (w * factor**2), 1)
+        if h <= rows:
+            image, depth = self._seen(layers or self.scene, camera, factor)[:2]
+            return image, depth[0]
+        image, depth = torch.empty(1, 3, h, w), torch.empty(h, w)
+        for top in range(0, h, rows):
+            bottom, first = min(top + rows, h), max(top - 1, 0)
+            part = camera.crop(first, 0, (min(bottom + 1, h) - first, w))
+            found = self._seen(layers or self.scene, part, factor)
+            inner = slice(top - first, bottom - first)
+            image[..., top:bottom, :], depth[top:bottom] = found[0][..., inner, :], found[1][0, inner]
+        return image, depth
 
     def painted(self, values: Sequence[float]) -> Layers:
         """The scene with each layer of one grey value, 0..1, instead of its texture."""

@@ -4,23 +4,32 @@ from __future__ import annotations
 
 import importlib
 import itertools
+import json
+import os
+import subprocess
+import sys
+import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
+from safetensors import safe_open
+from safetensors.torch import save_file
+from tifffile import imread
 from torch import Generator, Tensor
 
 from arraygeom import Rig
+from arraygeom.io.native import write as rig_text
 from pat.classical import classical_band_calibrated
 from pat.demo import classical
 from pat.develop import read_views, to_linear
 from pat.fuse import FusedFrame, fuse
 from pat.hdr import merged, usable_range
-from pat.images import luminance, to_luma_chroma, write_image, write_text
+from pat.images import luminance, read_image, to_luma_chroma, write_atomically, write_image, write_text
 from pat.metrics import score
 from pat.model import FusionNetwork
 from pat.results import colour_depth, save_frame, save_panels, view_of
@@ -42,6 +51,19 @@ class Recording:
     raw: Mapping[str, list[Float[Tensor, "_ _ _"]]]
     truth: list[Float[Tensor, "3 h w"]]
     light: Mapping[str, Float[Tensor, "1 _ _"]] = field(default_factory=dict)
+
+    @property
+    def known(self) -> dict[str, Tensor]:
+        """All but the raw pictures, by name."""
+        truth = {f"truth {i:03d}": picture.contiguous() for i, picture in enumerate(self.truth)}
+        return truth | {f"light {name}": picture.contiguous() for name, picture in self.light.items()}
+
+    @classmethod
+    def of(cls, known: Mapping[str, Tensor]) -> Recording:
+        """What `known` was of, without the raw pictures."""
+        kinds = {name.partition(" ")[::2]: tensor for name, tensor in known.items()}
+        truth = [kinds[key] for key in sorted(kinds) if key[0] == "truth"]
+        return cls({}, truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"})
 
 
 @dataclass(frozen=True)
@@ -106,55 +128,85 @@ def run_system(
 
     `photos` is a folder of pictures for the scene's textures; without, patterns and scikit-image's pictures are used.
     """
-    from .stage import Stage
-
     system = load_system(name)
-    module, rig = system.module, system.sized(full)
-    say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
-    stage = Stage(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
-    recording = module.record_scene(stage)
-    files = write_recording(recording, rig, out / "inputs")
+    rig = system.sized(full)
+    recording, files = recorded(system, rig, out / "inputs", photos=photos, say=say)
     say("fusing")
-    network = load_weights(weights)
     run = _sequence if len(recording.truth) > 1 else _still
-    lines, panels = run(network, system, rig, files, recording, out, {"max_memory": max_memory})
+    how = How(weights, max_memory, say)
+    lines, panels = run(how, system, rig, files, recording, out)
     save_panels(panels, out / "figure.png", columns=4)
     table = "\n".join(lines) + "\n"
     write_text(out / "scores.md", table)
     return Result(table, sorted(p for p in out.iterdir() if p.is_file()))
 
 
-def write_recording(recording: Recording, rig: Rig, out: Path) -> dict[str, list[Path]]:
+class How(NamedTuple):
+    """With which weights to fuse, in what memory, and who is told."""
+
+    weights: str
+    max_memory: str | None
+    say: Callable[[str], None]
+
+
+def recorded(
+    system: System, rig: Rig, out: Path, *, photos: Path | None, say: Callable[[str], None]
+) -> tuple[Recording, dict[str, list[Path]]]:
+    """What the cameras record of the system's scene, and the files: rendered, unless it was before."""
+    from .stage import Stage
+
+    module, kept = system.module, out / "recorded.safetensors"
+    key = f"{system.name}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
+    if kept.is_file():
+        with safe_open(kept, "pt") as file:
+            if file.metadata()["key"] == key:
+                say(f"taking the recording in {out}")
+                counts = json.loads(file.metadata()["counts"])
+                return Recording.of({name: file.get_tensor(name) for name in file.keys()}), _files(out, counts)  # noqa: SIM118
+    say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
+    kept.unlink(missing_ok=True)
+    stage = Stage(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
+    recording = module.record_scene(stage)
+    write_recording(recording, rig, out)
+    counts = {name: len(pictures) for name, pictures in recording.raw.items()}
+    with write_atomically(kept) as temporary:
+        save_file(recording.known, temporary, {"key": key, "counts": json.dumps(counts)})
+    return recording, _files(out, counts)
+
+
+def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:
+    return {name: [out / f"{name}_{i:03d}.png" for i in range(count)] for name, count in counts.items()}
+
+
+def write_recording(recording: Recording, rig: Rig, out: Path) -> None:
     """The pictures as cameras store them, 16 bits with the counts of the rig's, the truth, and the rig."""
     out.mkdir(parents=True, exist_ok=True)
     rig.save(out / "rig.yaml")
-    files: dict[str, list[Path]] = {}
     for name, pictures in recording.raw.items():
         white = 2 ** (rig[name].sensor.bits or 16) - 1
-        files[name] = [out / f"{name}_{i:03d}.png" for i in range(len(pictures))]
-        for path, picture in zip(files[name], pictures):
+        for i, picture in enumerate(pictures):
             counts = (picture.clamp(0, 1) * white).round()
-            write_image(path, counts / 65535, bits=16)
+            write_image(out / f"{name}_{i:03d}.png", counts / 65535, bits=16)
     for i, picture in enumerate(recording.truth):
         write_image(out / f"truth_{i:03d}.png", picture, bits=16)
-    return files
 
 
 Panels = dict[str, Tensor]
 
 
 def _still(
-    network: FusionNetwork,
-    system: System,
-    rig: Rig,
-    files: Mapping[str, list[Path]],
-    recording: Recording,
-    out: Path,
-    options: Mapping[str, Any],
+    how: How, system: System, rig: Rig, files: Mapping[str, list[Path]], recording: Recording, out: Path
 ) -> tuple[list[str], Panels]:
     alpha, truth = system.alpha, recording.truth[0]
-    read, images = read_views(rig, {name: paths[0] for name, paths in files.items()}, alpha=alpha)
-    frame = fuse(network, read, images, alpha=alpha, **options)
+    first = {name: paths[0] for name, paths in files.items()}
+    memory: list[str] = []
+    if how.max_memory is None:
+        read, images = read_views(rig, first, alpha=alpha)
+        frame = fuse(load_weights(how.weights), read, images, alpha=alpha)
+        save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
+    else:
+        frame, memory = fused_apart(how, out / "inputs" / "rig.yaml", first, alpha, out)
+        read, images = read_views(rig, first, alpha=alpha)
     baseline = classical_baseline(read, images, alpha)
     rows = {"alpha alone": images[alpha].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
     extra: list[str] = []
@@ -163,29 +215,45 @@ def _still(
         rows["fusion, exposures merged"] = merged_frame.image
         extra = [
             *_ranges(rig, recording, images, frame, merged_frame, alpha),
-            *_permuted(network, read, images, alpha, frame),
+            *_permuted(load_weights(how.weights), read, images, alpha, frame),
         ]
         write_image(out / "merged.tif", to_linear(merged_frame.image.clamp(min=0)), bits=32)
-    save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
     white = 1.0 if not recording.light else float(truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
     panels |= {"truth": truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
     panels |= {"depth (bright is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
-    return [*_table(rows, truth, white), *_known_where(frame, truth), *extra], panels
+    return [*_table(rows, truth, white), *_known_where(frame, truth), *extra, *memory], panels
+
+
+def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out: Path) -> tuple[FusedFrame, list[str]]:
+    """A frame fused by `pat fuse` in a process of its own, and what that took, as lines of text."""
+    images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
+    command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", alpha, *images, "--out", str(out)]
+    command += ["--bits", "16", "--weights", how.weights, "--max-memory", str(how.max_memory)]
+    begin, planned = time.monotonic(), ""
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    for line in process.stderr or ():
+        planned = line.strip() if line.startswith("plan:") else planned
+        if line.strip():
+            how.say(line.rstrip())
+    _, status, used = os.wait4(process.pid, 0)
+    if status:
+        raise ValueError(f"fusing in a process of its own failed (wait status {status})")
+    took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
+    peak = f"allowed {how.max_memory}, at most {used.ru_maxrss / 2**20:.2f} GiB resident"
+    depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
+    image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
+    unknown = torch.full_like(confidence, torch.nan)
+    depth = unknown if depth is None else torch.where(depth > 0, depth, unknown)
+    return FusedFrame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
 
 
 def _sequence(
-    network: FusionNetwork,
-    system: System,
-    rig: Rig,
-    files: Mapping[str, list[Path]],
-    recording: Recording,
-    out: Path,
-    options: Mapping[str, Any],
+    how: How, system: System, rig: Rig, files: Mapping[str, list[Path]], recording: Recording, out: Path
 ) -> tuple[list[str], Panels]:
-    alpha = system.alpha
+    alpha, network = system.alpha, load_weights(how.weights)
     frames = {name: PictureFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
-    job = SequenceFusion(network, rig, frames, alpha, options=options)
+    job = SequenceFusion(network, rig, frames, alpha, options={"max_memory": how.max_memory})
     keys = job.timeline.key_frames()
     colours = {key.alpha: job.colour(key) for key in keys}
     fused = [job.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(recording.truth))]

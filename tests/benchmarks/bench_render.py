@@ -1,9 +1,9 @@
-"""Measures rendering by Blender through the farm: `python -m tests.benchmarks.bench_render [--scenes 20]`.
+"""Measures rendering by Blender through the farm: `python -m tests.benchmarks.bench_render`, some 12 minutes.
 
-Scenes of two views of 512x384 with the fast preset, and some of the same scenes without its speed settings (full
-light, the denoiser at its default), in one run: scenes an hour, seconds and seconds of a core a scene, and the
-memory of a worker after its first and its last scene (`--recycle` keeps one worker for so many). The seconds of a
-core are what to compare where the machine does other work, too.
+Scenes of two views of 512x384 with the fast preset, and the first of the same scenes without its speed settings (full
+light, the denoiser at its default), by two workers in one run: scenes an hour, seconds and seconds of a core a scene,
+and the memory of each worker from scene to scene, none of them being replaced. Prints tables and writes them to
+tests/benchmarks/RENDERING.md. Seconds of a core are what to compare where the machine does other work, too.
 """
 
 from __future__ import annotations
@@ -14,9 +14,10 @@ import os
 import tempfile
 import time
 from pathlib import Path
-from statistics import median
+from statistics import mean
 from typing import Any
 
+import numpy as np
 import torch
 import yaml
 
@@ -25,6 +26,10 @@ from pat.farm.folders import JobFolder
 from pat.farm.job import RenderConfig
 from pat.farm.run import render
 from pat.farm.worker import FACTS
+from pat.images import write_text
+from pat.synthesis.blender import RenderSettings
+from pat.synthesis.blender import render as render_scene
+from pat.synthesis.generators import abstract
 
 SETTINGS: dict[str, dict[str, Any]] = {
     "fast preset": {},
@@ -41,45 +46,90 @@ def rig() -> Rig:
     return Rig(cameras, depth=(2.0, 20.0))
 
 
-def measure(root: Path, name: str, scenes: int, workers: int, recycle: int) -> dict[str, Any]:
-    """Render scenes; what it took."""
+def made(root: Path, name: str, scenes: int, workers: int) -> tuple[list[dict[str, Any]], float, int]:
+    """Render scenes: what each worker says of each, seconds in all, and seeds that the check refused."""
     rig().save(root / "rig.yaml")
     blender = {"generator": "abstract", "preset": "fast", "settings": SETTINGS[name]}
-    config = {"rig": "rig.yaml", "backend": "blender", "blender": blender, "limits": {"recycle": recycle}}
+    config = {"rig": "rig.yaml", "backend": "blender", "blender": blender, "limits": {"recycle": 1000}}
     (root / "render.yaml").write_text(yaml.safe_dump(config))
     out, begin = root / name.replace(" ", "-"), time.monotonic()
     summary = render(RenderConfig.load(root / "render.yaml"), scenes=scenes, out=out, workers=workers)
     seconds = time.monotonic() - begin
-    facts = [json.loads((JobFolder(out).scene(i) / FACTS).read_text()) for i in JobFolder(out).done()]
-    memory = [f["memory_mb"] for f in facts]
-    return {
-        "settings": name,
-        "scenes": len(facts),
-        "scenes/hour": round(3600 * len(facts) / seconds),
-        "s/scene": round(median(f["seconds"] for f in facts), 1),
-        "core s/scene": round(median(f["cpu_seconds"] for f in facts), 1),
-        "scenes/hour of 2 cores by core s": round(2 * 3600 / (sum(f["cpu_seconds"] for f in facts) / len(facts))),
-        "MB first": memory[0],
-        "MB most": max(memory),
-        "MB last": memory[-1],
-        "refused": summary.refusals,
-    }
+    folder = JobFolder(out)
+    return [json.loads((folder.scene(i) / FACTS).read_text()) for i in folder.done()], seconds, summary.refusals
+
+
+def speed(name: str, facts: list[dict[str, Any]], seconds: float | None, workers: int) -> str:
+    """A row: scenes, scenes an hour by the clock (if it was theirs) and by their own seconds, and those."""
+    each, cores = (mean(f[key] for f in facts) for key in ("seconds", "cpu_seconds"))
+    whole = f"{3600 * len(facts) / seconds:.0f}" if seconds else ""
+    return f"| {name} | {len(facts)} | {whole} | {3600 * workers / each:.0f} | {each:.2f} | {cores:.2f} |"
+
+
+def memory(facts: list[dict[str, Any]]) -> list[str]:
+    """A row for each worker: MB after some of its scenes, and what a scene adds by a straight line from the 5th on."""
+    rows = []
+    for process in sorted({f["process"] for f in facts}):
+        used = [f["memory_mb"] for f in facts if f["process"] == process]
+        slope = float(np.polyfit(np.arange(len(used))[4:], used[4:], 1)[0]) if len(used) > 6 else float("nan")
+        after = [f"{used[min(i, len(used)) - 1]:.0f}" for i in (1, 5, 10, 25, len(used))]
+        rows.append(f"| {len(used)} | {' | '.join(after)} | {max(used):.0f} | {slope:+.2f} |")
+    return rows
+
+
+def report(scenes: int, slow_scenes: int, workers: int) -> str:
+    """The tables."""
+    load = os.getloadavg()[0]
+    with tempfile.TemporaryDirectory() as folder:
+        (fast, slow), (fast_seconds, slow_seconds), (refused, _) = zip(
+            *(made(Path(folder), name, n, workers) for name, n in zip(SETTINGS, (scenes, slow_scenes)))
+        )
+    names = list(SETTINGS)
+    return "\n".join(
+        [
+            f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, load before "
+            f"{load:.1f}; two views of 512x384; {refused} seeds were refused by the check and cost time, too.",
+            "",
+            "| | scenes | an hour, all counted | an hour, by s a scene | s a scene | core s a scene |",
+            "| --- | ---: | ---: | ---: | ---: | ---: |",
+            speed(names[0], fast, fast_seconds, workers),
+            speed(f"{names[0]}, the scenes of the next row", fast[: len(slow)], None, workers),
+            speed(names[1], slow, slow_seconds, workers),
+            "",
+            "MB of each worker after its scenes, none replaced:",
+            "",
+            "| scenes | 1st | 5th | 10th | 25th | last | most | a scene adds |",
+            "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+            *memory(fast),
+            "",
+        ]
+    )
+
+
+def paper() -> str:
+    """One scene with the paper's preset on all cores."""
+    settings, begin = RenderSettings.preset("paper"), time.monotonic()
+    with tempfile.TemporaryDirectory() as folder:
+        done = render_scene(abstract(1, rig()), rig(), Path(folder) / "scene", settings=settings)
+        sizes = ", ".join(f"{c.hw[1]}x{c.hw[0]}" for c in done.rig.cameras.values())
+        verdict = "accepted" if done.accepted else f"refused: {done.about['check']['reasons']}"
+    return f"paper preset, {sizes}: {time.monotonic() - begin:.0f} s on {os.cpu_count()} cores, {verdict}"
 
 
 def main() -> None:
-    """Print a table."""
+    """Print the tables and keep them."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--scenes", type=int, default=20)
-    parser.add_argument("--slow-scenes", type=int, default=2, help="how many of them without the speed settings")
+    parser.add_argument("--scenes", type=int, default=100)
+    parser.add_argument("--slow-scenes", type=int, default=4, help="how many of them without the speed settings")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--recycle", type=int, default=25)
+    parser.add_argument("--out", type=Path, default=Path(__file__).with_name("RENDERING.md"))
+    parser.add_argument("--paper", action="store_true", help="only one scene with the paper's preset, 15 minutes")
     given = parser.parse_args()
-    print(f"{given.workers} workers, {os.cpu_count()} cores, load before: {os.getloadavg()[0]:.1f}")
-    with tempfile.TemporaryDirectory() as folder:
-        for name, scenes in zip(SETTINGS, (given.scenes, given.slow_scenes)):
-            if scenes:
-                row = measure(Path(folder), name, scenes, given.workers, given.recycle)
-                print("\n".join(f"{key:32} {value}" for key, value in row.items()), end="\n\n", flush=True)
+    if given.paper:
+        return print(paper())
+    found = report(given.scenes, given.slow_scenes, given.workers)
+    print(found)
+    write_text(given.out, f"# Rendering\n\n{found}")
 
 
 if __name__ == "__main__":

@@ -6,14 +6,16 @@ import pytest
 import torch
 
 import pat.fuse
+import pat.tiles
 from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
 from calib.matches import match_points, seen_depths
 from pat.demo import load_sample
-from pat.fuse import Tile, fuse, parse_bytes, pitch_ratio, quarter_turns, tiles_of, without_lenses
+from pat.fuse import fuse, pitch_ratio, quarter_turns, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
 from pat.images import luminance, read_image
 from pat.metrics import score
 from pat.model import PAT, PATConfig
+from pat.tiles import REACH, Tile, parse_bytes, plan, tiles_of, working_memory
 from pat.weights import load_weights
 
 
@@ -68,35 +70,69 @@ def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
     assert (fuse(network, rig, images, alpha="mono").image - whole.image).abs().max() > bound
 
 
+def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
+    sample, network = load_sample(), load_weights("mono-colour")
+    images = {name: sample.images[name] for name in sample.rig.names}
+    whole = fuse(network, sample.rig, images, alpha="mono")
+    monkeypatch.setattr(pat.tiles, "SURVEYED", 150_000)
+    monkeypatch.setattr(pat.tiles, "REACH", 128)
+    assert len(pat.tiles.survey_tiles(network, sample.rig["mono"].hw)) > 1
+    pieces = fuse(network, sample.rig, images, alpha="mono")
+    truth = sample.truth
+    assert score(pieces.image.clamp(0, 1), truth).psnr > score(whole.image.clamp(0, 1), truth).psnr - 0.1
+    assert ((pieces.image - whole.image).abs().amax(0) > 0.02).float().mean() < 0.02
+    hw = sample.rig["mono"].hw
+    monkeypatch.setattr(pat.fuse, "plan", lambda *_: list(tiles_of(hw, 192, REACH)))
+    tiled = fuse(network, sample.rig, images, alpha="mono")
+    assert (tiled.image - pieces.image).abs().max() < 1e-5
+    assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
+
+
+def test_pictures_are_asked_for_once_and_only_when_they_are_needed():
+    hw, beta_hw = (64, 96), (60, 80)
+    given = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    asked = []
+
+    class Files(dict):
+        def __getitem__(self, name):
+            asked.append(name)
+            return super().__getitem__(name)
+
+    network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
+    found = fuse(network, rig, Files(given), alpha="mono")
+    assert torch.equal(found.image, fuse(network, rig, given, alpha="mono").image)
+    assert asked.count("colour") == 1  # mono is asked for by the tests' check of types, too
+
+
 def test_memory_decides_the_tiles():
     network, hw = network_of("PAT"), (3000, 4000)
-    assert pat.fuse.plan(network, hw, [], None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
-    tiles = pat.fuse.plan(network, hw, [], 2.0**31)
+    assert plan(network, hw, [], None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
+    tiles = plan(network, hw, [], 2.0**31)
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
     assert area * network.bytes_per_pixel <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
-    with pytest.raises(ValueError, match="needs at least"):
-        pat.fuse.plan(network, hw, [], 2.0**20)
+    with pytest.raises(ValueError, match="need at least 77 MiB"):
+        plan(network, hw, [], 2.0**20)
 
 
 def test_tiles_are_those_with_the_least_work():
-    """No square tiles under the same limit make less; and a halo nearly as wide as the frame makes strips of it."""
-    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), 3.0 * 2**30
+    """Square tiles under the same limit make more."""
+    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), 2.0**30
 
     def work(tiles):
         return sum((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
 
-    ours = pat.fuse.plan(network, hw, [], limit)
-    side = int(math.sqrt(limit / network.bytes_per_pixel)) - 2 * network.halo
-    assert work(ours) < 0.8 * work(tiles_of(hw, side, network.halo))
-    assert all(pat.fuse.working_memory(network, t, []) <= limit for t in ours)
+    ours = plan(network, hw, [], limit)
+    side = int(math.sqrt(limit / network.bytes_per_pixel)) - 2 * REACH
+    assert work(ours) < 0.95 * work(tiles_of(hw, side, REACH))
+    assert all(working_memory(network, t, []) <= limit for t in ours)
 
 
 def test_the_plan_is_told_before_the_work():
     told, rig = [], rig_of((50, 70), (40, 60))
     images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
     fuse(network_of("PAT"), rig, images, alpha="mono", announce=told.append)
-    assert str(told[0]).startswith("1 piece, 0.0")
+    assert str(told[0]).startswith("1 piece, 0.5")
     assert told[0].seconds is None
 
 

@@ -1,10 +1,12 @@
 """The four arrays: their rigs are the paper's, what they record is what a user would have, fusing it gains."""
 
 import math
+import re
 
 import pytest
 import torch
 
+import pat.systems.stage
 from arraygeom import Rig
 from pat.cli import main
 from pat.develop import demosaiced, read_views, to_linear
@@ -78,6 +80,16 @@ def test_a_layer_moved_sideways_is_displaced_by_focal_over_depth(tiny):
     assert off[1] < min(off[0], off[2])
 
 
+def test_large_pictures_are_rendered_in_bands(tiny, monkeypatch):
+    s = stage("wide-narrow")
+    image, depth = s.seen("wide")
+    h, w = depth.shape
+    monkeypatch.setattr(pat.systems.stage, "BAND", 9 * w * (h // 3))
+    banded, banded_depth = s.seen("wide")
+    assert (banded - image).abs().max() < 1e-3
+    torch.testing.assert_close(banded_depth, depth, rtol=1e-5, atol=0)
+
+
 def test_a_mosaic_is_undone_by_its_pattern():
     rgb = torch.rand(3, 1, 1).expand(3, 12, 14)
     for pattern in ("RGGB", "GBRG"):
@@ -93,6 +105,23 @@ def test_recordings_are_files_as_cameras_write_them(tiny, tmp_path):
     assert {p.name for p in result.written} >= {"figure.png", "scores.md", "fused.png", "view.yaml"}
     rows = {line.split("|")[1].strip(): line.split("|")[2] for line in result.table.splitlines() if "|" in line}
     assert float(rows["fusion"]) > float(rows["alpha alone"]) + 2
+
+
+@pytest.mark.slow
+def test_a_system_is_fused_apart_under_a_cap_and_recorded_once(tiny, tmp_path):
+    said = []
+    here = run_system("wide-narrow", tmp_path, say=said.append)
+    assert said[0].startswith("rendering")
+    apart = run_system("wide-narrow", tmp_path, max_memory="2GiB", say=said.append)
+    assert f"taking the recording in {tmp_path / 'inputs'}" in said
+    here_psnr, apart_psnr = (
+        next(float(line.split("|")[2]) for line in table.splitlines() if "fusion" in line)
+        for table in (here.table, apart.table)
+    )
+    assert apart_psnr == pytest.approx(here_psnr, abs=0.02)
+    peak = re.search(r"at most ([0-9.]+) GiB resident", apart.table)
+    assert 0.2 < float(peak[1]) < 2
+    assert "plan: 1 piece" in apart.table
 
 
 @pytest.mark.slow

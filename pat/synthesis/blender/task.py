@@ -204,10 +204,10 @@ def _scratch() -> Iterator[Path]:
     Its name tells whose it is: those of processes that were killed are removed.
     """
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
-    for folder in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
-        owner = folder.name.removeprefix(_SCRATCH).partition("-")[0]
+    for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():
+        owner = left.name.removeprefix(_SCRATCH).partition("-")[0]
         if owner.isdecimal() and not _alive(int(owner)):
-            shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(left, ignore_errors=True)
     with tempfile.TemporaryDirectory(dir=where, prefix=f"{_SCRATCH}{os.getpid()}-") as folder:
         yield Path(folder)
 

@@ -1,17 +1,14 @@
 """Whole jobs with the layered backend: `pat render`."""
 
 import errno
+import importlib.util
 import json
 import os
 import signal
-import subprocess
 import sys
 import threading
-import time
-from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 import yaml
 
@@ -25,8 +22,9 @@ from pat.farm.run import Summary, check_space, render
 from pat.farm.worker import _Server
 from pat.farm.workshop import Stopped
 from pat.synthesis.rendered import Rendered
+from tests.pat.farm import kills
 from tests.pat.farm.journals import events, started_after_done
-from tests.pat.farm.test_workshop import ROOT, children, wait_for_the_end_of
+from tests.pat.farm.test_workshop import ROOT, children
 
 RIG = """
 depth: [2, 20]
@@ -51,28 +49,15 @@ def write(path: Path, **changes) -> None:
     path.write_text(yaml.safe_dump(settings | changes))
 
 
-def arrays(folder: Path) -> dict[str, np.ndarray]:
-    found = {}
-    for file in sorted(folder.glob("*.npz")):
-        with np.load(file) as held:
-            found |= {f"{file.name}:{key}": held[key] for key in held}
-    return found
-
-
-def same(one: Path, other: Path) -> bool:
-    a, b = arrays(one), arrays(other)
-    return bool(a) and a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
-
-
 def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     """The first run loses a worker and then its parent; the second makes the rest."""
     out = tmp_path / "data"
     command = [sys.executable, "-c", "from pat.cli import main; main()", "render", str(config), "--out", str(out)]
-    with killed_in_the_end([*command, "--scenes", "40"]) as parent:
-        wait_until(lambda: len(JobFolder(out).done()) >= 2)
+    with kills.killed_in_the_end([*command, "--scenes", "40"]) as parent:
+        kills.wait_until(lambda: len(JobFolder(out).done()) >= 2)
         os.kill(children(parent.pid)[0], signal.SIGKILL)
         known = len(JobFolder(out).done())
-        wait_until(lambda: len(JobFolder(out).done()) > known)
+        kills.wait_until(lambda: len(JobFolder(out).done()) > known)
     had = len(JobFolder(out).done())
     main(["render", str(config), "--scenes", str(had + 2), "--out", str(out)])
     said = " ".join(capfd.readouterr().err.split())
@@ -91,52 +76,26 @@ def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     assert (frame.index > 0).all()
 
 
-@contextmanager
-def killed_in_the_end(command: list[str]):
-    """A run of `pat render` that is killed (kill -9) when the block ends; its workers go with it."""
-    parent = subprocess.Popen(command, stderr=subprocess.DEVNULL)
-    try:
-        yield parent
-    finally:
-        workers = children(parent.pid)
-        parent.kill()
-        parent.wait()
-        wait_for_the_end_of(workers)
-
-
-def wait_until(condition) -> None:
-    end = time.monotonic() + 500
-    while not condition():
-        assert time.monotonic() < end
-        time.sleep(0.02)
-
-
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_thirty_scenes_survive_ten_kills_and_dask_makes_the_same(config, tmp_path):
-    out = tmp_path / "data"
-    command = [sys.executable, "-c", "from pat.cli import main; main()", "render", str(config), "--out", str(out)]
-    rng = np.random.default_rng(0)
-    for turn in range(5):
-        known = len(JobFolder(out).done())
-        with killed_in_the_end([*command, "--scenes", "30", "--workers", "2"]) as parent:
-            wait_until(lambda p=parent, k=known: len(JobFolder(out).done()) >= min(k + 2, 30) or p.poll() is not None)
-            for pid in children(parent.pid)[:1]:
-                os.kill(pid, signal.SIGKILL)
-            time.sleep(rng.uniform(0, 8) if turn % 2 else rng.uniform(0, 1))
-    subprocess.run([*command, "--scenes", "30", "--workers", "2"], check=True)
-    assert JobFolder(out).done() == list(range(30))
-    assert started_after_done(out) == []
-    assert not JobFolder(out).given_up()
-    assert all(len(arrays(JobFolder(out).scene(i))) == 6 for i in range(30))
-    part = tmp_path / "part"
-    render(RenderConfig.load(config), scenes=2, out=part, shard=Shard(1, 2))
-    assert JobFolder(part).done() == [0]
-    assert same(JobFolder(out).scene(0), JobFolder(part).scene(0))
+@pytest.mark.parametrize("backend", ["layered", "blender"])
+def test_thirty_scenes_survive_ten_kills_and_dask_makes_the_same(tmp_path, monkeypatch, backend):
+    if backend == "blender" and importlib.util.find_spec("bpy") is None:
+        pytest.skip("Blender is not installed: pip install '.[synthesis]'")
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    path, out = kills.write_config(tmp_path, backend), tmp_path / "data"
+    survived = kills.killed_again_and_again(path, out, scenes=30, kills=10)
+    assert survived.workers_killed + survived.commands_killed == 10
+    assert kills.faults(out, 30) == []
     again = tmp_path / "dask"
-    summary = render(RenderConfig.load(config), scenes=30, out=again, workers=2, scheduler="local")
+    summary = render(RenderConfig.load(path), scenes=30, out=again, workers=2, scheduler="local")
     assert summary.made == 30
-    assert all(same(JobFolder(out).scene(i), JobFolder(again).scene(i)) for i in range(30))
+    light = [kills.difference(JobFolder(out).scene(i), JobFolder(again).scene(i)) for i in range(30)]
+    assert max(light) < 1e-3
+    part = tmp_path / "part"
+    render(RenderConfig.load(path), scenes=2, out=part, shard=Shard(1, 2))
+    assert JobFolder(part).done() == [0]
+    assert kills.difference(JobFolder(out).scene(0), JobFolder(part).scene(0)) < 1e-3
 
 
 def fails(arguments, capfd) -> str:
