@@ -74,7 +74,7 @@ notebooks: $(READY)
 	@$(BIN)/python notebooks/run.py
 
 docs: $(READY)
-	@$(BIN)/mkdocs build --strict --quiet
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 drawings: $(READY)
 	@$(BIN)/python docs/drawings.py

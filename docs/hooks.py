@@ -1,9 +1,10 @@
-"""What the pages take from elsewhere: {{ file PATH }}, {{ commands }}, {{ formats }}."""
+"""What the pages take from elsewhere: {{ file PATH }}, {{ notebook NAME }}, {{ commands }}, {{ formats }}."""
 
 from __future__ import annotations
 
 import contextlib
 import io
+import json
 import os
 import re
 from pathlib import Path
@@ -16,6 +17,7 @@ MISSING = "*(not made yet)*"
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in what a page asks for."""
     markdown = re.sub(r"\{\{ file (\S+) \}\}", lambda found: included(found[1]), markdown)
+    markdown = re.sub(r"\{\{ notebook (\S+) \}\}", lambda found: notebook(found[1]), markdown)
     for name, made in (("commands", commands), ("formats", formats)):
         if f"{{{{ {name} }}}}" in markdown:
             markdown = markdown.replace(f"{{{{ {name} }}}}", made())
@@ -28,6 +30,31 @@ def included(name: str) -> str:
     if not path.exists():
         return MISSING
     return re.sub(r"\A# .*\n", "", path.read_text(encoding="utf-8"))
+
+
+def notebook(name: str) -> str:
+    """A notebook as it stands in the repository, with what it put out. Its links lead to these pages."""
+    cells = json.loads((ROOT / "notebooks" / f"{name}.ipynb").read_text(encoding="utf-8"))["cells"]
+    text = "\n\n".join(part for cell in cells for part in cell_parts(cell))
+    return re.sub(r"\]\((\d_\w+)\.ipynb\)", r"](\1.md)", text).replace("](../docs/", "](../")
+
+
+def cell_parts(cell: dict[str, Any]) -> list[str]:
+    """Markdown as it is; code, and below it what was printed and drawn."""
+    source = "".join(cell["source"])
+    if cell["cell_type"] == "markdown":
+        return [source]
+    return [f"```python\n{source}\n```", *(shown(output) for output in cell["outputs"])]
+
+
+def shown(output: dict[str, Any]) -> str:
+    """A picture, or text."""
+    data = output.get("data", {})
+    for kind in ("image/jpeg", "image/png"):
+        if kind in data:
+            return f"![](data:{kind};base64,{''.join(data[kind]).replace(chr(10), '')})"
+    text = "".join(output.get("text") or data.get("text/plain", ""))
+    return f"```text\n{text.rstrip()}\n```"
 
 
 def commands() -> str:

@@ -1,5 +1,7 @@
 """The documentation's samples run, its links lead somewhere, and the site builds without a warning."""
 
+import json
+import os
 import re
 import subprocess
 import sys
@@ -13,6 +15,7 @@ from pat.images import write_image
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
+NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
 ELSEWHERE = {"dask_jobqueue"}
@@ -58,6 +61,18 @@ def test_links_lead_somewhere(page):
     assert [link for link in local if link and not (page.parent / link).exists()] == []
 
 
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
+def test_a_notebook_is_a_page_and_is_found_from_the_readme(notebook):
+    cells = json.loads(notebook.read_text())["cells"]
+    prose = "".join(line for cell in cells if cell["cell_type"] == "markdown" for line in cell["source"])
+    links = [link for link in re.findall(r"\]\(([^)]+)\)", prose) if "://" not in link]
+    assert [link for link in links if not (notebook.parent / link).exists()] == []
+    page = ROOT / "docs" / "notebooks" / f"{notebook.stem}.md"
+    assert page.read_text() == f"{{{{ notebook {notebook.stem} }}}}\n"
+    assert f"]({page.name})" in (page.parent / "index.md").read_text()
+    assert f"](notebooks/{notebook.name})" in (ROOT / "README.md").read_text()
+
+
 def test_commands_in_the_pages_exist():
     """Every `pat ...` that a page shows parses: its --help is printed."""
     from pat.cli import Command
@@ -87,7 +102,12 @@ def test_the_site_builds_without_a_warning(tmp_path):
         cwd=ROOT,
         capture_output=True,
         text=True,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
     )
+    assert built.stderr.count("WARNING") == 0
     assert built.returncode == 0, built.stderr
     assert "Epipolar" in (tmp_path / "api" / "arraygeom.html").read_text()
     assert "--alpha" in (tmp_path / "commands.html").read_text()
+    story = (tmp_path / "notebooks" / "1_ten_minutes.html").read_text()
+    assert 'src="data:image/jpeg;base64,' in story
+    assert 'href="2_receptive_fields.html"' in story

@@ -44,6 +44,12 @@ def test_an_unknown_system_is_named(capsys):
     assert all(name in shown for name in NAMES)
 
 
+def test_a_scale_makes_the_reduced_size_smaller_and_leaves_the_full_one():
+    system = load_system("exposures")
+    sizes = [system.sized(full, scale=scale)["alpha"].hw for full, scale in ((False, 1), (False, 0.5), (True, 0.5))]
+    assert sizes == [(320, 512), (160, 256), (800, 1280)]
+
+
 @pytest.fixture
 def tiny(monkeypatch):
     """Every system at a few thousand pixels."""
