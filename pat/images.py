@@ -107,7 +107,7 @@ def _packed_bits(path: Path) -> int:
 
 def _log_level(level: int) -> int:
     """Set how much OpenCV says; what it was before. OpenCV 5 has the function in another place."""
-    logging = cv2 if hasattr(cv2, "setLogLevel") else cv2.utils.logging
+    logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
     return int(logging.setLogLevel(level))
 
 
