@@ -4,7 +4,7 @@ Four squares meet in a corner: grey is a + b S(d) S(e) with d, e the distances i
 from -1 to 1 blurred by a Gaussian. Position, levels and blur of each corner are fitted by least squares to the pixels
 beside its edges (Gauss-Newton); the edges' directions and how a lens bends them come from a smooth map of the whole
 board, as all its corners tell it. The pixels looked at are symmetric about the corner, so that gamma, glare and ink
-that spreads, which move every edge towards one colour, move no corner.
+that spreads, which move every edge towards one colour, hardly move a corner.
 """
 
 from __future__ import annotations
@@ -32,6 +32,8 @@ SETTLED = 1e-3
 """Steps below this, in pixels, end the search."""
 BLUR = 0.4, 3.0
 """Least and most standard deviation of the blur, pixels."""
+DEGREES = {0: 0, 12: 1, 30: 3, 42: 4, 54: 5}
+"""The degree of the polynomial that bends the board's map, by how many points there are at least."""
 PASSES = 2
 """The map of the board is made again from better corners."""
 FEWEST = 8
@@ -76,14 +78,14 @@ def refine_corners(
 
 
 def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: Bool[np.ndarray, " n"]) -> Map:
-    """From the board to the picture: a homography and on top of it a polynomial, of degree 3 if the points allow.
+    """From the board to the picture: a homography and on top of it a polynomial, of degree 5 if the points allow.
 
     Points that are far off the others' map have no say.
     """
     middle, size = p[good].mean(0), max(float(np.abs(p[good] - p[good].mean(0)).max()), 1e-9)
     H, kept = cv2.findHomography(p[good], x[good], cv2.RANSAC, 3.0)
     weight = kept[:, 0].astype(float) if kept.mean() > 0.5 else np.ones(int(good.sum()))
-    degree = 3 if good.sum() >= 30 else 1 if good.sum() >= 12 else 0
+    degree = max(d for fewest, d in DEGREES.items() if good.sum() >= fewest)
     flat = cv2.perspectiveTransform(p[good][:, None], H)[:, 0]
     basis = _powers((p[good] - middle) / size, degree)
     for _ in range(4):

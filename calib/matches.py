@@ -72,8 +72,8 @@ def detect(picture: Float[Tensor, "_ h w"]) -> Features:
     found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
     points = np.array([p.pt for p in found], np.float64).reshape(-1, 2)
     sizes, angles = (np.array([getattr(p, name) for p in found], np.float64) for name in ("size", "angle"))
-    descriptors = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
-    return Features(points, sizes, np.radians(angles), descriptors, even)
+    known = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
+    return Features(points, sizes, np.radians(angles), known, even)
 
 
 def _chosen(a: Features, b: Features) -> tuple[list[int], list[int]]:

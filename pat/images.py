@@ -108,14 +108,20 @@ def _packed_bits(path: Path) -> int:
     return 0 if bits == 16 else int(bits)
 
 
+def _log_level(level: int) -> int:
+    """Set how much OpenCV says; what it was before. OpenCV 5 has the function in another place."""
+    logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
+    return int(logging.setLogLevel(level))
+
+
 def _decode_bytes(content: NDArray) -> NDArray | None:
-    level = cv2.setLogLevel(0)
+    level = _log_level(0)
     try:
         return cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
     finally:
-        cv2.setLogLevel(level)
+        _log_level(level)
 
 
 def _opaque(coded: NDArray, label: str) -> NDArray:

@@ -51,7 +51,7 @@ def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose
     found: list[Pose] = []
     while len(found) < count:
         pose = _pose(cameras[cameras.names[len(found) % len(cameras.names)]], random)
-        if all(_seen(c, pose) >= LEAST_SEEN for c in cameras.cameras.values()):
+        if all(_seen(cameras[name], pose) >= LEAST_SEEN for name in cameras.names):
             found.append(pose)
     return found
 

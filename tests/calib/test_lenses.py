@@ -40,7 +40,7 @@ def medians(k1: float) -> tuple[float, float]:
 
 def test_lines_that_bend_are_followed():
     straight, bent = medians(-0.25)
-    assert bent < 0.06 < 0.3 < straight
+    assert bent < 0.06 < 0.15 < straight
 
 
 def test_lenses_that_do_not_bend_change_nothing():

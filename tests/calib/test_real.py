@@ -1,16 +1,23 @@
-"""Real pictures of real rigs: what the benchmarks measure at length."""
+"""Real and rendered pictures of rigs: what the benchmarks measure at length."""
+
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import Rig
+from calib.boards import parse_board
+from calib.calibrate import calibrate
+from calib.collect import collect_folder
 from calib.doctor import diagnose, diagnose_matches
 from calib.matches import match_cameras
 from calib.refine import refine_matches
 from tests.benchmarks.bench_doctor import MISTAKES
 from tests.benchmarks.bench_refine import worse
+from tests.calib.boards_seen import errors_of, pose_errors
 from tests.calib.real import bumblebee, syntim
+from tests.calib.rendered import BOARD, photograph
 
 
 @pytest.mark.slow
@@ -43,3 +50,18 @@ def test_real_rigs_return(shared_data, source):
     assert found.accepted
     assert found.held_out[1].median < 0.3 < 1 < found.held_out[0].median
     assert diagnose_matches(found.rig, {n: c.hw for n, c in rig.cameras.items()}, matches).before.misfit < 0.2
+
+
+@pytest.mark.slow
+def test_rendered_photographs_of_four_cameras(tmp_path):
+    """Twelve boards, found, fitted and compared with the rig that took them (ten minutes of one core)."""
+    if find_spec("bpy") is None:
+        pytest.skip("rendering needs `make synthesis`")
+    photograph(tmp_path)
+    true = Rig.load(tmp_path / "true.yaml")
+    views = collect_folder(tmp_path, parse_board(BOARD)).views
+    fit = calibrate({name: views[name] for name in true.names}, parse_board(BOARD)).fit
+    degrees, metres = pose_errors(fit, true)
+    assert degrees < 0.02
+    assert metres < 0.2e-3
+    assert np.abs(errors_of(fit, true) / np.sqrt(fit.covariance.diagonal())).max() < 3
