@@ -1,5 +1,6 @@
 """The explorer in a real browser: clicks and sliders, what is drawn, and how long it takes."""
 
+import json
 import re
 import shutil
 import subprocess
@@ -162,3 +163,19 @@ def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page, tmp_path):
     assert {"mono", "colour", "the pixel"} <= set(traces)
     page.save_screenshot(str(tmp_path / "explorer.png"))
     assert [entry for entry in page.get_log("browser") if entry["level"] == "SEVERE"] == []
+
+
+def test_the_rig_in_space_follows_once_the_controls_rest(page):
+    camera = (
+        SCRIPT
+        + """
+        const plot = [...doc._all_models.values()].filter(m => m.type.endsWith('PlotlyPlot'))[0];
+        const entries = (data) => data instanceof Map ? [...data] : Object.entries(data);
+        const plain = (v) => v && typeof v == 'object' && v[Symbol.iterator] ? Array.from(v, plain) : v;
+        return JSON.stringify(plot.data.map(t => entries(t).map(([k, v]) => [k, plain(v)])));
+        """
+    )
+    before = page.execute_script(camera)
+    assert before.count(".") > 20
+    page.execute_script(SCRIPT + "titled('colour.rotation y (deg)').value = 2.0")
+    until(page, camera.replace("return JSON", f"return {json.dumps(before)} != JSON"), seconds=30)
