@@ -160,7 +160,7 @@ PROBE = 192
 
 class Probe(NamedTuple):
     """What a small piece from the middle of alpha took: bytes that the survey leaves for each pixel of alpha, seconds
-    of the survey for each pixel, and of the rest for each byte of working memory."""
+    of the survey and of the rest for each byte of working memory, which goes by the pixels of both views."""
 
     known: float
     survey: float
@@ -183,14 +183,13 @@ class Probe(NamedTuple):
             fuse_tile(betas, piece)
             end = time.perf_counter()
         known = sum(part.nbytes for consensus in found if consensus is not None for part in consensus)
-        surveying = middle - begin
-        fusing = max(end - middle - surveying, 0.0)
-        return cls(known / _area(box), surveying / _area(box), fusing / working_memory(network, piece, betas))
+        surveying, work = middle - begin, working_memory(network, piece, betas)
+        return cls(known / _area(box), surveying / work, max(end - middle - surveying, 0.0) / work)
 
     def seconds(self, network: FusionNetwork, betas: list[Beta], surveys: list[Tile], tiles: list[Tile]) -> float:
         """About how long a frame will take here."""
-        work = sum(working_memory(network, tile, betas) for tile in tiles)
-        return self.survey * sum(_area(tile.outer) for tile in surveys) + self.fusion * work
+        surveying, fusing = (sum(working_memory(network, t, betas) for t in pieces) for pieces in (surveys, tiles))
+        return self.survey * surveying + self.fusion * fusing
 
 
 def held_memory(own: Tensor, betas: list[Beta], known: float, *, frame: bool) -> float:
