@@ -47,6 +47,7 @@ from .images import luminance, write_atomically
 from .model import Fused, FusionNetwork, Look
 from .tiles import (
     PROBE,
+    SLACK,
     Beta,
     Plan,
     Probe,
@@ -152,7 +153,7 @@ def fuse(
         if name in images
     ]
     hw, surveys = rig[alpha].hw, survey_tiles(network, rig[alpha].hw)
-    large, limit = math.prod(hw) > 16 * PROBE**2, None if max_memory is None else parse_bytes(max_memory)
+    large, limit = math.prod(hw) > 16 * PROBE**2, None if max_memory is None else parse_bytes(max_memory) / SLACK
     probe = Probe.of(network, own, betas, partial(_fuse_tile, network, own)) if large and (limit or announce) else None
     held = held_memory(own, betas, probe.known if probe else 0.0, frame=store is None)
     surveying = survey_memory(surveys, probe)
@@ -160,7 +161,7 @@ def fuse(
     if announce:
         work = max(surveying, *(working_memory(network, tile, betas) for tile in tiles))
         seconds = probe.seconds(network, betas, surveys, tiles) if probe else None
-        announce(Plan(tiles, held + work, seconds, len(surveys)))
+        announce(Plan(tiles, SLACK * (held + work), seconds, len(surveys)))
     betas = [surveyed(network, own, beta, surveys) for beta in betas]
     make = partial(_fuse_tile, network, own, betas)
     shown = progress(tiles, len(tiles)) if progress else tiles

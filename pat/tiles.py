@@ -21,11 +21,13 @@ from .model import FusionNetwork, Look
 REACH = 256
 """The widest halo, pixels: farther off, nothing was seen to matter to trained weights (at 224 pixels 2e-6 of the
 picture, at 256 less than 1e-7), whatever their convolutions could carry."""
-SURVEYED = 2_400_000
+SURVEYED = 1_600_000
 """Pixels of alpha that are surveyed at once. Larger frames are cut the same way whatever memory is allowed, so that
 results do not depend on it."""
 LIBRARIES = 0.5 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
+SLACK = 1.06
+"""What a process takes over what is counted here: 4.06 GiB were seen where 3.99 had been planned."""
 SURVEY_BYTES = 330.0
 """Working memory of a survey for each pixel of alpha, measured."""
 FRAME_BYTES = 20.0
