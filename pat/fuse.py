@@ -153,7 +153,7 @@ def fuse(
         if name in images
     ]
     hw, surveys = rig[alpha].hw, survey_tiles(network, rig[alpha].hw)
-    large, limit = math.prod(hw) > 16 * PROBE**2, None if max_memory is None else parse_bytes(max_memory) / SLACK
+    large, limit = math.prod(hw) > 16 * PROBE**2, None if max_memory is None else parse_bytes(max_memory)
     probe = Probe.of(network, own, betas, partial(_fuse_tile, network, own)) if large and (limit or announce) else None
     held = held_memory(own, betas, probe.known if probe else 0.0, frame=store is None)
     surveying = survey_memory(surveys, probe)

@@ -104,7 +104,7 @@ def plan(
     whole = _whole(hw)
     if limit is None:
         return [whole]
-    left, halo = limit - held, min(network.halo, REACH)
+    left, halo = limit / SLACK - held, min(network.halo, REACH)
     if max(working_memory(network, whole, betas), surveying) <= left:
         return [whole]
     for sides in _by_work(hw, halo, network.multiple, left / network.bytes_per_pixel) if surveying <= left else ():
@@ -112,7 +112,7 @@ def plan(
         if max(working_memory(network, tile, betas) for tile in tiles) <= left:
             return tiles
     least = max(working_memory(network, tile, betas) for tile in tiles_of(hw, 64, halo))
-    needed = (held + max(least, surveying)) / 2**20
+    needed = SLACK * (held + max(least, surveying)) / 2**20
     raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this frame and network need at least {needed:.0f} MiB")
 
 
