@@ -47,6 +47,7 @@ from .images import luminance, write_atomically
 from .model import Fused, FusionNetwork, Look
 from .tiles import (
     PROBE,
+    SLACK,
     Beta,
     Plan,
     Probe,
@@ -160,7 +161,7 @@ def fuse(
     if announce:
         work = max(surveying, *(working_memory(network, tile, betas) for tile in tiles))
         seconds = probe.seconds(network, betas, surveys, tiles) if probe else None
-        announce(Plan(tiles, held + work, seconds, len(surveys)))
+        announce(Plan(tiles, SLACK * (held + work), seconds, len(surveys)))
     betas = [surveyed(network, own, beta, surveys) for beta in betas]
     make = partial(_fuse_tile, network, own, betas)
     shown = progress(tiles, len(tiles)) if progress else tiles

@@ -21,11 +21,13 @@ from .model import FusionNetwork, Look
 REACH = 256
 """The widest halo, pixels: farther off, nothing was seen to matter to trained weights (at 224 pixels 2e-6 of the
 picture, at 256 less than 1e-7), whatever their convolutions could carry."""
-SURVEYED = 2_400_000
+SURVEYED = 1_600_000
 """Pixels of alpha that are surveyed at once. Larger frames are cut the same way whatever memory is allowed, so that
 results do not depend on it."""
 LIBRARIES = 0.5 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
+SLACK = 1.06
+"""What a process takes over what is counted here: 4.06 GiB were seen where 3.99 had been planned."""
 SURVEY_BYTES = 330.0
 """Working memory of a survey for each pixel of alpha, measured."""
 FRAME_BYTES = 20.0
@@ -102,7 +104,7 @@ def plan(
     whole = _whole(hw)
     if limit is None:
         return [whole]
-    left, halo = limit - held, min(network.halo, REACH)
+    left, halo = limit / SLACK - held, min(network.halo, REACH)
     if max(working_memory(network, whole, betas), surveying) <= left:
         return [whole]
     for sides in _by_work(hw, halo, network.multiple, left / network.bytes_per_pixel) if surveying <= left else ():
@@ -110,7 +112,7 @@ def plan(
         if max(working_memory(network, tile, betas) for tile in tiles) <= left:
             return tiles
     least = max(working_memory(network, tile, betas) for tile in tiles_of(hw, 64, halo))
-    needed = (held + max(least, surveying)) / 2**20
+    needed = SLACK * (held + max(least, surveying)) / 2**20
     raise ValueError(f"max_memory is {limit / 2**20:.0f} MiB; this frame and network need at least {needed:.0f} MiB")
 
 
@@ -160,7 +162,7 @@ PROBE = 192
 
 class Probe(NamedTuple):
     """What a small piece from the middle of alpha took: bytes that the survey leaves for each pixel of alpha, seconds
-    of the survey for each pixel, and of the rest for each byte of working memory."""
+    of the survey and of the rest for each byte of working memory, which goes by the pixels of both views."""
 
     known: float
     survey: float
@@ -183,14 +185,13 @@ class Probe(NamedTuple):
             fuse_tile(betas, piece)
             end = time.perf_counter()
         known = sum(part.nbytes for consensus in found if consensus is not None for part in consensus)
-        surveying = middle - begin
-        fusing = max(end - middle - surveying, 0.0)
-        return cls(known / _area(box), surveying / _area(box), fusing / working_memory(network, piece, betas))
+        surveying, work = middle - begin, working_memory(network, piece, betas)
+        return cls(known / _area(box), surveying / work, max(end - middle - surveying, 0.0) / work)
 
     def seconds(self, network: FusionNetwork, betas: list[Beta], surveys: list[Tile], tiles: list[Tile]) -> float:
         """About how long a frame will take here."""
-        work = sum(working_memory(network, tile, betas) for tile in tiles)
-        return self.survey * sum(_area(tile.outer) for tile in surveys) + self.fusion * work
+        surveying, fusing = (sum(working_memory(network, t, betas) for t in pieces) for pieces in (surveys, tiles))
+        return self.survey * surveying + self.fusion * fusing
 
 
 def held_memory(own: Tensor, betas: list[Beta], known: float, *, frame: bool) -> float:
