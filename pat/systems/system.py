@@ -131,16 +131,8 @@ def run_system(
     `photos` is a folder of pictures for the scene's textures; without, patterns and scikit-image's pictures are used.
     """
     system = load_system(name)
-<<<<<<< HEAD
-    rig = system.sized(full)
+    rig = system.sized(full, scale=scale)
     recording, files = recorded(system, rig, out / "inputs", photos=photos, say=say)
-=======
-    module, rig = system.module, system.sized(full, scale=scale)
-    say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
-    stage = Stage(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
-    recording = module.record_scene(stage)
-    files = write_recording(recording, rig, out / "inputs")
->>>>>>> way
     say("fusing")
     run = _sequence if len(recording.truth) > 1 else _still
     how = How(weights, max_memory, say)
