@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -85,7 +85,7 @@ class FusedFrame(NamedTuple):
 def fuse(
     network: FusionNetwork,
     rig: Rig,
-    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    images: Mapping[str, Any],
     *,
     alpha: str,
     depth: tuple[float, float] | None = None,
@@ -106,8 +106,8 @@ def fuse(
     Args:
         network: `load_weights("mono-colour")`, say.
         rig: the cameras. Those without a picture in `images` are left out.
-        images: by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping that reads them when
-            asked saves memory (`pat.develop.ViewFiles`).
+        images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping that reads
+            them when asked saves memory (`pat.develop.ViewFiles`).
         alpha: the camera whose view is wanted.
         depth: (near, far) in metres, instead of the rig's.
         field: where to look; by default the depth-bounded epipolar segment of calibrated cameras, the run of the
@@ -219,7 +219,7 @@ class TileStore(NamedTuple):
         return self.folder / f"{self.digest}_{'_'.join(map(str, (*tile.inner, *tile.outer)))}.safetensors"
 
 
-def without_lenses(rig: Rig, images: Mapping[str, Tensor]) -> tuple[Rig, dict[str, Tensor]]:
+def without_lenses(rig: Rig, images: Mapping[str, Any]) -> tuple[Rig, dict[str, Tensor]]:
     """The rig and its pictures with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
     straight = dict(images)
     for name, image in images.items():
@@ -277,7 +277,7 @@ def default_field(pair: Pair) -> ReceptiveField:
     return Rectified(alpha_is="either", max_disparity=0.12 * pair.beta.hw[1])
 
 
-def _check_names(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
+def _check_names(rig: Rig, images: Mapping[str, Any], alpha: str) -> None:
     for name in (alpha, *images):
         rig.known(name)
     if alpha not in images:
@@ -286,7 +286,7 @@ def _check_names(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> None:
         raise ValueError(f"no picture of any other camera than alpha, '{alpha}': fusion needs at least one beta")
 
 
-def _picture(rig: Rig, images: Mapping[str, Tensor], name: str) -> Tensor:
+def _picture(rig: Rig, images: Mapping[str, Any], name: str) -> Tensor:
     """The picture of a camera, which may be read from its file only now, found to be usable."""
     image, (h, w) = images[name], rig[name].hw
     if tuple(image.shape[1:]) != (h, w):
