@@ -90,14 +90,7 @@ def classical_fusion_calibrated(
     and the colours taken back to alpha. Raises ValueError if 0 < near < far does not hold, and for cameras
     that look along the line between them (nothing rectifies those).
     """
-    near, far = depth
-    if not 0 < near < far:
-        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
-    matrices = (x.detach().cpu().double().numpy() for x in (K_alpha, K_beta, R, t))
-    plane = _rectified_plane(*matrices, hw=(alpha.shape[1], alpha.shape[2]), depth=depth)
-    mono = _warped(_planes(alpha), plane.from_alpha, plane.wh)
-    inside = _covered((beta.shape[1], beta.shape[2]), plane.from_beta, plane.wh)
-    colours = _warped(_planes(beta), plane.from_beta, plane.wh)
+    plane, mono, colours, inside = _on_one_plane(alpha, beta, (K_alpha, K_beta, R, t), depth)
     sharpness = float(K_beta[0, 0] / K_alpha[0, 0])
     chroma = _carried_chroma(mono, colours, inside, plane.max_disparity, sharpness)
     back = _warped(chroma, np.linalg.inv(plane.from_alpha), (alpha.shape[2], alpha.shape[1]))
@@ -118,14 +111,7 @@ def classical_band_calibrated(
 
     Arguments and errors are as of `classical_fusion_calibrated`.
     """
-    near, far = depth
-    if not 0 < near < far:
-        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
-    matrices = (x.detach().cpu().double().numpy() for x in (K_alpha, K_beta, R, t))
-    plane = _rectified_plane(*matrices, hw=(alpha.shape[1], alpha.shape[2]), depth=depth)
-    mono = _warped(_planes(alpha), plane.from_alpha, plane.wh)
-    inside = _covered((beta.shape[1], beta.shape[2]), plane.from_beta, plane.wh)
-    band = _warped(_planes(beta), plane.from_beta, plane.wh)
+    plane, mono, band, inside = _on_one_plane(alpha, beta, (K_alpha, K_beta, R, t), depth)
     difference = _carried_band(mono, band, inside, plane.max_disparity, float(K_beta[0, 0] / K_alpha[0, 0]))
     back = _warped(difference, np.linalg.inv(plane.from_alpha), (alpha.shape[2], alpha.shape[1]))
     return (alpha + torch.from_numpy(back)[None].to(alpha)).clamp(0, 1)
@@ -138,6 +124,20 @@ class _Plane(NamedTuple):
     from_beta: NDArray[np.float64]
     wh: tuple[int, int]
     max_disparity: float
+
+
+def _on_one_plane(
+    alpha: Tensor, beta: Tensor, cameras: tuple[Tensor, ...], depth: tuple[float, float]
+) -> tuple[_Plane, Picture, Picture, Picture]:
+    """The common plane of two cameras (K_alpha, K_beta, R, t), both pictures on it, and where beta has content."""
+    near, far = depth
+    if not 0 < near < far:
+        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
+    matrices = (x.detach().cpu().double().numpy() for x in cameras)
+    plane = _rectified_plane(*matrices, hw=(alpha.shape[1], alpha.shape[2]), depth=depth)
+    inside = _covered((beta.shape[1], beta.shape[2]), plane.from_beta, plane.wh)
+    mono, other = _warped(_planes(alpha), plane.from_alpha, plane.wh), _warped(_planes(beta), plane.from_beta, plane.wh)
+    return plane, mono, other, inside
 
 
 def _rectified_plane(K_alpha, K_beta, R, t, *, hw: tuple[int, int], depth: tuple[float, float]) -> _Plane:

@@ -124,10 +124,9 @@ def levelled(picture: Float[Tensor, "b 1 hb wb"], like: Float[Tensor, "b 1 h w"]
 def _geometry(segments: Segments, batch: int) -> _Geometry:
     """An invalid segment is as short as none: its length is negative."""
     length = segments.length
-    along = (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
     end = (segments.end + 0.5) / FINE - 0.5
     length = torch.where(segments.valid, length / FINE, -1.0)
-    return _Geometry(*(_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along, length)))
+    return _Geometry(*(_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length)))
 
 
 def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
@@ -261,9 +260,14 @@ def _regressed(
 def matches(segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
     """Where the alpha pixels of segments (B or 1, H, W) have their matches `reach` from the ends, beta's pixels."""
     length = segments.length
-    along = (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
     far = interpolate(reach, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
-    return segments.end + far.clamp(min=0).minimum(length)[..., None] * along
+    return segments.end + far.clamp(min=0).minimum(length)[..., None] * along(segments)
+
+
+def along(segments: Segments) -> Float[Tensor, "*n 2"]:
+    """Unit vectors from end to start; zero where a segment is a point."""
+    length = segments.length
+    return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
 
 
 def _enlarged(x: Tensor) -> Tensor:

@@ -21,7 +21,7 @@ from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 
 from .attention import Attended, attend, attend_with_statistics
 from .blocks import ResidualBlock, conv, enlarge
-from .consensus import FILLS, FINE, Consensus, consensus, matches
+from .consensus import FILLS, FINE, Consensus, along, consensus, matches
 from .images import luminance
 from .model import Fused, Look, Looks
 
@@ -235,8 +235,8 @@ class Carry(nn.Module):
 
 def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
     """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `reach` from their end."""
-    middle, along = matches(segments, reach), _along(segments)
-    return Segments(middle + window * along, middle - window * along, segments.valid.expand(middle.shape[:-1]))
+    middle, step = matches(segments, reach), window * along(segments)
+    return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
 def _segments(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:
@@ -248,12 +248,6 @@ def _segments(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segme
         raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the pictures")
     start, end = (v.reshape(-1, *grid, 2) for v in (found.start, found.end))
     return Segments(start, end, found.valid.reshape(-1, *grid))
-
-
-def _along(segments: Segments) -> Tensor:
-    """Unit vectors from end to start; zero where a segment is a point."""
-    length = segments.length
-    return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
 
 
 class Encoder(nn.Module):
