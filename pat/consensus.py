@@ -47,6 +47,8 @@ FILLS = 2
 """Ways in which colour is spread: along its regression on brightness, and as it is."""
 DETAIL_RADIUS, DETAIL_FLOOR = 3, 3e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
+LEVEL_RADIUS = 20
+"""Window in which beta's brightness at the matches gets the level of alpha's."""
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
 
@@ -119,6 +121,24 @@ def levelled(picture: Float[Tensor, "b 1 hb wb"], like: Float[Tensor, "b 1 h w"]
     spread, mean = torch.std_mean(picture, (1, 2, 3), keepdim=True)
     wanted, middle = torch.std_mean(like, (1, 2, 3), keepdim=True)
     return (picture - mean) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + middle
+
+
+def levelled_locally(
+    picture: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """The picture with another's mean around each pixel, where the weight is; both show the same at the same place.
+
+    Levels of whole pictures say little where these show different parts of a scene.
+    """
+    weight = weight + 1e-3
+    return picture + _mean(weight * (like - picture), LEVEL_RADIUS) / _mean(weight, LEVEL_RADIUS)
+
+
+def _mean(x: Tensor, radius: int) -> Tensor:
+    """Over squares around each pixel, as far as these are on the picture."""
+    side = 2 * radius + 1
+    rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
+    return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
 
 
 def _geometry(segments: Segments, batch: int) -> _Geometry:
@@ -210,10 +230,10 @@ def _colours(
     inside = position.clamp(min=0).minimum(position.new_tensor([beta.shape[-1] - 1, beta.shape[-2] - 1]))
     seen = sample(torch.cat([beta, guide, level], 1), inside, interpolation="bicubic").values
     values, own, brightness = seen.reshape(len(beta), -1, *hw).split([bands, 1, 1], 1)
-    matched = _detailed(values - own, brightness, alpha) + own - alpha
+    consistent = _enlarged((facts[:, :1] < CONSISTENT).to(alpha))
+    matched = _detailed(values - own, levelled_locally(brightness, alpha, valid * consistent), alpha) + own - alpha
     unlike = avg_pool2d((brightness - _no_sharper(alpha, level)).abs(), 3, 1, 1, count_include_pad=False)
-    agreed = _enlarged(torch.where(facts[:, :1] < CONSISTENT, 1.0, DOUBT))
-    trust = agreed * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+    trust = (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
     planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
     spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
 
@@ -234,9 +254,7 @@ def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
     The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution.
     """
 
-    def mean(x: Tensor) -> Tensor:
-        return avg_pool2d(x, 2 * DETAIL_RADIUS + 1, 1, DETAIL_RADIUS, count_include_pad=False)
-
+    mean = partial(_mean, radius=DETAIL_RADIUS)
     middle = mean(brightness)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
     slope = (mean(colour * brightness) - mean(colour) * middle) / (variance + DETAIL_FLOOR)
