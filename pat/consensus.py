@@ -87,6 +87,7 @@ class _Geometry(NamedTuple):
     end: NDArray[np.float32]
     along: NDArray[np.float32]
     length: NDArray[np.float32]
+    cut: NDArray[np.float32]
 
 
 @torch.no_grad()
@@ -105,7 +106,7 @@ def consensus(
     """
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     own, other = equally_sharp(own, levelled(other, own))
-    geometry = _geometry(blocks, len(alpha))
+    geometry = _geometry(blocks, len(alpha), (beta.shape[-2], beta.shape[-1]))
     found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
     planes = zip(found, consistent, _bytes(avg_pool2d(alpha, FINE)))
@@ -141,12 +142,17 @@ def _mean(x: Tensor, radius: int) -> Tensor:
     return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
 
 
-def _geometry(segments: Segments, batch: int) -> _Geometry:
-    """An invalid segment is as short as none: its length is negative."""
+def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
+    """An invalid segment is as short as none: its length is negative.
+
+    Segments that start within a pixel of beta's edge may have been cut there.
+    """
     length = segments.length
+    cut = segments.valid & ~on_picture(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
     end = (segments.end + 0.5) / FINE - 0.5
     length = torch.where(segments.valid, length / FINE, -1.0)
-    return _Geometry(*(_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length)))
+    planes = (_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length, cut))
+    return _Geometry(*planes)
 
 
 def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
@@ -178,15 +184,16 @@ def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, sli
 
 
 def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray) -> None:
-    own, own_bits, other, other_bits, end, along, length = views
+    own, own_bits, other, other_bits, end, along, length, cut = views
     inner, outer = box
-    a, a_bits, e, u, n = (np.ascontiguousarray(x[outer]) for x in (own, own_bits, end, along, length))
+    planes = (own, own_bits, end, along, length, cut)
+    a, a_bits, e, u, n, o = (np.ascontiguousarray(x[outer]) for x in planes)
     cost = np.empty((*a.shape, labels), np.uint8)
-    kernels.costs(a, a_bits, other, other_bits, e, u, n, cost)
+    kernels.costs(a, a_bits, other, other_bits, e, u, n, o, cost)
     total = np.zeros(cost.shape, np.float32)
     kernels.aggregate(cost, a, total)
     r, f = np.empty(a.shape, np.float32), np.empty((*a.shape, 3), np.float32)
-    kernels.winners(total, e, u, n, *other.shape, r, f)
+    kernels.winners(total, e, u, n, o, *other.shape, r, f)
     inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
     reach[inner], facts[inner] = r[inside], f[inside]
 

@@ -8,6 +8,8 @@ from pat.attention.cpu_kernels import compiled
 
 NOWHERE = np.uint8(80)
 """Cost of a label that is not on beta: more than any other can have."""
+UNSEEN = np.uint8(24)
+"""Cost of a label beyond beta's edge, where the point may well be: about as much as what is unlike."""
 MOST = np.float32(1e9)
 LEVELS = np.float32(30.0)
 """Cost of a difference of 1 in (levelled) brightness, which counts up to `TRUNCATED`."""
@@ -55,19 +57,23 @@ def _pixel(end, along, label):
 
 
 @compiled(nogil=True, cache=True)
-def costs(own, own_bits, other, other_bits, end, along, length, out):
+def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
     """How unlike alpha's pixel (own) and beta's (other) at each label are: out (h, w, labels).
 
-    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere.
+    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere, or, where
+    it is beta's edge that cuts the segment, not seen.
     """
     height, width, labels = out.shape
     rows, columns = other.shape
     for y in range(height):
         for x in range(width):
             reach = length[y, x] + HALF
+            beyond = UNSEEN if cut[y, x] else NOWHERE
             for label in range(labels):
                 column, row = _pixel(end[y, x], along[y, x], label)
-                if label > reach or column < 0 or row < 0 or column >= columns or row >= rows:
+                if label > reach:
+                    out[y, x, label] = beyond
+                elif column < 0 or row < 0 or column >= columns or row >= rows:
                     out[y, x, label] = NOWHERE
                 else:
                     unlike = min(abs(own[y, x] - other[row, column]) * LEVELS, TRUNCATED)
@@ -143,20 +149,20 @@ def _sweep(cost, guide, total, dx, way):
 
 
 @compiled(nogil=True, cache=True)
-def winners(total, end, along, length, rows, columns, reach, facts):
+def winners(total, end, along, length, cut, rows, columns, reach, facts):
     """Each pixel's best label, to a fraction (reach); and facts (h, w, 3): how far the best label of those that
     look at the same pixel of beta is from it, by how much it is better than the second, and how good it is."""
     claims = _claims(total, end, along, length, rows, columns)
     height, width, labels = total.shape
     for y in range(height):
         for x in range(width):
-            last = min(labels - 1, int(length[y, x] + HALF))
+            last = labels - 1 if cut[y, x] else min(labels - 1, int(length[y, x] + HALF))
             best, second = _two_best(total[y, x], last)
             lowest = total[y, x, best]
             reach[y, x] = np.float32(best) + _between(total[y, x], best, last)
             column, row = _pixel(end[y, x], along[y, x], best)
             facts[y, x, 0] = ONE
-            if 0 <= row < rows and 0 <= column < columns:
+            if best <= length[y, x] + HALF and 0 <= row < rows and 0 <= column < columns:
                 facts[y, x, 0] = min(np.float32(abs(claims[row, column] - best)) / FARTHEST, ONE)
             facts[y, x, 1] = min((second - lowest) / (8 * LARGE), ONE)
             facts[y, x, 2] = lowest / (8 * LARGE)
