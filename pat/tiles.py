@@ -210,12 +210,13 @@ def survey_tiles(network: FusionNetwork, hw: HW) -> list[Tile]:
 
 def surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta, pieces: list[Tile]) -> Beta:
     """The beta with what the network wants to know before it fuses pieces of a frame."""
-    if len(pieces) == 1:
-        m = network.multiple
-        with torch.no_grad():
-            known = network.survey(padded(alpha, m), padded(beta.picture, m), beta.look)
-    else:
-        known = _joined(((p, survey_piece(network, alpha, beta, p)) for p in pieces), network, alpha)
+    pictures = padded(alpha, network.multiple), padded(beta.picture, network.multiple)
+    with torch.no_grad():
+        if len(pieces) == 1:
+            known = network.survey(*pictures, beta.look)
+        else:
+            told = replace(beta, look=replace(beta.look, balances=network.balance(*pictures)))
+            known = _joined(((p, survey_piece(network, alpha, told, p)) for p in pieces), network, alpha)
     return replace(beta, look=replace(beta.look, known=known))
 
 
@@ -273,7 +274,8 @@ def strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) 
     known = beta.look.known
     if known is not None:
         known = known.cut((top, top - (top - bottom) // m * m, left, left - (left - right) // m * m))
-    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples, known), beta.pair, (x0, y0), beta.points)
+    look = replace(beta.look, at=at, known=known)
+    return Strip(beta.picture[..., y0:y1, x0:x1], look, beta.pair, (x0, y0), beta.points)
 
 
 def touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
