@@ -210,12 +210,13 @@ def survey_tiles(network: FusionNetwork, hw: HW) -> list[Tile]:
 
 def surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta, pieces: list[Tile]) -> Beta:
     """The beta with what the network wants to know before it fuses pieces of a frame."""
-    pictures = padded(alpha, network.multiple), padded(beta.picture, network.multiple)
+    m = network.multiple
     with torch.no_grad():
         if len(pieces) == 1:
-            known = network.survey(*pictures, beta.look)
+            known = network.survey(padded(alpha, m), padded(beta.picture, m), beta.look)
         else:
-            told = replace(beta, look=replace(beta.look, balances=network.balance(*pictures)))
+            balances = network.balance(padded(alpha, m), padded(beta.picture, m))
+            told = replace(beta, look=replace(beta.look, balances=balances))
             known = _joined(((p, survey_piece(network, alpha, told, p)) for p in pieces), network, alpha)
     return replace(beta, look=replace(beta.look, known=known))
 
