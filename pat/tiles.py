@@ -16,6 +16,7 @@ from arraygeom import Pair, Positions, Segments, pixel_grid
 from arraygeom.pixels import HW
 
 from .consensus import Consensus
+from .memory import give_back
 from .model import FusionNetwork, Look
 
 REACH = 256
@@ -109,7 +110,8 @@ def plan(
         return [whole]
     for sides in _by_work(hw, halo, network.multiple, left / network.bytes_per_pixel) if surveying <= left else ():
         tiles = list(tiles_of(hw, sides, halo))
-        if max(working_memory(network, tile, betas) for tile in tiles) <= left:
+        largest_first = sorted(tiles, key=lambda tile: -_area(tile.outer))
+        if all(working_memory(network, tile, betas) <= left for tile in largest_first):
             return tiles
     least = max(working_memory(network, tile, betas) for tile in tiles_of(hw, 64, halo))
     needed = SLACK * (held + max(least, surveying)) / 2**20
@@ -156,13 +158,15 @@ def _area(box: tuple[int, int, int, int]) -> int:
     return (bottom - top) * (right - left)
 
 
-PROBE = 192
-"""Side of the piece of alpha that is fused to estimate the time, pixels."""
+PROBE = (192, 512)
+"""Least and greatest side of the piece of alpha that is fused to estimate the time, pixels."""
+PROBED = 1 / 40
+"""The part of alpha that the piece is between these."""
 
 
 class Probe(NamedTuple):
-    """What a small piece from the middle of alpha took: bytes that the survey leaves for each pixel of alpha, seconds
-    of the survey and of the rest for each byte of working memory, which goes by the pixels of both views."""
+    """What a piece from the middle of alpha took, for each of its pixels: bytes that the survey leaves, seconds of
+    the survey and of the rest."""
 
     known: float
     survey: float
@@ -172,26 +176,31 @@ class Probe(NamedTuple):
     def of(
         cls, network: FusionNetwork, own: Tensor, betas: list[Beta], fuse_tile: Callable[[list[Beta], Tile], object]
     ) -> Probe:
-        """Survey and fuse the piece, twice: the first time loops may be compiled."""
+        """Survey and fuse a small piece, as loops may have to be compiled, and then one to measure."""
         h, w = own.shape[-2:]
-        m = network.multiple
-        top, left = (max((side - PROBE) // 2, 0) // m * m for side in (h, w))
-        box = (top, min(top + PROBE, h), left, min(left + PROBE, w))
-        piece = Tile(box, box)
-        for _ in range(2):
+        side = min(max(math.sqrt(h * w * PROBED), PROBE[0]), PROBE[1])
+        for n in (PROBE[0], int(side)):
+            piece = _middle((h, w), n, network.multiple)
             begin = time.perf_counter()
             found = [survey_piece(network, own, beta, piece) for beta in betas]
             middle = time.perf_counter()
             fuse_tile(betas, piece)
             end = time.perf_counter()
         known = sum(part.nbytes for consensus in found if consensus is not None for part in consensus)
-        surveying, work = middle - begin, working_memory(network, piece, betas)
-        return cls(known / _area(box), surveying / work, max(end - middle - surveying, 0.0) / work)
+        surveying, pixels = middle - begin, _area(piece.outer)
+        again = surveying if known else 0.0
+        return cls(known / pixels, surveying / pixels, max(end - middle - again, 0.0) / pixels)
 
-    def seconds(self, network: FusionNetwork, betas: list[Beta], surveys: list[Tile], tiles: list[Tile]) -> float:
-        """About how long a frame will take here."""
-        surveying, fusing = (sum(working_memory(network, t, betas) for t in pieces) for pieces in (surveys, tiles))
+    def seconds(self, surveys: list[Tile], tiles: list[Tile]) -> float:
+        """About how long a frame will take here, if the machine stays as busy as it was."""
+        surveying, fusing = (sum(_area(tile.outer) for tile in pieces) for pieces in (surveys, tiles))
         return self.survey * surveying + self.fusion * fusing
+
+
+def _middle(hw: HW, side: int, multiple: int) -> Tile:
+    top, left = (max((n - side) // 2, 0) // multiple * multiple for n in hw)
+    box = (top, min(top + side, hw[0]), left, min(left + side, hw[1]))
+    return Tile(box, box)
 
 
 def held_memory(own: Tensor, betas: list[Beta], known: float, *, frame: bool) -> float:
@@ -243,6 +252,8 @@ def _joined(pieces: Iterator[tuple[Tile, Consensus | None]], network: FusionNetw
         whole = whole or [p.new_empty(*p.shape[:-2], hw[0] // s, hw[1] // s) for p, s in zip(part, steps)]
         for target, p, s in zip(whole, part, steps):
             target[..., box[0] // s : box[1] // s, box[2] // s : box[3] // s] = p
+        del found, part, p
+        give_back()
     return Consensus(*whole)
 
 
@@ -297,16 +308,3 @@ def padded(picture: Tensor, multiple: int) -> Tensor:
     """The picture continued at the bottom and the right to whole multiples."""
     h, w = picture.shape[-2:]
     return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
-
-
-def parse_bytes(amount: float | str) -> float:
-    """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
-    if not isinstance(amount, str):
-        return float(amount)
-    units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-    number = amount.rstrip("BbKkMmGgIi ")
-    unit = amount[len(number) :].strip().upper() or "B"
-    try:
-        return float(number) * units[unit]
-    except (KeyError, ValueError):
-        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB") from None
