@@ -20,7 +20,7 @@ def parse_bytes(amount: float | str) -> float:
 
 
 def give_back() -> None:
-    """Return freed memory to the system: glibc keeps some 300 MiB of it after a tile, which the next may not fit into."""
+    """Return freed memory to the system: glibc keeps some 300 MiB after a tile, which the next may not fit."""
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
