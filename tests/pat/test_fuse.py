@@ -7,8 +7,21 @@ import torch
 
 import pat.fuse
 import pat.tiles
-from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Distortion,
+    Epipolar,
+    Link,
+    Pose,
+    Rectified,
+    Rig,
+    View,
+    intrinsics,
+    retaken,
+    rotation_from_vector,
+)
 from calib.matches import match_points, seen_depths
+from pat.data.pairs import flickr_pairs, kitti_pairs
 from pat.demo import load_sample
 from pat.fuse import fuse, pitch_ratio, quarter_turns, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
@@ -75,7 +88,7 @@ def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
     monkeypatch.setattr(pat.tiles, "SURVEYED", 150_000)
-    monkeypatch.setattr(pat.tiles, "REACH", 128)
+    monkeypatch.setattr(pat.tiles, "SURVEY_REACH", 128)
     assert len(pat.tiles.survey_tiles(network, sample.rig["mono"].hw)) > 1
     pieces = fuse(network, sample.rig, images, alpha="mono")
     truth = sample.truth
@@ -87,6 +100,27 @@ def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     tiled = fuse(network, sample.rig, images, alpha="mono")
     assert (tiled.image - pieces.image).abs().max() < 1e-5
     assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "which", [lambda data: kitti_pairs(data / "kitti"), lambda data: flickr_pairs(data / "flickr1024")]
+)
+def test_halos_are_wide_enough_for_the_weights(which, shared_data):
+    """Tiles of real pictures equal the whole with the weights that are shipped."""
+    pair, network = next(which(shared_data)), load_weights("mono-colour")
+    images = {"left": luminance(pair.left), "right": pair.right}
+    rig = Rig({name: View(hw=picture.shape[1:]) for name, picture in images.items()})
+    field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
+    whole = fuse(network, rig, images, alpha="left", field=field)
+    h, w = rig["left"].hw
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            pat.fuse, "plan", lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), REACH))
+        )
+        tiled = fuse(network, rig, images, alpha="left", field=field)
+    assert (tiled.image - whole.image).abs().max() < 1e-5
+    assert (tiled.confidence - whole.confidence).abs().max() < 1e-5
 
 
 def test_pictures_are_asked_for_once_and_only_when_they_are_needed():
