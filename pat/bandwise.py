@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .consensus import Consensus
+from .consensus import Balances, Consensus
 from .guided import GuidedPAT, GuidedPATConfig, Seen
 from .model import Fused, Look, Looks
 
@@ -44,6 +44,10 @@ class BandwisePAT(nn.Module):
         super().__init__()
         self.config = config
         self.single = GuidedPAT(GuidedPATConfig(**asdict(config)))
+
+    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"]) -> Balances:
+        """How the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
+        return self.single.balance(alpha, beta)
 
     def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus | None:
         """What can be known before attention looks, once for all bands of a beta."""

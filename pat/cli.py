@@ -142,7 +142,7 @@ class Fuse:
     def run(self) -> None:
         """Do it."""
         from .batch import find_pictures
-        from .fuse import parse_bytes
+        from .memory import parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")

@@ -8,7 +8,7 @@ worked out on pictures of half the size, as a whole frame and without gradients.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -81,6 +81,45 @@ class Consensus(NamedTuple):
         return self._replace(matched=self.matched[:, i : i + 1], colour=self.colour[:, :, i : i + 1])
 
 
+class Balance(NamedTuple):
+    """How beta's brightness is levelled to alpha's, and with what either is then blurred, for each of a batch.
+
+    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
+    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
+    """
+
+    level: Tensor
+    blurs: tuple[list[float], list[float]]
+
+    @classmethod
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Balance:
+        """What makes the means and standard deviations the same, and then the sharpness."""
+        (spread, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
+        level = torch.stack([mean, (wanted / spread.clamp(min=1e-3)).clamp(max=4), middle])
+        return cls(level, equalising_blurs(alpha, _levelled(beta, level)))
+
+    def levelled(self, beta: Tensor) -> Tensor:
+        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
+        return _levelled(beta, self.level)
+
+    def equally_sharp(self, alpha: Tensor, levelled: Tensor) -> tuple[Tensor, Tensor]:
+        """Both (or parts of them), the sharper one blurred."""
+        own, other = (_blurred(p, blurs) for p, blurs in zip((alpha, levelled), self.blurs))
+        return own, other
+
+
+class Balances(NamedTuple):
+    """Those of pictures, and of the same at half the size."""
+
+    whole: Balance
+    half: Balance
+
+    @classmethod
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Balances:
+        """Of alpha and beta's brightness; all sides are even."""
+        return cls(Balance.of(alpha, beta), Balance.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
+
+
 class _Geometry(NamedTuple):
     """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32."""
 
@@ -97,15 +136,17 @@ def consensus(
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
     blocks: Segments,
+    balances: Balances | None = None,
 ) -> Consensus:
     """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
 
     `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
-    of its 2x2 pixels, in beta's pixels. All sides are even. On the CPU, with as many threads as torch may use; the
-    same whatever their number.
+    of its 2x2 pixels, in beta's pixels. All sides are even. `balances` are those of the whole pictures if these are
+    parts. On the CPU, with as many threads as torch may use; the same whatever their number.
     """
+    balances = balances or Balances.of(alpha, guide)
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    own, other = equally_sharp(own, levelled(other, own))
+    own, other = balances.half.equally_sharp(own, balances.half.levelled(other))
     geometry = _geometry(blocks, len(alpha), (beta.shape[-2], beta.shape[-1]))
     found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
@@ -114,14 +155,7 @@ def consensus(
     smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, spread)])
     reach = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
     facts = torch.from_numpy(told).movedim(-1, 1).to(alpha)
-    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts))
-
-
-def levelled(picture: Float[Tensor, "b 1 hb wb"], like: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 hb wb"]:
-    """The picture with the mean and the standard deviation of another, each of the batch by itself."""
-    spread, mean = torch.std_mean(picture, (1, 2, 3), keepdim=True)
-    wanted, middle = torch.std_mean(like, (1, 2, 3), keepdim=True)
-    return (picture - mean) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + middle
+    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts, balances.whole))
 
 
 def levelled_locally(
@@ -198,28 +232,33 @@ def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray
     reach[inner], facts[inner] = r[inside], f[inside]
 
 
-def equally_sharp(
+def _levelled(picture: Tensor, level: Tensor) -> Tensor:
+    mean, factor, middle = level.to(picture)
+    return (picture - mean) * factor + middle
+
+
+def equalising_blurs(
     picture: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
-) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 hb wb"]]:
-    """Both, the sharper one blurred until it is as sharp as the other: details that only one has cannot be matched.
+) -> tuple[list[float], list[float]]:
+    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
 
-    Sharpness is the mean difference of neighbouring pixels.
+    Sharpness is the mean difference of neighbouring pixels. 0 for a picture that has hardly more than the other.
     """
-    return _no_sharper(picture, other), _no_sharper(other, picture)
+    own, its = ([float(_contrast(p)) for p in pictures] for pictures in (picture, other))
+    return [_least_blur(p, c) for p, c in zip(picture, its)], [_least_blur(p, c) for p, c in zip(other, own)]
 
 
-def _no_sharper(picture: Tensor, than: Tensor) -> Tensor:
-    return torch.cat([_blurred_to(p[None], float(_contrast(t))) for p, t in zip(picture, than)])
+def _least_blur(picture: Tensor, contrast: float) -> float:
+    """The least of `BLURS` after which there is no more contrast than that."""
+    enough = (b for b in (0.0, *BLURS) if float(_contrast(_blurred(picture[None], [b])[0])) <= 1.05 * contrast)
+    return next(enough, BLURS[-1])
 
 
-def _blurred_to(picture: Tensor, contrast: float) -> Tensor:
-    """The least blurred of `BLURS` that has no more contrast; the picture itself if it has hardly more."""
-    blurred = picture
-    for blur in BLURS:
-        if float(_contrast(blurred[0])) <= 1.05 * contrast:
-            break
-        blurred = torch.from_numpy(cv2.GaussianBlur(_numpy(picture[0, 0]), (0, 0), blur))[None, None].to(picture)
-    return blurred
+def _blurred(pictures: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+    def one(picture: Tensor, blur: float) -> Tensor:
+        return torch.from_numpy(cv2.GaussianBlur(_numpy(picture), (0, 0), blur)).to(picture) if blur else picture
+
+    return torch.stack([one(p[0], blur) for p, blur in zip(pictures, blurs)])[:, None]
 
 
 def _contrast(picture: Float[Tensor, "1 h w"]) -> Tensor:
@@ -227,19 +266,19 @@ def _contrast(picture: Float[Tensor, "1 h w"]) -> Tensor:
 
 
 def _colours(
-    alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor
+    alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor, balance: Balance
 ) -> tuple[Tensor, Tensor]:
     """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
     hw, bands = alpha.shape[-2:], beta.shape[1]
     position = matches(segments, reach).reshape(len(beta), -1, 2).to(beta)
     valid = on_picture(position, (beta.shape[-2], beta.shape[-1])).reshape(-1, 1, *hw)
-    level = levelled(guide, alpha)
+    level = balance.levelled(guide)
     inside = position.clamp(min=0).minimum(position.new_tensor([beta.shape[-1] - 1, beta.shape[-2] - 1]))
     seen = sample(torch.cat([beta, guide, level], 1), inside, interpolation="bicubic").values
     values, own, brightness = seen.reshape(len(beta), -1, *hw).split([bands, 1, 1], 1)
     consistent = _enlarged((facts[:, :1] < CONSISTENT).to(alpha))
     matched = _detailed(values - own, levelled_locally(brightness, alpha, valid * consistent), alpha) + own - alpha
-    unlike = avg_pool2d((brightness - _no_sharper(alpha, level)).abs(), 3, 1, 1, count_include_pad=False)
+    unlike = avg_pool2d((brightness - _blurred(alpha, balance.blurs[0])).abs(), 3, 1, 1, count_include_pad=False)
     trust = (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
     planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
     spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)

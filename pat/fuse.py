@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -43,7 +43,8 @@ from arraygeom.fields import pinhole_track
 from arraygeom.pixels import HW, coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
-from .images import luminance, write_atomically
+from .images import Pictures, luminance, write_atomically
+from .memory import give_back, parse_bytes
 from .model import Fused, FusionNetwork, Look
 from .tiles import (
     PROBE,
@@ -55,7 +56,6 @@ from .tiles import (
     Tile,
     held_memory,
     padded,
-    parse_bytes,
     plan,
     strip,
     survey_memory,
@@ -85,7 +85,7 @@ class FusedFrame(NamedTuple):
 def fuse(
     network: FusionNetwork,
     rig: Rig,
-    images: Mapping[str, Any],
+    images: Pictures,
     *,
     alpha: str,
     depth: tuple[float, float] | None = None,
@@ -127,47 +127,77 @@ def fuse(
     """
     rig = rig if depth is None else rig.replace(depth=depth)
     _check_names(rig, images, alpha)
-    picture = partial(_picture, rig, images)
     fields = field if isinstance(field, Mapping) else dict.fromkeys(rig.betas(alpha), field)
-    if any(_has_lens(rig[name]) for name in images) and not any(map(_follows_lenses, fields.values())):
-        straight_rig, straight = without_lenses(rig, {name: picture(name) for name in images})
-        fields = {name: _straightened(f, rig[alpha], straight_rig[alpha]) for name, f in fields.items()}
-        seen = fuse(
-            network,
-            straight_rig,
-            straight,
-            alpha=alpha,
-            field={name: f for name, f in fields.items() if f is not None},
-            max_memory=max_memory,
-            match_levels=match_levels,
-            progress=progress,
-            announce=announce,
-            store=store,
-        )
-        return _bent(seen, straight[alpha], picture(alpha), straight_rig[alpha], rig[alpha])
-    own = _grey(picture(alpha))[None]
-    levels = own if match_levels else None
+    bent = any(_has_lens(rig[name]) for name in images) and not any(map(_follows_lenses, fields.values()))
+    how = _How(match_levels, None if max_memory is None else parse_bytes(max_memory), progress, announce, store)
+    return (_fuse_bent if bent else _fuse_straight)(network, rig, images, alpha, fields, how)
+
+
+class _How(NamedTuple):
+    """What `fuse` is told of how to work; `limit` is the memory, bytes."""
+
+    match_levels: bool
+    limit: float | None
+    progress: Progress | None
+    announce: Callable[[Plan], None] | None
+    store: Path | None
+
+
+Fields = Mapping[str, ReceptiveField | None]
+
+
+def _fuse_bent(network: FusionNetwork, rig: Rig, images: Pictures, alpha: str, fields: Fields, how: _How) -> FusedFrame:
+    """By way of pinhole views of what lenses bend."""
+    straight_rig, straight = without_lenses(rig, {name: _picture(rig, images, name) for name in images})
+    fields = {name: _straightened(f, rig[alpha], straight_rig[alpha]) for name, f in fields.items()}
+    frame = _fuse_straight(network, straight_rig, straight, alpha, fields, how)
+    return _bent(frame, straight[alpha], _picture(rig, images, alpha), straight_rig[alpha], rig[alpha])
+
+
+def _fuse_straight(
+    network: FusionNetwork, rig: Rig, images: Pictures, alpha: str, fields: Fields, how: _How
+) -> FusedFrame:
+    own = _grey(_picture(rig, images, alpha))[None]
+    levels = own if how.match_levels else None
     betas = [
-        _prepare(network, rig.pair(alpha, name), picture(name)[None], fields.get(name), levels, name)
+        _prepare(network, rig.pair(alpha, name), _picture(rig, images, name)[None], fields.get(name), levels, name)
         for name in rig.betas(alpha)
         if name in images
     ]
-    hw, surveys = rig[alpha].hw, survey_tiles(network, rig[alpha].hw)
-    large, limit = math.prod(hw) > 16 * PROBE**2, None if max_memory is None else parse_bytes(max_memory)
-    probe = Probe.of(network, own, betas, partial(_fuse_tile, network, own)) if large and (limit or announce) else None
-    held = held_memory(own, betas, probe.known if probe else 0.0, frame=store is None)
+    planned = _planned(network, own, betas, how)
+    if how.announce:
+        how.announce(planned)
+    betas = [surveyed(network, own, beta, survey_tiles(network, rig[alpha].hw)) for beta in betas]
+    return _fused_in_tiles(network, own, betas, planned.tiles, how)
+
+
+def _planned(network: FusionNetwork, own: Tensor, betas: list[Beta], how: _How) -> Plan:
+    """The tiles under the limit, and for a large frame the time, by fusing a piece."""
+    hw = own.shape[-2], own.shape[-1]
+    surveys, large = survey_tiles(network, hw), math.prod(hw) > 16 * PROBE[0] ** 2
+    measured = large and (how.limit or how.announce)
+    probe = Probe.of(network, own, betas, partial(_fuse_tile, network, own)) if measured else None
+    held = held_memory(own, betas, probe.known if probe else 0.0, frame=how.store is None)
     surveying = survey_memory(surveys, probe)
-    tiles = plan(network, hw, betas, limit, held, surveying)
-    if announce:
-        work = max(surveying, *(working_memory(network, tile, betas) for tile in tiles))
-        seconds = probe.seconds(network, betas, surveys, tiles) if probe else None
-        announce(Plan(tiles, SLACK * (held + work), seconds, len(surveys)))
-    betas = [surveyed(network, own, beta, surveys) for beta in betas]
-    make = partial(_fuse_tile, network, own, betas)
-    shown = progress(tiles, len(tiles)) if progress else tiles
-    if not store or len(tiles) == 1:
+    tiles = plan(network, hw, betas, how.limit, held, surveying)
+    work = max(surveying, *(working_memory(network, tile, betas) for tile in tiles))
+    return Plan(tiles, SLACK * (held + work), probe.seconds(surveys, tiles) if probe else None, len(surveys))
+
+
+def _fused_in_tiles(network: FusionNetwork, own: Tensor, betas: list[Beta], tiles: list[Tile], how: _How) -> FusedFrame:
+    """The frame, put together from its tiles or from where they are kept. Empties `betas` when they are done."""
+    hw = own.shape[-2], own.shape[-1]
+
+    def make(tile: Tile) -> FusedFrame:
+        frame = _fuse_tile(network, own, betas, tile)
+        if len(tiles) > 1:
+            give_back()
+        return frame
+
+    shown = how.progress(tiles, len(tiles)) if how.progress else tiles
+    if not how.store or len(tiles) == 1:
         return _assembled(hw, ((tile, make(tile)) for tile in shown))
-    kept = TileStore.of(store, network, own, betas)
+    kept = TileStore.of(how.store, network, own, betas)
     for tile in shown:
         kept.keep(tile, make)
     betas.clear()
@@ -219,7 +249,7 @@ class TileStore(NamedTuple):
         return self.folder / f"{self.digest}_{'_'.join(map(str, (*tile.inner, *tile.outer)))}.safetensors"
 
 
-def without_lenses(rig: Rig, images: Mapping[str, Any]) -> tuple[Rig, dict[str, Tensor]]:
+def without_lenses(rig: Rig, images: Pictures) -> tuple[Rig, dict[str, Tensor]]:
     """The rig and its pictures with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
     straight = dict(images)
     for name, image in images.items():
@@ -277,7 +307,7 @@ def default_field(pair: Pair) -> ReceptiveField:
     return Rectified(alpha_is="either", max_disparity=0.12 * pair.beta.hw[1])
 
 
-def _check_names(rig: Rig, images: Mapping[str, Any], alpha: str) -> None:
+def _check_names(rig: Rig, images: Pictures, alpha: str) -> None:
     for name in (alpha, *images):
         rig.known(name)
     if alpha not in images:
@@ -286,7 +316,7 @@ def _check_names(rig: Rig, images: Mapping[str, Any], alpha: str) -> None:
         raise ValueError(f"no picture of any other camera than alpha, '{alpha}': fusion needs at least one beta")
 
 
-def _picture(rig: Rig, images: Mapping[str, Any], name: str) -> Tensor:
+def _picture(rig: Rig, images: Pictures, name: str) -> Tensor:
     """The picture of a camera, which may be read from its file only now, found to be usable."""
     image, (h, w) = images[name], rig[name].hw
     if tuple(image.shape[1:]) != (h, w):

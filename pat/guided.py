@@ -21,7 +21,7 @@ from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 
 from .attention import Attended, attend, attend_with_statistics
 from .blocks import ResidualBlock, conv, enlarge
-from .consensus import FILLS, FINE, Consensus, along, consensus, matches
+from .consensus import FILLS, FINE, Balances, Consensus, along, consensus, matches
 from .images import luminance
 from .model import Fused, Look, Looks
 
@@ -104,6 +104,10 @@ class GuidedPAT(nn.Module):
         self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
         self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
+    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"]) -> Balances:
+        """How the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
+        return Balances.of(alpha, _guide(beta))
+
     def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
         """What can be known before attention looks, of whole pictures; for pieces of them it is cut, not redone."""
         return self._agreed(alpha, beta, look, _segments(look, hw_of(alpha), 1, alpha.double()))
@@ -179,7 +183,7 @@ class GuidedPAT(nn.Module):
 
     def _agreed(self, alpha: Tensor, beta: Tensor, look: Look, segments: Segments) -> Consensus:
         blocks = _segments(look, hw_of(alpha), FINE, alpha.double())
-        return consensus(alpha, _guide(beta), beta, segments, blocks)
+        return consensus(alpha, _guide(beta), beta, segments, blocks, look.balances)
 
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""

@@ -6,7 +6,9 @@ pictures), colours in the order red, green, blue. Files appear whole or not at a
 
 from __future__ import annotations
 
+from collections.abc import ItemsView, Iterator, KeysView
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -27,6 +29,31 @@ _ROWS = 256
 """Worked off at once, where copies of a whole picture would take much memory."""
 
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
+
+
+@runtime_checkable
+class Pictures(Protocol):
+    """Pictures (C, H, W) by camera: a dict, or what reads them when asked for (`pat.develop.ViewFiles`)."""
+
+    def __getitem__(self, name: str, /) -> Tensor:
+        """One of them."""
+        ...
+
+    def __contains__(self, name: object, /) -> bool:
+        """Whether there is one."""
+        ...
+
+    def __iter__(self) -> Iterator[str]:
+        """The cameras."""
+        ...
+
+    def keys(self) -> KeysView[str]:
+        """The same."""
+        ...
+
+    def items(self) -> ItemsView[str, Tensor]:
+        """Cameras with their pictures."""
+        ...
 
 
 def read_image(path: str | Path, *, name: str | None = None, bits: int | None = None) -> Float[Tensor, "c h w"]:

@@ -19,7 +19,7 @@ from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_g
 
 from .attention import Attended, attend_with_statistics
 from .blocks import ResidualASPP, ResidualBlock
-from .consensus import Consensus
+from .consensus import Balances, Consensus
 
 
 @dataclass(frozen=True)
@@ -27,12 +27,14 @@ class Look:
     """Where to look in one beta: `at` maps alpha pixels (n, 2) to segments or positions in beta's pixels.
 
     `at` may answer for one rig (n) or for a batch of rigs (B, n). Segments are looked at in `samples` places.
-    `known` is what a survey of the whole pictures has found, for networks that make one.
+    `known` is what a survey of the whole pictures has found, for networks that make one, and `balances` what the
+    survey of a piece is to know of the whole.
     """
 
     at: Callable[[Tensor], Segments | Positions]
     samples: int
     known: Consensus | None = None
+    balances: Balances | None = None
 
     @classmethod
     def along(cls, field: ReceptiveField, pair: Pair) -> Look:
@@ -79,6 +81,10 @@ class FusionNetwork(Protocol):
     """Pictures are padded to multiples of this, and cut at them."""
     equal_pitch: bool
     """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
+
+    def balance(self, alpha: Tensor, beta: Tensor) -> Balances | None:
+        """What surveys of pieces are to know of the whole pictures, if anything."""
+        ...
 
     def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> Consensus | None:
         """What is to be known of whole pictures (of whole multiples) before pieces of them are fused, if anything."""
@@ -145,6 +151,9 @@ class PAT(nn.Module):
         if self.config.residual:
             image = image + self._enlarged(alpha)
         return Fused(image, *(list(part) for part in list(zip(*attended))[1:]))
+
+    def balance(self, alpha: Tensor, beta: Tensor) -> None:
+        """Nothing."""
 
     def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
         """Nothing: each piece of a frame is fused by itself."""

@@ -16,11 +16,14 @@ from arraygeom import Pair, Positions, Segments, pixel_grid
 from arraygeom.pixels import HW
 
 from .consensus import Consensus
+from .memory import give_back
 from .model import FusionNetwork, Look
 
-REACH = 256
-"""The widest halo, pixels: farther off, nothing was seen to matter to trained weights (at 224 pixels 2e-6 of the
-picture, at 256 less than 1e-7), whatever their convolutions could carry."""
+REACH = 192
+"""The widest halo, pixels: what is farther off changes pictures by at most 1.5e-6 with trained weights (at 160 pixels
+2e-4, at 224 1e-7; measured on three scenes), whatever their convolutions could carry."""
+SURVEY_REACH = 256
+"""The halo of the pieces of a survey, pixels."""
 SURVEYED = 1_600_000
 """Pixels of alpha that are surveyed at once. Larger frames are cut the same way whatever memory is allowed, so that
 results do not depend on it."""
@@ -109,7 +112,8 @@ def plan(
         return [whole]
     for sides in _by_work(hw, halo, network.multiple, left / network.bytes_per_pixel) if surveying <= left else ():
         tiles = list(tiles_of(hw, sides, halo))
-        if max(working_memory(network, tile, betas) for tile in tiles) <= left:
+        largest_first = sorted(tiles, key=lambda tile: -_area(tile.outer))
+        if all(working_memory(network, tile, betas) <= left for tile in largest_first):
             return tiles
     least = max(working_memory(network, tile, betas) for tile in tiles_of(hw, 64, halo))
     needed = SLACK * (held + max(least, surveying)) / 2**20
@@ -156,13 +160,15 @@ def _area(box: tuple[int, int, int, int]) -> int:
     return (bottom - top) * (right - left)
 
 
-PROBE = 192
-"""Side of the piece of alpha that is fused to estimate the time, pixels."""
+PROBE = (192, 512)
+"""Least and greatest side of the piece of alpha that is fused to estimate the time, pixels."""
+PROBED = 1 / 40
+"""The part of alpha that the piece is between these."""
 
 
 class Probe(NamedTuple):
-    """What a small piece from the middle of alpha took: bytes that the survey leaves for each pixel of alpha, seconds
-    of the survey and of the rest for each byte of working memory, which goes by the pixels of both views."""
+    """What a piece from the middle of alpha took, for each of its pixels: bytes that the survey leaves, seconds of
+    the survey and of the rest."""
 
     known: float
     survey: float
@@ -172,26 +178,31 @@ class Probe(NamedTuple):
     def of(
         cls, network: FusionNetwork, own: Tensor, betas: list[Beta], fuse_tile: Callable[[list[Beta], Tile], object]
     ) -> Probe:
-        """Survey and fuse the piece, twice: the first time loops may be compiled."""
+        """Survey and fuse a small piece, as loops may have to be compiled, and then one to measure."""
         h, w = own.shape[-2:]
-        m = network.multiple
-        top, left = (max((side - PROBE) // 2, 0) // m * m for side in (h, w))
-        box = (top, min(top + PROBE, h), left, min(left + PROBE, w))
-        piece = Tile(box, box)
-        for _ in range(2):
+        side = min(max(math.sqrt(h * w * PROBED), PROBE[0]), PROBE[1])
+        for n in (PROBE[0], int(side)):
+            piece = _middle((h, w), n, network.multiple)
             begin = time.perf_counter()
             found = [survey_piece(network, own, beta, piece) for beta in betas]
             middle = time.perf_counter()
             fuse_tile(betas, piece)
             end = time.perf_counter()
         known = sum(part.nbytes for consensus in found if consensus is not None for part in consensus)
-        surveying, work = middle - begin, working_memory(network, piece, betas)
-        return cls(known / _area(box), surveying / work, max(end - middle - surveying, 0.0) / work)
+        surveying, pixels = middle - begin, _area(piece.outer)
+        again = surveying if known else 0.0
+        return cls(known / pixels, surveying / pixels, max(end - middle - again, 0.0) / pixels)
 
-    def seconds(self, network: FusionNetwork, betas: list[Beta], surveys: list[Tile], tiles: list[Tile]) -> float:
-        """About how long a frame will take here."""
-        surveying, fusing = (sum(working_memory(network, t, betas) for t in pieces) for pieces in (surveys, tiles))
+    def seconds(self, surveys: list[Tile], tiles: list[Tile]) -> float:
+        """About how long a frame will take here, if the machine stays as busy as it was."""
+        surveying, fusing = (sum(_area(tile.outer) for tile in pieces) for pieces in (surveys, tiles))
         return self.survey * surveying + self.fusion * fusing
+
+
+def _middle(hw: HW, side: int, multiple: int) -> Tile:
+    top, left = (max((n - side) // 2, 0) // multiple * multiple for n in hw)
+    box = (top, min(top + side, hw[0]), left, min(left + side, hw[1]))
+    return Tile(box, box)
 
 
 def held_memory(own: Tensor, betas: list[Beta], known: float, *, frame: bool) -> float:
@@ -205,17 +216,19 @@ def survey_tiles(network: FusionNetwork, hw: HW) -> list[Tile]:
     """The pieces that a frame is surveyed in: one, or those with the least work of at most `SURVEYED` pixels."""
     if math.prod(hw) <= SURVEYED:
         return [_whole(hw)]
-    return list(tiles_of(hw, _by_work(hw, REACH, network.multiple, SURVEYED)[0], REACH))
+    return list(tiles_of(hw, _by_work(hw, SURVEY_REACH, network.multiple, SURVEYED)[0], SURVEY_REACH))
 
 
 def surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta, pieces: list[Tile]) -> Beta:
     """The beta with what the network wants to know before it fuses pieces of a frame."""
-    if len(pieces) == 1:
-        m = network.multiple
-        with torch.no_grad():
+    m = network.multiple
+    with torch.no_grad():
+        if len(pieces) == 1:
             known = network.survey(padded(alpha, m), padded(beta.picture, m), beta.look)
-    else:
-        known = _joined(((p, survey_piece(network, alpha, beta, p)) for p in pieces), network, alpha)
+        else:
+            balances = network.balance(padded(alpha, m), padded(beta.picture, m))
+            told = replace(beta, look=replace(beta.look, balances=balances))
+            known = _joined(((p, survey_piece(network, alpha, told, p)) for p in pieces), network, alpha)
     return replace(beta, look=replace(beta.look, known=known))
 
 
@@ -241,6 +254,8 @@ def _joined(pieces: Iterator[tuple[Tile, Consensus | None]], network: FusionNetw
         whole = whole or [p.new_empty(*p.shape[:-2], hw[0] // s, hw[1] // s) for p, s in zip(part, steps)]
         for target, p, s in zip(whole, part, steps):
             target[..., box[0] // s : box[1] // s, box[2] // s : box[3] // s] = p
+        del found, part, p
+        give_back()
     return Consensus(*whole)
 
 
@@ -273,7 +288,8 @@ def strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) 
     known = beta.look.known
     if known is not None:
         known = known.cut((top, top - (top - bottom) // m * m, left, left - (left - right) // m * m))
-    return Strip(beta.picture[..., y0:y1, x0:x1], Look(at, beta.look.samples, known), beta.pair, (x0, y0), beta.points)
+    look = replace(beta.look, at=at, known=known)
+    return Strip(beta.picture[..., y0:y1, x0:x1], look, beta.pair, (x0, y0), beta.points)
 
 
 def touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
@@ -294,16 +310,3 @@ def padded(picture: Tensor, multiple: int) -> Tensor:
     """The picture continued at the bottom and the right to whole multiples."""
     h, w = picture.shape[-2:]
     return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
-
-
-def parse_bytes(amount: float | str) -> float:
-    """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
-    if not isinstance(amount, str):
-        return float(amount)
-    units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
-    number = amount.rstrip("BbKkMmGgIi ")
-    unit = amount[len(number) :].strip().upper() or "B"
-    try:
-        return float(number) * units[unit]
-    except (KeyError, ValueError):
-        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB") from None

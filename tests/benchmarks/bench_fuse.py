@@ -2,14 +2,18 @@
 
 The array "wide field - narrow field" at a part of its size, with smooth random pictures: seconds of the survey and of
 the network, what part of the latter convolutions take, and at what rate, beside the rate of this machine's matrix
-products with as many threads in the same run. `--full-runs` also fuses the rendered frame of 4024x3036 under caps of
-2, 4 and 8 GiB (`pat systems run wide-narrow --full --max-memory ...`), and prints what that took.
+products with as many threads in the same run. `--full-runs` instead fuses the rendered frame of 4024x3036 under caps
+(`--caps 4GiB 8GiB 2GiB`; `pat systems run wide-narrow --full --max-memory ...`), in 4 to 6 minutes of a core each on
+a machine that does nothing else, and compares what comes out. Prints figures and puts them into
+tests/benchmarks/RESULTS_fuse.md, each in its section, beside those that were there.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
+import shutil
 import time
 from pathlib import Path
 from statistics import median
@@ -22,12 +26,14 @@ from torch.utils.flop_counter import FlopCounterMode
 import pat.fuse
 from arraygeom import Rig
 from pat.fuse import fuse
+from pat.images import read_image, write_text
 from pat.systems import load_system, run_system
 from pat.tiles import survey_tiles, surveyed
 from pat.weights import load_weights
 
 SIDE = 2048
-CAPS = ("4GiB", "2GiB", "8GiB")
+CAPS = ("4GiB", "8GiB", "2GiB")
+RESULTS = Path(__file__).with_name("RESULTS_fuse.md")
 
 
 def rig(scale: float) -> Rig:
@@ -91,20 +97,57 @@ def measure(scale: float) -> dict[str, str]:
     }
 
 
+def full_run(cap: str, out: Path) -> str:
+    """The frame at full size under a cap: scores, plan, memory, time, and how it differs from those under others."""
+    before, threads = os.getloadavg()[0], os.environ.get("OMP_NUM_THREADS", "all")
+    table = run_system("wide-narrow", out, full=True, max_memory=cap).table
+    lines = [table, f"Threads: {threads}. Load {before:.1f} before, {os.getloadavg()[0]:.1f} after.", ""]
+    kept = {other: out / f"fused_{other}.png" for other in CAPS}
+    shutil.copyfile(out / "fused.png", kept[cap])
+    own = read_image(kept.pop(cap))
+    for other, file in kept.items():
+        if file.is_file():
+            off = (own - read_image(file)).abs()
+            lines.append(
+                f"Differs from that under {other} by at most {float(off.max()):.1e}, mean {float(off.mean()):.1e}."
+            )
+    return "\n".join(lines)
+
+
+def put(heading: str, text: str) -> None:
+    """The section of that heading in the file of results, in place of the one that was there."""
+    found = (
+        RESULTS.read_text(encoding="utf-8")
+        if RESULTS.is_file()
+        else "# Fusing whole frames\n\nBy `python -m tests.benchmarks.bench_fuse`.\n"
+    )
+    sections = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", found, re.M | re.S))
+    sections[heading] = f"\n{text.strip()}\n\n"
+    start = found.partition("\n## ")[0].strip()
+    body = "".join(f"## {name}\n{part}" for name, part in sections.items())
+    write_text(RESULTS, f"{start}\n\n{body.strip()}\n")
+
+
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--scale", type=float, default=0.5)
     parser.add_argument("--threads", type=int, default=len(os.sched_getaffinity(0)))
-    parser.add_argument("--full-runs", action="store_true", help="also 4024x3036 under 2, 4 and 8 GiB")
+    parser.add_argument("--full-runs", action="store_true", help="4024x3036 under caps of memory instead")
+    parser.add_argument("--caps", nargs="+", default=CAPS, choices=CAPS)
     parser.add_argument("--out", type=Path, default=Path("out/systems/wide-narrow-full"))
     given = parser.parse_args()
     torch.set_num_threads(given.threads)
-    print(f"{given.threads} threads, load before: {os.getloadavg()[0]:.1f}")
-    print("\n".join(f"{name:32} {value}" for name, value in measure(given.scale).items()), flush=True)
-    for cap in CAPS if given.full_runs else ():
-        result = run_system("wide-narrow", given.out, full=True, max_memory=cap)
-        print(f"\n{cap}\n{result.table}", flush=True)
+    for cap in given.caps if given.full_runs else ():
+        text = full_run(cap, given.out)
+        print(f"\n{cap}\n{text}", flush=True)
+        put(f"wide-narrow, 4024x3036, under {cap}", text)
+    if not given.full_runs:
+        load = f"{given.threads} threads, load before: {os.getloadavg()[0]:.1f}\n"
+        rows = [f"| {name} | {value} |" for name, value in measure(given.scale).items()]
+        text = "\n".join([load, "| | |", "| --- | --- |", *rows])
+        print(text)
+        put(f"A part of the frame, {given.threads} threads", text)
 
 
 if __name__ == "__main__":

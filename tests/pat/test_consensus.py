@@ -8,7 +8,7 @@ import torch
 import pat.consensus
 from arraygeom import Camera, Epipolar, Pair, Pose, Segments, intrinsics, lazily, pixel_grid, rotation_from_vector
 from pat import consensus_kernels as kernels
-from pat.consensus import Consensus, consensus, equally_sharp, matches
+from pat.consensus import Balance, Consensus, consensus, equalising_blurs, matches
 from pat.images import luminance
 
 HW = (64, 96)
@@ -179,11 +179,29 @@ def blurred(picture: torch.Tensor, blur: float) -> torch.Tensor:
 def test_the_sharper_of_two_pictures_is_blurred_whichever_it_is():
     sharp = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     soft = blurred(sharp, 1.25)
-    one, other = equally_sharp(sharp, soft)
+    own, its = equalising_blurs(sharp, soft)
+    assert its == [0.0]
+    one, other = Balance(torch.zeros(3, 1, 1, 1, 1), (own, its)).equally_sharp(sharp, soft)
     assert torch.equal(other, soft)
     assert (one - soft).abs().mean() < 0.05 * (sharp - soft).abs().mean()
-    assert all(torch.equal(a, b) for a, b in zip(equally_sharp(soft, sharp), (other, one)))
-    assert torch.equal(equally_sharp(sharp, sharp.flip(-1))[0], sharp)
+    assert equalising_blurs(soft, sharp) == (its, own)
+    assert equalising_blurs(sharp, sharp.flip(-1)) == ([0.0], [0.0])
+
+
+def test_parts_are_balanced_as_the_whole_is():
+    """The right half is darker and softer than the left: by themselves the halves would be treated otherwise."""
+    alpha = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
+    alpha[..., 40:] = 0.3 * blurred(alpha, 2.0)[..., 40:]
+    beta = 0.5 * blurred(alpha, 1.0) + 0.2
+    balance = Balance.of(alpha, beta)
+    level = balance.levelled(beta)
+    assert abs(float(level.mean() - alpha.mean())) < 1e-5
+    assert abs(float(level.std() - alpha.std())) < 1e-5
+    assert balance.blurs[0] != [0.0]
+    assert torch.equal(balance.levelled(beta[..., 40:]), level[..., 40:])
+    sharp, part = (balance.equally_sharp(a, b) for a, b in ((alpha, level), (alpha[..., 40:], level[..., 40:])))
+    assert torch.allclose(part[0][..., 20:], sharp[0][..., 60:], atol=1e-6)
+    assert Balance.of(alpha[..., 40:], beta[..., 40:]).blurs != balance.blurs
 
 
 def test_a_match_has_the_detail_that_beta_lost():

@@ -119,6 +119,9 @@ class Matcher:
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
 
+    def balance(self, alpha, beta):
+        return None
+
     def survey(self, alpha, beta, look):
         return None
 
@@ -209,6 +212,9 @@ class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
     halo, beta_halo, multiple, bytes_per_pixel, equal_pitch = 0, 2, 1, 1.0, True
+
+    def balance(self, alpha, beta):
+        return None
 
     def survey(self, alpha, beta, look):
         return None

@@ -7,15 +7,28 @@ import torch
 
 import pat.fuse
 import pat.tiles
-from arraygeom import Camera, Distortion, Epipolar, Link, Pose, Rig, View, intrinsics, retaken, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Distortion,
+    Epipolar,
+    Link,
+    Pose,
+    Rectified,
+    Rig,
+    View,
+    intrinsics,
+    retaken,
+    rotation_from_vector,
+)
 from calib.matches import match_points, seen_depths
+from pat.data.pairs import flickr_pairs, kitti_pairs
 from pat.demo import load_sample
 from pat.fuse import fuse, pitch_ratio, quarter_turns, without_lenses
 from pat.guided import GuidedPAT, GuidedPATConfig
 from pat.images import luminance, read_image
 from pat.metrics import score
 from pat.model import PAT, PATConfig
-from pat.tiles import REACH, Tile, parse_bytes, plan, tiles_of, working_memory
+from pat.tiles import REACH, Tile, plan, tiles_of, working_memory
 from pat.weights import load_weights
 
 
@@ -75,17 +88,39 @@ def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
     monkeypatch.setattr(pat.tiles, "SURVEYED", 150_000)
-    monkeypatch.setattr(pat.tiles, "REACH", 128)
+    monkeypatch.setattr(pat.tiles, "SURVEY_REACH", 128)
     assert len(pat.tiles.survey_tiles(network, sample.rig["mono"].hw)) > 1
     pieces = fuse(network, sample.rig, images, alpha="mono")
     truth = sample.truth
     assert score(pieces.image.clamp(0, 1), truth).psnr > score(whole.image.clamp(0, 1), truth).psnr - 0.1
-    assert ((pieces.image - whole.image).abs().amax(0) > 0.02).float().mean() < 0.08
+    off = (pieces.image - whole.image).abs().amax(0)
+    assert (off > 0.005).float().mean() < 1e-3
     hw = sample.rig["mono"].hw
     monkeypatch.setattr(pat.fuse, "plan", lambda *_: list(tiles_of(hw, 192, REACH)))
     tiled = fuse(network, sample.rig, images, alpha="mono")
     assert (tiled.image - pieces.image).abs().max() < 1e-5
     assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "which", [lambda data: kitti_pairs(data / "kitti"), lambda data: flickr_pairs(data / "flickr1024")]
+)
+def test_halos_are_wide_enough_for_the_weights(which, shared_data):
+    """Tiles of real pictures equal the whole with the weights that are shipped."""
+    pair, network = next(which(shared_data)), load_weights("mono-colour")
+    images = {"left": luminance(pair.left), "right": pair.right}
+    rig = Rig({name: View(hw=picture.shape[1:]) for name, picture in images.items()})
+    field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
+    whole = fuse(network, rig, images, alpha="left", field=field)
+    h, w = rig["left"].hw
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            pat.fuse, "plan", lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), REACH))
+        )
+        tiled = fuse(network, rig, images, alpha="left", field=field)
+    assert (tiled.image - whole.image).abs().max() < 1e-5
+    assert (tiled.confidence - whole.confidence).abs().max() < 1e-5
 
 
 def test_pictures_are_asked_for_once_and_only_when_they_are_needed():
@@ -101,7 +136,7 @@ def test_pictures_are_asked_for_once_and_only_when_they_are_needed():
     network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
     found = fuse(network, rig, Files(given), alpha="mono")
     assert torch.equal(found.image, fuse(network, rig, given, alpha="mono").image)
-    assert asked.count("colour") == 1  # mono is asked for by the tests' check of types, too
+    assert sorted(asked) == ["colour", "mono"]
 
 
 def test_memory_decides_the_tiles():
@@ -175,14 +210,6 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
     made.clear()
     with pytest.raises(KeyboardInterrupt):
         fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
-
-
-def test_bytes_are_read():
-    assert parse_bytes("4GiB") == 4 * 2**30
-    assert parse_bytes("500 MB") == 5e8
-    assert parse_bytes(7) == 7.0
-    with pytest.raises(ValueError, match="'4 gigs'"):
-        parse_bytes("4 gigs")
 
 
 def test_pitch_is_the_ratio_of_pixels():

@@ -1,0 +1,27 @@
+"""Memory of this process: amounts as people write them, and giving back what was freed."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+
+
+def parse_bytes(amount: float | str) -> float:
+    """Bytes of a number, or of text such as "4GiB" or "500 MB". Raises ValueError for other text."""
+    if not isinstance(amount, str):
+        return float(amount)
+    units = {"B": 1, "KB": 1e3, "MB": 1e6, "GB": 1e9, "KIB": 2**10, "MIB": 2**20, "GIB": 2**30}
+    number = amount.rstrip("BbKkMmGgIi ")
+    unit = amount[len(number) :].strip().upper() or "B"
+    try:
+        return float(number) * units[unit]
+    except (KeyError, ValueError):
+        raise ValueError(f"max_memory is '{amount}'; wanted bytes, or like 4GiB or 500MB") from None
+
+
+def give_back() -> None:
+    """Return freed memory to the system: glibc keeps some 300 MiB after a tile, which the next may not fit."""
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim:
+            trim(0)

@@ -1,0 +1,91 @@
+"""What random rigs in training are worth: weights trained on one rig and on random ones, on rigs of many kinds.
+
+    python -m tests.benchmarks.bench_rigs --single runs/mono-colour-single-rig/best.safetensors
+
+Rigs differ in how hard they are, so what counts is how far weights stay ahead of the classical baseline, on the same
+scenes: `lost` is how much less that is than on the rig that the single-rig recipe was trained on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import tyro
+
+from pat.ablate import ALPHA, BETA, Case, layered_cases
+from pat.demo import classical
+from pat.fuse import fuse
+from pat.images import write_text
+from pat.metrics import bootstrap_interval, score
+from pat.model import FusionNetwork
+from pat.synthesis.rigs import RigDistribution
+from pat.training.config import load_config
+from pat.weights import load_weights
+
+SINGLE = load_config("mono-colour-single-rig").rectified_rigs
+GENERAL = replace(SINGLE, mode="general", focal_ratio=(1.0, 1.0), rotation=0.0, toe_in=(0.0, 0.0), decentring=0.0)
+RIGS: dict[str, RigDistribution] = {
+    "the single rig": SINGLE,
+    "twice the baseline": replace(SINGLE, parallax=(80.0, 80.0)),
+    "a quarter of the baseline": replace(SINGLE, parallax=(10.0, 10.0)),
+    "alpha on the right": replace(SINGLE, alpha="right"),
+    "beta as sharp as alpha": replace(SINGLE, resolutions=(1.0,)),
+    "beta four times coarser": replace(SINGLE, resolutions=(0.25,)),
+    "depths to 40 times the nearest": replace(SINGLE, depth_ratio=(40.0, 40.0)),
+    "baseline in any direction": GENERAL,
+    "turned, toed in": replace(GENERAL, rotation=6.0, toe_in=(0.0, 1.0), decentring=0.1),
+    "focal lengths 2 : 1": replace(GENERAL, rotation=6.0, focal_ratio=(0.5, 0.5), resolutions=(1.0,)),
+    "focal lengths 3 : 1": replace(GENERAL, rotation=6.0, focal_ratio=(1 / 3, 1 / 3), resolutions=(1.0,)),
+}
+
+
+@dataclass
+class Args:
+    single: str
+    """Weights trained on the single rig."""
+    random: str = "mono-colour-small"
+    """Weights trained as long on random rigs."""
+    scenes: int = 16
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs; scikit-image's if none is given."""
+    out: Path | None = None
+    """Markdown file for the table."""
+
+
+def ahead(networks: dict[str, FusionNetwork], case: Case) -> dict[str, float]:
+    """By how many dB each is ahead of the classical baseline; and the baseline's PSNR."""
+    base = score(classical(case.rig, case.images, ALPHA, BETA), case.truth).psnr
+    fused = {name: fuse(net, case.rig, case.images, alpha=ALPHA).image.clamp(0, 1) for name, net in networks.items()}
+    return {"classical": base} | {name: score(image, case.truth).psnr - base for name, image in fused.items()}
+
+
+def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
+    yield f"{args.scenes} layered scenes of 240 x 320 a row; PSNR in dB, ahead of classical; [95% interval].\n"
+    yield "| rig | classical | " + " | ".join(f"{name} rigs | lost" for name in networks) + " |"
+    yield "|---" + "|---:" * (1 + 2 * len(networks)) + "|"
+    reference: dict[str, float] = {}
+    for kind, rigs in RIGS.items():
+        found = [ahead(networks, case) for case in layered_cases(args.scenes, photos=args.photos, rigs=rigs, seed=7)]
+        cells = [kind, f"{np.mean([f['classical'] for f in found]):.2f}"]
+        for name in networks:
+            values = [f[name] for f in found]
+            mean, (low, high) = float(np.mean(values)), bootstrap_interval(values)
+            lost = reference.setdefault(name, mean) - mean
+            cells += [f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]", f"{lost:+.2f}"]
+        yield f"| {' | '.join(cells)} |"
+
+
+def main(args: Args) -> None:
+    table = []
+    for line in lines(args, {"random": load_weights(args.random), "single": load_weights(args.single)}):
+        print(line, flush=True)
+        table.append(line)
+    if args.out:
+        write_text(args.out, "\n".join(["# Weights of one rig, weights of random rigs", "", *table]) + "\n")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
