@@ -47,8 +47,6 @@ FILLS = 2
 """Ways in which colour is spread: along its regression on brightness, and as it is."""
 DETAIL_RADIUS, DETAIL_FLOOR = 3, 3e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
-LEVEL_RADIUS = 20
-"""Window in which beta's brightness at the matches gets the level of alpha's."""
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
 
@@ -158,15 +156,19 @@ def consensus(
     return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts, balances.whole))
 
 
-def levelled_locally(
+def levelled_at_matches(
     picture: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The picture with another's mean around each pixel, where the weight is; both show the same at the same place.
+    """The picture with another's mean and standard deviation, where the weight is; both show the same at a place.
 
     Levels of whole pictures say little where these show different parts of a scene.
     """
-    weight = weight + 1e-3
-    return picture + _mean(weight * (like - picture), LEVEL_RADIUS) / _mean(weight, LEVEL_RADIUS)
+    weight = (weight + 1e-6) / (weight + 1e-6).sum((2, 3), keepdim=True)
+    means = [(weight * p).sum((2, 3), keepdim=True) for p in (picture, like)]
+    spread, wanted = (
+        (weight * (p - m).square()).sum((2, 3), keepdim=True).sqrt() for p, m in zip((picture, like), means)
+    )
+    return (picture - means[0]) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + means[1]
 
 
 def _mean(x: Tensor, radius: int) -> Tensor:
@@ -277,7 +279,8 @@ def _colours(
     seen = sample(torch.cat([beta, guide, level], 1), inside, interpolation="bicubic").values
     values, own, brightness = seen.reshape(len(beta), -1, *hw).split([bands, 1, 1], 1)
     consistent = _enlarged((facts[:, :1] < CONSISTENT).to(alpha))
-    matched = _detailed(values - own, levelled_locally(brightness, alpha, valid * consistent), alpha) + own - alpha
+    brightness = levelled_at_matches(brightness, alpha, valid * consistent)
+    matched = _detailed(values - own, brightness, alpha) + own - alpha
     unlike = avg_pool2d((brightness - _blurred(alpha, balance.blurs[0])).abs(), 3, 1, 1, count_include_pad=False)
     trust = (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
     planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))

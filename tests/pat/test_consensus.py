@@ -6,7 +6,19 @@ import pytest
 import torch
 
 import pat.consensus
-from arraygeom import Camera, Epipolar, Pair, Pose, Segments, intrinsics, lazily, pixel_grid, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Epipolar,
+    Pair,
+    Pose,
+    Rectified,
+    Segments,
+    View,
+    intrinsics,
+    lazily,
+    pixel_grid,
+    rotation_from_vector,
+)
 from pat import consensus_kernels as kernels
 from pat.consensus import Balance, Consensus, consensus, equalising_blurs, matches
 from pat.images import luminance
@@ -216,3 +228,60 @@ def test_a_match_has_the_detail_that_beta_lost():
     chroma = [picture - luminance(picture) for picture in (found.matched, beta, truth)]
     left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].abs().mean() for c in chroma[:2])
     assert left < 0.75 * lost
+
+
+def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
+    """Two pictures of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
+    alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
+    view = View(hw=(alpha.shape[-2], width))
+    look = lazily(Rectified(64.0), Pair(view, view))
+    found = []
+    for step in (1, 2):
+        x = (pixel_grid((view.hw[0] // step, width // step), dtype=torch.float64) + 0.5) * step - 0.5
+        segments = look(x.reshape(-1, 2))
+        shape = (1, *x.shape[:-1])
+        found.append(
+            Segments(segments.start.reshape(*shape, 2), segments.end.reshape(*shape, 2), segments.valid.reshape(shape))
+        )
+    return alpha, beta, found
+
+
+def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
+    """A scene with little to hold on to, 64 x 256."""
+    soft = blurred(torch.rand(1, 1, 64, 256, generator=torch.Generator().manual_seed(seed)), blur)
+    return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
+
+
+def test_what_lies_beyond_the_edge_of_beta_is_not_looked_for_within_it():
+    """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
+    alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
+    noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
+    found = consensus(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
+    assert ((found.reach[..., 22:36] - 40).abs() < 2).float().mean() > 0.98
+    assert (found.facts[:, 0, :, :17] > pat.consensus.CONSISTENT).float().mean() > 0.845
+
+
+@pytest.mark.parametrize(("cut", "beyond"), [(1.0, kernels.UNSEEN), (0.0, kernels.NOWHERE)])
+def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut, beyond):
+    own, bits = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.uint64)
+    other, its = np.ones((1, 9), np.float32), np.full((1, 9), 2**48 - 1, np.uint64)
+    ends, along = np.array([[[2.0, 0.0]]], np.float32), np.array([[[-1.0, 0.0]]], np.float32)
+    length, edge = np.full((1, 1), 2, np.float32), np.full((1, 1), cut, np.float32)
+    cost = np.empty((1, 1, 5), np.uint8)
+    kernels.costs(own, bits, other, its, ends, along, length, edge, cost)
+    unlike = 48 + int(kernels.TRUNCATED)
+    assert cost.ravel().tolist() == [unlike] * 3 + [beyond] * 2
+    reach, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 3), np.float32)
+    kernels.winners(cost.astype(np.float32), ends, along, length, edge, 1, 9, reach, facts)
+    assert (reach[0, 0] > 2) == (cut == 1)
+    assert (facts[0, 0, 0] == 1) == (cut == 1)
+
+
+def test_colour_at_matches_does_not_hang_on_what_the_other_picture_shows_elsewhere():
+    """Alpha alone sees something dark on the left: whole pictures have other levels, what both see has the same."""
+    scene = faint(1, contrast=0.1, blur=3.0)
+    scene[..., :48] -= 0.35
+    tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
+    alpha, beta, segments = beside(scene, 48)
+    found = consensus(alpha, beta, beta * tint, *segments)
+    assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
