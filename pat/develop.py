@@ -7,7 +7,7 @@ value in all of them. Ordinary pictures, of which the rig says nothing, pass as 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -59,10 +59,7 @@ class ViewFiles(Mapping[str, Tensor]):
     @property
     def developed(self) -> Rig:
         """The rig that says of the pictures what they are now."""
-        rig = self.rig
-        for name in self.files:
-            rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
-        return rig
+        return developed_rig(self.rig, self.files)
 
 
 def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> Views:
@@ -113,6 +110,13 @@ def developed(sensor: Sensor) -> Sensor:
     measured = sensor.response == "mono" and sensor.coding == "linear"
     plain = dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
     return dataclasses.replace(plain, response=LIGHT) if measured else plain
+
+
+def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
+    """The rig that says of the developed pictures of these cameras what they are."""
+    for name in names:
+        rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
+    return rig
 
 
 def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
