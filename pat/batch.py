@@ -25,7 +25,7 @@ from safetensors.torch import load_file, save_file
 from arraygeom import ReceptiveField, Rig
 from arraygeom.io.native import write as rig_text
 
-from .develop import ViewFiles
+from .develop import ViewFiles, developed_rig
 from .fuse import fuse
 from .images import read_image, sweep, write_atomically, write_text
 from .jobs import HERE, OnError, Report, Task, Workers, run_tasks
@@ -148,7 +148,14 @@ class Batch:
         frames = {n: PictureFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
         options = {"max_memory": self.max_memory}
         return SequenceFusion(
-            _network(self.weights), self.rig, frames, self.alpha, self.speed, self.field, self.match_levels, options
+            _network(self.weights),
+            developed_rig(self.rig, self.files),
+            frames,
+            self.alpha,
+            self.speed,
+            self.field,
+            self.match_levels,
+            options,
         )
 
     def _key_file(self, key: KeyFrame) -> Path:

@@ -7,7 +7,7 @@ value in all of them. Ordinary pictures, of which the rig says nothing, pass as 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,8 +19,11 @@ from torch import Generator, Tensor
 
 from arraygeom import Rig, Sensor
 
-from .images import read_image
+from .images import luminance, read_image
 from .sensors import Coded, Linear
+
+_ROWS = 256
+"""Worked off at once, where copies of a whole picture would take much memory."""
 
 
 class Views(NamedTuple):
@@ -56,10 +59,7 @@ class ViewFiles(Mapping[str, Tensor]):
     @property
     def developed(self) -> Rig:
         """The rig that says of the pictures what they are now."""
-        rig = self.rig
-        for name in self.files:
-            rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
-        return rig
+        return developed_rig(self.rig, self.files)
 
 
 def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> Views:
@@ -98,9 +98,47 @@ def develop(picture: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | N
     return _coded(linear * scale[:, None, None])
 
 
+LIGHT = "luminance of light"
+"""The response of developed pictures of which it is known that they are the luminance of linear light, coded as sRGB.
+
+Of ordinary grey pictures it is not known: many are the luminance of coded values, which is another where colours are
+strong."""
+
+
 def developed(sensor: Sensor) -> Sensor:
     """What is true of a camera's pictures once they are developed: values are sRGB, counts and filters are gone."""
-    return dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
+    measured = sensor.response == "mono" and sensor.coding == "linear"
+    plain = dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
+    return dataclasses.replace(plain, response=LIGHT) if measured else plain
+
+
+def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
+    """The rig that says of the developed pictures of these cameras what they are."""
+    for name in names:
+        rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
+    return rig
+
+
+def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
+    """The fused picture as bright as alpha's camera saw it, if that measured the luminance of light (`LIGHT`).
+
+    Fusion gives a picture whose coded values have alpha's as their luminance. Here all three are moved by the same
+    amount until the luminance of their light is that of alpha's: by 0.045 for saturated purple of middle brightness.
+    """
+    if sensor.response != LIGHT:
+        return image
+    parts = zip(image.split(_ROWS, 1), alpha.split(_ROWS, 1))
+    return torch.cat([part + _missing(part, to_linear(own)) for part, own in parts], 1)
+
+
+def _missing(image: Tensor, light: Tensor) -> Tensor:
+    """What to add to coded values for that luminance of light; Newton's method on a convex function, from above."""
+    shift = torch.zeros_like(light)
+    for _ in range(4):
+        value = image + shift
+        slope = torch.where(value <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((value.clamp(min=0) + 0.055) / 1.055) ** 1.4)
+        shift = shift - (luminance(to_linear(value)) - light) / luminance(slope)
+    return shift
 
 
 def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h w"]:

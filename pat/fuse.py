@@ -43,6 +43,7 @@ from arraygeom.fields import pinhole_track
 from arraygeom.pixels import HW, coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
+from .develop import as_bright
 from .images import Pictures, luminance, write_atomically
 from .memory import give_back, parse_bytes
 from .model import Fused, FusionNetwork, Look
@@ -101,7 +102,8 @@ def fuse(
     Lenses: unless `field` is `Curved`, pictures that a lens bends are taken across to pinhole views first (up to 62
     degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha is bent back,
     alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta turned by about
-    a quarter or half a turn against alpha is turned upright.
+    a quarter or half a turn against alpha is turned upright. Where alpha is known to measure the luminance of linear
+    light and one beta the colours, the result is as bright in that sense (`pat.develop.as_bright`).
 
     Args:
         network: `load_weights("mono-colour")`, say.
@@ -168,7 +170,9 @@ def _fuse_straight(
     if how.announce:
         how.announce(planned)
     betas = [surveyed(network, own, beta, survey_tiles(network, rig[alpha].hw)) for beta in betas]
-    return _fused_in_tiles(network, own, betas, planned.tiles, how)
+    one_colour = len(betas) == 1 and betas[0].picture.shape[1] == 3
+    frame = _fused_in_tiles(network, own, betas, planned.tiles, how)
+    return frame._replace(image=as_bright(frame.image, own[0], rig[alpha].sensor)) if one_colour else frame
 
 
 def _planned(network: FusionNetwork, own: Tensor, betas: list[Beta], how: _How) -> Plan:

@@ -26,7 +26,7 @@ from arraygeom import Rig
 from arraygeom.io.native import write as rig_text
 from pat.classical import classical_band_calibrated
 from pat.demo import classical
-from pat.develop import read_views, to_linear
+from pat.develop import as_bright, read_views, to_linear
 from pat.fuse import FusedFrame, fuse
 from pat.hdr import merged, usable_range
 from pat.images import luminance, read_image, to_luma_chroma, write_atomically, write_image, write_text
@@ -210,6 +210,8 @@ def _still(
         frame, memory = fused_apart(how, out / "inputs" / "rig.yaml", first, alpha, out)
         read, images = read_views(rig, first, alpha=alpha)
     baseline = classical_baseline(read, images, alpha)
+    if len(images) == 2:
+        baseline = as_bright(baseline, images[alpha], read[alpha].sensor)
     rows = {"alpha alone": images[alpha].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
     extra: list[str] = []
     if recording.light:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ import arraygeom.io.whole
 from arraygeom import Rig
 from pat.batch import Batch, find_pictures
 from pat.cli import main
+from pat.develop import LIGHT
 from pat.guided import GuidedPAT, GuidedPATConfig
 from pat.images import read_image, write_image
 from pat.jobs import JobError
@@ -148,3 +150,12 @@ def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys):
     with pytest.raises(SystemExit):
         main([a for a in given if a != "--sequence"])
     assert "as many pictures of each camera" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_path):
+    job = batch(material, tmp_path, sequence=True)
+    sensor = replace(job.rig["fast"].sensor, response="mono", coding="linear")
+    job = replace(job, rig=job.rig.with_camera("fast", job.rig["fast"].replace(sensor=sensor)))
+    known = job._fusion().rig["fast"].sensor
+    assert (known.response, known.coding) == (LIGHT, "srgb")
+    assert known.frame_rate == sensor.frame_rate

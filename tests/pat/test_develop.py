@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from arraygeom import Rig, Sensor, View
-from pat.develop import develop, read_views, to_linear
-from pat.images import write_image
+from pat.develop import as_bright, develop, developed, read_views, to_linear
+from pat.images import luminance, write_image
 from pat.sensors import Coded
 
 HW = (48, 64)
@@ -123,3 +123,15 @@ def test_exr_is_written_and_holds_the_floats(tmp_path):
     with pytest.raises(ValueError, match="32-bit"):
         write_image(tmp_path / "b.exr", picture, bits=16)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_a_picture_is_as_bright_as_the_light_that_alpha_measured():
+    """The right chroma on alpha's values is too bright where colours are strong; then it is the truth again."""
+    linear = light() ** torch.tensor([1.0, 3.0, 0.5]).view(3, 1, 1)
+    truth, alpha = coded(linear), coded(luminance(linear))
+    fused = truth - luminance(truth) + alpha
+    assert (fused - truth).abs().max() > 0.02
+    measured = developed(Sensor(response="mono", coding="linear"))
+    assert (as_bright(fused, alpha, measured) - truth).abs().max() < 1e-4
+    for unknown in (Sensor(response="mono"), Sensor(response="nir", coding="linear"), Sensor(coding="linear")):
+        assert as_bright(fused, alpha, developed(unknown)) is fused
