@@ -170,21 +170,46 @@ class FittedLink(NamedTuple):
 def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """A better F than `F`, and a rough map, from matches that `F` puts within some pixels of their lines.
 
-    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by RANSAC, then moved along the lines' mean direction. Raises
-    ValueError for fewer than 20 matches that agree.
+    F by MAGSAC++ (Barath et al. 2020) to 1 px; H as of `rough_map`. Raises ValueError for fewer than 20 matches that
+    agree.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
     kept = near_lines(near, fitted, within=3)
     if len(kept.alpha) < ENOUGH:
         raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
-    H = similarity(kept)
-    low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
-    line = epipolar_lines(fitted, kept.alpha)
+    H, displacement = rough_map(kept, fitted)
+    return FittedLink(Link(fitted, H), kept, displacement)
+
+
+def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
+    """A similarity in the middle of where points are along their lines, and how far from it 98% of them are, pixels.
+
+    By RANSAC, then moved along the lines' mean direction.
+    """
+    H = similarity(matches)
+    low, high = _percentiles(_along_lines(matches, F, H), 0.01)
+    line = epipolar_lines(F, matches.alpha)
     shift = torch.stack([-line[:, 1], line[:, 0]], -1).mean(0) * (low + high) / 2
     H = shift_matrix(*(-shift).tolist()).to(H) @ H
-    low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
-    return FittedLink(Link(fitted, H), kept, max(-low, high))
+    low, high = _percentiles(_along_lines(matches, F, H), 0.01)
+    return H, max(-low, high)
+
+
+def straightened(pair: Pair, matches: Matches) -> Matches:
+    """The points where cameras without lenses would see them; those that the lens models do not reach are left out."""
+    (x, seen), (y, also) = pair.alpha.straighten(matches.alpha), pair.beta.straighten(matches.beta)
+    return Matches(x, y).only(seen & also)
+
+
+def with_map(pair: Pair, matches: Matches) -> FittedLink:
+    """The pair's link with the rough map of points near their lines, its F as it is. Raises ValueError for too few."""
+    F = pair.fundamental
+    kept = near_lines(straightened(pair, matches), F, within=3)
+    if len(kept.alpha) < ENOUGH:
+        raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
+    H, displacement = rough_map(kept, F)
+    return FittedLink(Link(F, H), kept, displacement)
 
 
 def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
@@ -192,7 +217,8 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
     """
-    near = near_lines(matches, pair.fundamental, within=3)
+    straight = Matches(pair.alpha.straighten(matches.alpha)[0], pair.beta.straighten(matches.beta)[0])
+    near = matches.only(line_distance(straight, pair.fundamental) <= 3)
     found = triangulate([camera.to(torch.float64) for camera in pair.cameras], torch.stack(near))
     depth = pair.cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
     if len(depth) < ENOUGH:
