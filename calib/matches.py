@@ -24,6 +24,10 @@ RATIO = 0.75
 FEATURES = 6000
 ENOUGH = 20
 """Matches that must agree before anything is concluded from them."""
+LOCATED = (0.15, 0.2, 0.3, np.inf)
+"""Points are to be known this well, one standard deviation in pixels by what patches around them leave over."""
+PLENTY = 40
+"""So many points that are located well are enough, and others are left out."""
 MANY = 60
 """With fewer matches that agree, the pictures may be mirrored."""
 AGREE = 5.0
@@ -91,8 +95,17 @@ def _sharp(a: Features, b: Features) -> Matches:
     ratio, turn = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
     c, s = ratio * np.cos(turn), ratio * np.sin(turn)
     maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
-    y = sharpened(a.picture, b.picture, a.points[i], b.points[j], maps)
-    return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y))
+    y, deviation = sharpened(a.picture, b.picture, a.points[i], b.points[j], maps)
+    kept = torch.from_numpy(_good_enough(deviation))
+    return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y)).only(kept)
+
+
+def _good_enough(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The points that are located best, by the first bound that leaves `PLENTY` of them; all, if none does."""
+    for bound in LOCATED:
+        if (kept := deviation < bound).sum() >= PLENTY:
+            return kept
+    return np.ones_like(deviation, dtype=np.bool_)
 
 
 def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:

@@ -31,7 +31,7 @@ from .unknowns import Unknown, changed, unknowns
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
-FREE = ("rotation", "centre")
+FREE = ("rotation", "translation", "centre")
 NO_NARROWER = 0.9
 """A number is left alone if the pictures leave more than this part of its standard deviation."""
 HELD_OUT = 4

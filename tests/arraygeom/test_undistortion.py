@@ -88,10 +88,11 @@ def test_a_picture_extended_keeps_its_edge_where_nothing_is_seen():
     plain, extended = (retaken(picture(HW), c, view, extended=e) for e in (False, True))
     assert torch.equal(plain.valid, extended.valid)
     assert torch.equal(extended.values * extended.valid, plain.values)
-    assert not plain.valid[0, 0, 0]
     assert (extended.values > 0).all()
-    corner = picture(HW)[:, 0, 0]
-    assert torch.allclose(extended.values[0, :, 0, 0], corner, atol=1e-3)
+    for row, column in ((0, 0), (-1, -1)):
+        assert not plain.valid[0, row, column]
+        corner = picture(HW)[:, row, column]
+        assert torch.allclose(extended.values[0, :, row, column], corner, atol=1e-3)
 
 
 def test_a_lens_of_unknown_focal_length_bends_as_that_of_a_camera():
