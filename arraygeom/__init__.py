@@ -3,7 +3,7 @@
 Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
 """
 
-from .camera import Camera, Projected, View, intrinsics
+from .camera import Camera, LensView, Projected, View, intrinsics
 from .distortion import Distortion
 from .epipolar import (
     Depth,
@@ -29,6 +29,7 @@ from .fields import (
     NearestVoxels,
     ReceptiveField,
     Rectified,
+    ThroughLenses,
     Widened,
     approximated,
     lazily,
@@ -56,6 +57,7 @@ __all__ = [
     "Epipolar",
     "EpipolarLine",
     "HomographyDisplacement",
+    "LensView",
     "Link",
     "Local",
     "Moved",
@@ -70,6 +72,7 @@ __all__ = [
     "Rig",
     "Segments",
     "Sensor",
+    "ThroughLenses",
     "Track",
     "Triangulated",
     "View",

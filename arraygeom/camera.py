@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeVar
 
@@ -52,6 +53,14 @@ class View:
         """The camera of the picture whose pixels are x' ~ A x, of size `hw`."""
         return self.replace(hw=hw)
 
+    def straighten(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Where a camera without this one's lens would have put what pixels see, and which the lens model reaches."""
+        return x, torch.ones_like(x[..., 0], dtype=torch.bool)
+
+    def bend(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Straightened pixels to those of the picture: the inverse of `straighten`."""
+        return x, torch.ones_like(x[..., 0], dtype=torch.bool)
+
     def contains(self, x: Float[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
         """Whether points lie on the picture's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         h, w = self.hw
@@ -67,7 +76,72 @@ class View:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Camera(View):
+class LensView(View):
+    """A view whose lens is known; its focal length and its place need not be.
+
+    `K` maps the plane z = 1 (after the lens) to pixels. Without a calibration it is only the scale and the centre in
+    which `distortion` counts: then `rays` say how the lens bends, not at which angle. Links of such views relate
+    `straighten`ed pixels.
+
+    >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
+    >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
+    >>> view.bend(torch.tensor([100.0, 30.0], dtype=torch.float64))[0].tolist()
+    [95.0, 30.0]
+    """
+
+    K: Float[Tensor, "*b 3 3"]
+    distortion: Distortion | None = None
+
+    def project_local(self, X: Float[Tensor, "*n 3"]) -> Projected:
+        """Points in the camera's own frame to pixels."""
+        normalised, valid = self._through_lens(X)
+        return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
+
+    def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
+        """The direction in the camera's frame of what pixels see, z = 1 for pinholes, and its validity."""
+        normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
+        if self.distortion is None:
+            return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
+        return self.distortion.unproject(normalised)
+
+    def straighten(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Where a pinhole with the same K would have put what pixels see, and which the lens model reaches."""
+        return self._each_through(Distortion.undistort, x)
+
+    def bend(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Straightened pixels to those of the picture: the inverse of `straighten`."""
+        return self._each_through(Distortion.distort, x)
+
+    def mapped(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
+        """The camera of the picture whose pixels are x' ~ A x, of size `hw`: K' = A K."""
+        return self.replace(K=A.to(self.K) @ self.K, hw=hw)
+
+    def to(self: AnyLensView, *args: Any, **kwargs: Any) -> AnyLensView:
+        """Like `Tensor.to`, for every tensor of the view."""
+        lens = None if self.distortion is None else self.distortion.to(*args, **kwargs)
+        return self.replace(K=self.K.to(*args, **kwargs), distortion=lens)
+
+    def _through_lens(self, X: Tensor) -> tuple[Tensor, Tensor]:
+        if self.distortion is not None:
+            return self.distortion.project(X)
+        z = X[..., 2:]
+        front = z > 0
+        return X[..., :2] / torch.where(front, z, 1.0), front[..., 0]
+
+    def _each_through(self, f: ThroughLens, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels to normalised points, through f, and back to pixels."""
+        if self.distortion is None:
+            return super().straighten(x)
+        normalised, valid = f(self.distortion, map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x))
+        return map_homogeneous(self.K[..., :2, :], normalised), valid
+
+
+AnyLensView = TypeVar("AnyLensView", bound=LensView)
+ThroughLens = Callable[[Distortion, Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera(LensView):
     """A calibrated camera. Leading batch axes everywhere; every tensor may require grad.
 
     `K` maps the plane z = 1 (after the lens) to pixels, the first pixel's centre being (0, 0). It is affine,
@@ -80,9 +154,7 @@ class Camera(View):
     [49.5, 29.5]
     """
 
-    K: Float[Tensor, "*b 3 3"]
     cam_from_world: Pose
-    distortion: Distortion | None = None
 
     @property
     def R(self) -> Float[Tensor, "*b 3 3"]:
@@ -103,11 +175,6 @@ class Camera(View):
         """World points (*n, 3) to pixels; with a batched camera (*b), points are (*b, n, 3)."""
         return self.project_local(self.cam_from_world.apply(X))
 
-    def project_local(self, X: Float[Tensor, "*n 3"]) -> Projected:
-        """Points in the camera's own frame to pixels."""
-        normalised, valid = self._through_lens(X)
-        return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
-
     def unproject(self, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
         """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
 
@@ -120,22 +187,9 @@ class Camera(View):
         X = torch.where(valid[..., None], X, torch.nan)
         return self.cam_from_world.inverse().apply(X)
 
-    def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
-        """The direction in the camera's frame of what pixels see, z = 1 for pinholes, and its validity."""
-        normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
-        if self.distortion is None:
-            return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
-        return self.distortion.unproject(normalised)
-
-    def mapped(self, A: Float[Tensor, "3 3"], hw: HW) -> Camera:
-        """The camera of the picture whose pixels are x' ~ A x, of size `hw`: K' = A K."""
-        return self.replace(K=A.to(self.K) @ self.K, hw=hw)
-
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Like `Tensor.to`, for every tensor of the camera."""
-        distortion = None if self.distortion is None else self.distortion.to(*args, **kwargs)
-        pose = self.cam_from_world.to(*args, **kwargs)
-        return self.replace(K=self.K.to(*args, **kwargs), cam_from_world=pose, distortion=distortion)
+        return super().to(*args, **kwargs).replace(cam_from_world=self.cam_from_world.to(*args, **kwargs))
 
     def to_kornia(self) -> PinholeCamera:
         """The same pinhole as a kornia camera, batched (B, 4, 4). Raises ValueError if there is a lens."""
@@ -154,13 +208,6 @@ class Camera(View):
         pose = Pose(camera.extrinsics[:, :3, :3], camera.extrinsics[:, :3, 3])
         hw = (int(camera.height[0]), int(camera.width[0]))
         return cls(K=camera.intrinsics[:, :3, :3], cam_from_world=pose, hw=hw)
-
-    def _through_lens(self, X: Tensor) -> tuple[Tensor, Tensor]:
-        if self.distortion is not None:
-            return self.distortion.project(X)
-        z = X[..., 2:]
-        front = z > 0
-        return X[..., :2] / torch.where(front, z, 1.0), front[..., 0]
 
 
 def intrinsics(

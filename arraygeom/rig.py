@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .camera import Camera, View
+from .camera import Camera, LensView, View
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, resize_matrix, shift_matrix, turn_matrix
@@ -25,7 +25,10 @@ Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
 
 @dataclass(frozen=True)
 class Link:
-    """What is known of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha."""
+    """What is known of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
+
+    Of views with lenses, x are straightened pixels (`LensView.straighten`).
+    """
 
     F: Float[Tensor, "*b 3 3"]
     H: Float[Tensor, "*b 3 3"] | None = None
@@ -63,6 +66,11 @@ class Pair:
         return isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)
 
     @property
+    def bent(self) -> bool:
+        """Whether either view has a lens, so that lines are curves in its picture."""
+        return any(isinstance(view, LensView) and view.distortion is not None for view in (self.alpha, self.beta))
+
+    @property
     def cameras(self) -> tuple[Camera, Camera]:
         """Both cameras. Raises ValueError unless the pair is calibrated."""
         if not (isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)):
@@ -90,7 +98,10 @@ class Pair:
 
     @property
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
-        """F with x_beta^T F x_alpha = 0, from the cameras or as given. Raises ValueError if neither is known."""
+        """F with x_beta^T F x_alpha = 0, from the cameras or as given; between straightened pixels through lenses.
+
+        Raises ValueError if neither is known.
+        """
         if self.link is not None:
             return self.link.F
         if not self.calibrated:
@@ -226,7 +237,7 @@ class Rig:
 
         `free` holds patterns over "camera.rotation" (rotation vector, radians), "camera.translation" (metres),
         "camera.focal" (fx, fy in pixels), "camera.centre" (cx, cy in pixels), "camera.distortion", "depth.near"
-        and "depth.far" (metres), for instance ["colour.*", "depth.near"].
+        and "depth.far" (metres), for instance ["colour.*", "depth.near"]. An uncalibrated view has its lens's.
         Raises ValueError for a pattern that matches nothing.
         """
         known = self._parameter_shapes()
@@ -278,11 +289,10 @@ class Rig:
         """One tensor of the right shape, type and device for each parameter."""
         known: dict[str, Tensor] = {}
         for name, camera in self.cameras.items():
-            if not isinstance(camera, Camera):
-                continue
-            known |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
-            known |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
-            if camera.distortion is not None:
+            if isinstance(camera, Camera):
+                known |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
+                known |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
+            if isinstance(camera, LensView) and camera.distortion is not None:
                 known[f"{name}.distortion"] = camera.distortion.coefficients
         if self.depth is not None:
             known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
@@ -313,15 +323,18 @@ def _focal_places(K: Tensor) -> Tensor:
 
 def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) -> View:
     mine = {k.removeprefix(f"{name}."): v for k, v in changes.items() if k.startswith(f"{name}.")}
-    if not mine or not isinstance(camera, Camera):
+    if not mine or not isinstance(camera, LensView):
         return camera
-    pose, K, lens = camera.cam_from_world, camera.K, camera.distortion
+    if "distortion" in mine and (lens := camera.distortion) is not None:
+        lens = dataclasses.replace(lens, coefficients=lens.coefficients + mine["distortion"])
+        camera = camera.replace(distortion=lens)
+    if not isinstance(camera, Camera):
+        return camera
+    pose, K = camera.cam_from_world, camera.K
     if mine.keys() & {"rotation", "translation"}:
         pose = pose.perturbed(mine.get("rotation"), mine.get("translation"))
     if "focal" in mine:
         K = K + torch.nn.functional.pad(_focal_places(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
     if "centre" in mine:
         K = K + torch.nn.functional.pad(mine["centre"][..., None], (2, 0, 0, 1))
-    if "distortion" in mine and lens is not None:
-        lens = dataclasses.replace(lens, coefficients=lens.coefficients + mine["distortion"])
-    return camera.replace(K=K, cam_from_world=pose, distortion=lens)
+    return camera.replace(K=K, cam_from_world=pose)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import Delaunay, QhullError
 from torch import Tensor
 
-from arraygeom import Camera, Pair, Rig
+from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 
@@ -211,7 +211,7 @@ def _area(triangles: Tensor) -> Tensor:
 def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
     """Whether one of two cameras is that of a mirrored picture."""
     views = [rig[name] for name in names]
-    return sum(isinstance(v, Camera) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
+    return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
 
 
 def _mean(shares: Iterable[float]) -> float:

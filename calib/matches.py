@@ -24,6 +24,10 @@ RATIO = 0.75
 FEATURES = 6000
 ENOUGH = 20
 """Matches that must agree before anything is concluded from them."""
+LOCATED = (0.15, 0.2, 0.3, np.inf)
+"""Points are to be known this well, one standard deviation in pixels by what patches around them leave over."""
+PLENTY = 40
+"""So many points that are located well are enough, and others are left out."""
 MANY = 60
 """With fewer matches that agree, the pictures may be mirrored."""
 AGREE = 5.0
@@ -91,8 +95,17 @@ def _sharp(a: Features, b: Features) -> Matches:
     ratio, turn = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
     c, s = ratio * np.cos(turn), ratio * np.sin(turn)
     maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
-    y = sharpened(a.picture, b.picture, a.points[i], b.points[j], maps)
-    return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y))
+    y, deviation = sharpened(a.picture, b.picture, a.points[i], b.points[j], maps)
+    kept = torch.from_numpy(_good_enough(deviation))
+    return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y)).only(kept)
+
+
+def _good_enough(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The points that are located best, by the first bound that leaves `PLENTY` of them; all, if none does."""
+    for bound in LOCATED:
+        if (kept := deviation < bound).sum() >= PLENTY:
+            return kept
+    return np.ones_like(deviation, dtype=np.bool_)
 
 
 def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:
@@ -170,21 +183,46 @@ class FittedLink(NamedTuple):
 def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """A better F than `F`, and a rough map, from matches that `F` puts within some pixels of their lines.
 
-    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by RANSAC, then moved along the lines' mean direction. Raises
-    ValueError for fewer than 20 matches that agree.
+    F by MAGSAC++ (Barath et al. 2020) to 1 px; H as of `rough_map`. Raises ValueError for fewer than 20 matches that
+    agree.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
     kept = near_lines(near, fitted, within=3)
     if len(kept.alpha) < ENOUGH:
         raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
-    H = similarity(kept)
-    low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
-    line = epipolar_lines(fitted, kept.alpha)
+    H, displacement = rough_map(kept, fitted)
+    return FittedLink(Link(fitted, H), kept, displacement)
+
+
+def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
+    """A similarity in the middle of where points are along their lines, and how far from it 98% of them are, pixels.
+
+    By RANSAC, then moved along the lines' mean direction.
+    """
+    H = similarity(matches)
+    low, high = _percentiles(_along_lines(matches, F, H), 0.01)
+    line = epipolar_lines(F, matches.alpha)
     shift = torch.stack([-line[:, 1], line[:, 0]], -1).mean(0) * (low + high) / 2
     H = shift_matrix(*(-shift).tolist()).to(H) @ H
-    low, high = _percentiles(_along_lines(kept, fitted, H), 0.01)
-    return FittedLink(Link(fitted, H), kept, max(-low, high))
+    low, high = _percentiles(_along_lines(matches, F, H), 0.01)
+    return H, max(-low, high)
+
+
+def straightened(pair: Pair, matches: Matches) -> Matches:
+    """The points where cameras without lenses would see them; those that the lens models do not reach are left out."""
+    (x, seen), (y, also) = pair.alpha.straighten(matches.alpha), pair.beta.straighten(matches.beta)
+    return Matches(x, y).only(seen & also)
+
+
+def with_map(pair: Pair, matches: Matches) -> FittedLink:
+    """The pair's link with the rough map of points near their lines, its F as it is. Raises ValueError for too few."""
+    F = pair.fundamental
+    kept = near_lines(straightened(pair, matches), F, within=3)
+    if len(kept.alpha) < ENOUGH:
+        raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
+    H, displacement = rough_map(kept, F)
+    return FittedLink(Link(F, H), kept, displacement)
 
 
 def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
@@ -192,7 +230,8 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
     """
-    near = near_lines(matches, pair.fundamental, within=3)
+    straight = Matches(pair.alpha.straighten(matches.alpha)[0], pair.beta.straighten(matches.beta)[0])
+    near = matches.only(line_distance(straight, pair.fundamental) <= 3)
     found = triangulate([camera.to(torch.float64) for camera in pair.cameras], torch.stack(near))
     depth = pair.cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
     if len(depth) < ENOUGH:

@@ -25,6 +25,13 @@ NEAR = 2.0
 Array = np.ndarray
 
 
+class Sharpened(NamedTuple):
+    """Places in beta, and their deviation along the worse axis, pixels; inf where nothing fitted."""
+
+    y: Float[np.ndarray, "n 2"]
+    deviation: Float[np.ndarray, " n"]
+
+
 class Patches(NamedTuple):
     """Patches of alpha and their values there; places in beta; maps (pixels of beta a step in the patch)."""
 
@@ -39,10 +46,10 @@ def sharpened(
     x: Float[np.ndarray, "n 2"],
     y: Float[np.ndarray, "n 2"],
     beta_from_alpha: Float[np.ndarray, "n 2 2"],
-) -> Float[np.ndarray, "n 2"]:
+) -> Sharpened:
     """Better `y` for points `x` of alpha, from rough maps between their neighbourhoods; as it is where none fits."""
     if not len(x):
-        return y
+        return Sharpened(y, np.zeros(0))
     step = np.maximum(1.0, 1 / np.sqrt(np.abs(np.linalg.det(beta_from_alpha))))[:, None, None]
     row = np.arange(-HALF, HALF + 1.0)
     around = np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
@@ -51,11 +58,11 @@ def sharpened(
     slopes = [cv2.Sobel(picture, cv2.CV_32F, 1 - k, k, ksize=3) / 8 for k in (0, 1)]
     found = Patches(_sampled(alpha.astype(np.float32), x[:, None] + step * around), y, step * beta_from_alpha)
     for _ in range(STEPS):
-        found, alike, moved = _moved(found, [picture, *slopes], around, weight / weight.sum())
+        found, alike, moved, deviation = _moved(found, [picture, *slopes], around, weight)
         if np.quantile(moved, 0.9) < SETTLED:
             break
     good = (alike > ALIKE) & (np.linalg.norm(found.y - y, axis=1) < NEAR)
-    return np.where(good[:, None], found.y, y)
+    return Sharpened(np.where(good[:, None], found.y, y), np.where(good, deviation, np.inf))
 
 
 def _sampled(picture: Array, x: Array) -> Array:
@@ -63,8 +70,10 @@ def _sampled(picture: Array, x: Array) -> Array:
     return cv2.remap(picture, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).astype(np.float64)
 
 
-def _moved(found: Patches, pictures: list[Array], around: Array, weight: Array) -> tuple[Patches, Array, Array]:
-    """The patches after a step, how alike they were before it (correlation), and how far they moved."""
+def _moved(found: Patches, pictures: list[Array], around: Array, weights: Array) -> tuple[Patches, Array, Array, Array]:
+    """The patches after a step, how alike they were before it (correlation), how far they moved; and how well their
+    places are known, by what is left (the worse axis's deviation, pixels)."""
+    weight = weights / weights.sum()
     at = found.y[:, None] + around @ found.A.swapaxes(1, 2)
     seen, across, down = (_sampled(p, at) for p in pictures)
     seen, wanted = (v - (v @ weight)[:, None] for v in (seen, found.values))
@@ -78,4 +87,7 @@ def _moved(found: Patches, pictures: list[Array], around: Array, weight: Array) 
     step = np.linalg.solve(H, turned @ (wanted - gain * seen)[..., None])[..., 0]
     shift, turn = step[:, :2].clip(-0.5, 0.5), step[:, 2:].reshape(-1, 2, 2).clip(-0.1, 0.1)
     alike = both / np.sqrt(power * own + 1e-9)
-    return found._replace(y=found.y + shift, A=found.A + turn), alike, np.linalg.norm(shift, axis=1)
+    left = ((wanted - gain * seen) ** 2) @ weight
+    known = np.linalg.inv(H)[:, :2, :2] * (left / weights.sum())[:, None, None]
+    deviation = np.sqrt(np.linalg.eigvalsh(known)[:, 1])
+    return found._replace(y=found.y + shift, A=found.A + turn), alike, np.linalg.norm(shift, axis=1), deviation

@@ -24,6 +24,7 @@ from arraygeom import (
     Positions,
     ReceptiveField,
     Rig,
+    ThroughLenses,
     pixel_grid,
 )
 
@@ -91,9 +92,9 @@ def photometric_errors(
 def field_of(pair: Pair) -> ReceptiveField:
     """Where to look: the segment of calibrated pinholes, the curve through lenses, the line of a pair known by F."""
     if pair.link is not None or not pair.calibrated:
-        return HomographyDisplacement(PART * max(pair.beta.hw))
-    straight = all(camera.distortion is None for camera in pair.cameras)
-    return Epipolar() if straight else Curved(64, nodes=16)
+        line = HomographyDisplacement(PART * max(pair.beta.hw))
+        return ThroughLenses(line, 64) if pair.bent else line
+    return Curved(64, nodes=16) if pair.bent else Epipolar()
 
 
 def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:

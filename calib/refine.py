@@ -22,7 +22,8 @@ from torch import Tensor
 
 from arraygeom import Rig
 
-from .matches import Matches, match_cameras
+from .lenses import spoken_lenses, with_lenses
+from .matches import ENOUGH, Matches, match_cameras, with_map
 from .photometric import Views, photometric_errors, with_depths
 from .residuals import epipolar_residuals, related
 from .unknowns import Unknown, changed, unknowns
@@ -30,7 +31,7 @@ from .unknowns import Unknown, changed, unknowns
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
-FREE = ("rotation", "centre")
+FREE = ("rotation", "translation", "centre")
 NO_NARROWER = 0.9
 """A number is left alone if the pictures leave more than this part of its standard deviation."""
 HELD_OUT = 4
@@ -106,6 +107,7 @@ class Refined:
         lines = [f"held-out points ({before.points}) lie {before} off their lines before, {after} after"]
         if self.accepted:
             lines += [f"changed: {change}" for change in self.changes]
+            lines += [sentence] if (sentence := spoken_lenses(self.rig)) else []
         else:
             lines.append("not accepted: held-out points come no nearer to their lines; the rig stays as it is")
         if self.left_alone:
@@ -128,20 +130,20 @@ def refine(
     """The rig after its free numbers are fitted to points matched in frames, each with a picture of every camera.
 
     The first camera that has pictures keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
-    always free. With two frames or more, whole frames are held out, else parts of the picture. With `photometric`,
+    always free, and views that are known by F alone are given lenses where points that were held out come nearer to
+    their lines so. With two frames or more, whole frames are held out, else parts of the picture. With `photometric`,
     the fusion's own error then has its say, with what the points told as its prior.
     Raises ValueError, one line: a camera that the rig lacks, a picture of another size than the rig says, equal
     pictures, too few points.
     """
     for frame in frames:
         _check(rig, frame)
-    fit = Fit.of(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
-    solution = fit.solve()
+    fit, solution = fitted(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
     told = fit.report(solution)
     if not (photometric and told.accepted):
         return told
     polished, errors = polish(fit, solution, frames)
-    return replace(fit.report(polished), photometric=errors) if errors.accepted else replace(told, photometric=errors)
+    return replace(fit.report(polished) if errors.accepted else told, photometric=errors)
 
 
 def refine_matches(
@@ -152,8 +154,23 @@ def refine_matches(
     sigma: Mapping[str, float] | None = None,
 ) -> Refined:
     """The same from points matched already, without the fusion's error."""
+    fit, solution = fitted(rig, frames, free=free, sigma=sigma)
+    return fit.report(solution)
+
+
+def fitted(
+    rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
+) -> tuple[Fit, Solution]:
+    """The fit and what it tells; with lenses for views known by F, if held-out points come nearer to their lines so."""
     fit = Fit.of(rig, frames, free=free, sigma=sigma)
-    return fit.report(fit.solve())
+    solution = fit.solve()
+    bent = with_lenses(rig, rig.names)
+    if bent is rig:
+        return fit, solution
+    other = Fit.of(bent, frames, free=free, sigma=sigma)
+    through = other.solve()
+    off = [line_distances(f.after(s.z), f.held_out) for f, s in ((fit, solution), (other, through))]
+    return (other, through) if nearer(*off) else (fit, solution)
 
 
 @dataclass(frozen=True)
@@ -197,7 +214,8 @@ class Fit:
         accepted = bool(solution.active.any()) and nearer(*off[1])
         changes = tuple(_changes(self.given, solution)) if accepted else ()
         alone = tuple(_left_alone(self.given, solution.active))
-        return Refined(better if accepted else self.rig, accepted, changes, alone, fitted, held_out)
+        rig = _with_maps(better, self.used) if accepted else self.rig
+        return Refined(rig, accepted, changes, alone, fitted, held_out)
 
 
 def polish(fit: Fit, solution: Solution, frames: Sequence[Frame]) -> tuple[Solution, Photometric]:
@@ -307,14 +325,14 @@ def _normal_equations(residuals: Callable[[Tensor], Tensor], z: Tensor, active: 
 def jacobian(f: Callable[[Tensor], Tensor], z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
     """f(z) and its derivatives, of many values in few numbers.
 
-    The gradient of u . f in z is linear in u; its derivatives in u are the columns wanted: n + 1 backward passes.
+    The gradient of u . f in z is linear in u; its derivatives in u are the columns wanted, all at once.
     """
     z = z.detach().requires_grad_()
     values = f(z)
     u = torch.zeros_like(values, requires_grad=True)
     (slope,) = torch.autograd.grad(values, z, u, create_graph=True)
-    columns = [torch.autograd.grad(s, u, retain_graph=True)[0] for s in slope]
-    return values.detach(), torch.stack(columns, -1)
+    (columns,) = torch.autograd.grad(slope, u, torch.eye(len(z)).to(slope), is_grads_batched=True)
+    return values.detach(), columns.T
 
 
 def sampson(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
@@ -363,6 +381,15 @@ def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], Matches]:
     names = dict.fromkeys(name for frame in frames for name in frame)
     parts = {name: [frame[name] for frame in frames if name in frame] for name in names}
     return {name: Matches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
+
+
+def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
+    """The rig whose links have a rough map where they had none and points tell one."""
+    links = dict(rig.links)
+    for names, matches in pairs.items():
+        if names in links and links[names].H is None and len(matches.alpha) >= ENOUGH:
+            links[names] = with_map(rig.pair(*names), matches).link
+    return rig.replace(links=links)
 
 
 def _check(rig: Rig, frame: Frame) -> None:

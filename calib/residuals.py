@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, Link, Pair, Pose, Rig, View, essential_matrix
+from arraygeom import Camera, Distortion, LensView, Link, Pair, Pose, Rig, View, essential_matrix
 from arraygeom.pixels import to_homogeneous
 
 from .matches import Matches
@@ -111,7 +111,7 @@ def related(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> dict[tuple[st
 
 def nature(pair: Pair) -> tuple[object, ...]:
     """What pairs must have in common to be stacked: known by cameras or by F, and their kinds of lenses."""
-    lenses = (view.distortion if isinstance(view, Camera) else None for view in (pair.alpha, pair.beta))
+    lenses = (view.distortion if isinstance(view, LensView) else None for view in (pair.alpha, pair.beta))
     kinds = (None if lens is None else (lens.model, lens.coefficients.shape[-1]) for lens in lenses)
     return (pair.calibrated and pair.link is None, *kinds)
 
@@ -126,13 +126,16 @@ def stacked(pairs: Sequence[Pair]) -> Pair:
 
 
 def _stacked(views: Sequence[View]) -> View:
-    cameras = [view for view in views if isinstance(view, Camera)]
-    if len(cameras) < len(views):
+    known = [view for view in views if isinstance(view, LensView)]
+    if len(known) < len(views):
         return views[0]
-    pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
-    lenses = [c.distortion for c in cameras if c.distortion is not None]
+    lenses = [view.distortion for view in known if view.distortion is not None]
     lens = Distortion(lenses[0].model, torch.stack([lens.coefficients for lens in lenses])) if lenses else None
-    return cameras[0].replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose, distortion=lens)
+    batch = known[0].replace(K=torch.stack([view.K for view in known]), distortion=lens)
+    cameras = [view for view in known if isinstance(view, Camera)]
+    if len(cameras) < len(known):
+        return LensView(hw=batch.hw, sensor=batch.sensor, K=batch.K, distortion=lens)
+    return batch.replace(cam_from_world=Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras])))
 
 
 def _for_each(pair: Pair, matches: Matches) -> tuple[Tensor, Tensor]:
@@ -143,9 +146,9 @@ def _for_each(pair: Pair, matches: Matches) -> tuple[Tensor, Tensor]:
 
 
 def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Rays of the pixels and E; or the pixels themselves and F. And where the rays exist."""
+    """Rays of the pixels and E; or the straightened pixels and F. And where the rays exist."""
     if pair.link is not None or not pair.calibrated:
-        everywhere = torch.ones_like(x[..., 0], dtype=torch.bool)
-        return (to_homogeneous(x), to_homogeneous(y)), pair.fundamental, everywhere
+        (a, seen), (b, also) = pair.alpha.straighten(x), pair.beta.straighten(y)
+        return (to_homogeneous(a), to_homogeneous(b)), pair.fundamental, seen & also
     (a, seen), (b, also) = (camera.rays(points) for camera, points in zip(pair.cameras, (x, y)))
     return (a, b), essential_matrix(pair.beta_from_alpha), seen & also

@@ -15,8 +15,9 @@ from torch import Tensor
 from arraygeom import Rig, View, intrinsics
 from arraygeom.pixels import HW
 
-from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras
-from .refine import split
+from .lenses import spoken_lenses
+from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, with_map
+from .refine import line_distances, refine_matches, split
 
 
 class Started(NamedTuple):
@@ -33,13 +34,14 @@ class Started(NamedTuple):
     by_focal: dict[tuple[str, str], bool]
 
     def as_text(self) -> str:
-        """One line a link."""
+        """One line a link, and one on lenses if there are any."""
+        lenses = spoken_lenses(self.rig)
         return "\n".join(
             f"{a} > {b}: {self.points[a, b]} points, held-out ones {self.off[a, b]:.2f} px off their lines, "
             f"seen within {self.displacement[a, b]:.0f} px of the rough map"
             + (", with the focal lengths given" if self.by_focal[a, b] else "")
             for a, b in self.rig.links
-        )
+        ) + (f"\n{lenses}" if lenses else "")
 
 
 def start(images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None) -> Started:
@@ -47,8 +49,9 @@ def start(images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, f
 
     F of every two cameras that see the same, by MAGSAC++ (Barath et al. 2020), and a rough map. With rough focal
     lengths, in pixels, of both cameras an essential matrix is fitted too, of five numbers instead of seven: it is
-    taken where it fits points better that were held out. Raises ValueError, one line: fewer than two pictures, equal
-    ones, too few points, a focal length of no camera.
+    taken where it fits points better that were held out. All F are then fitted together, with lenses, and taken on
+    the same condition. Raises ValueError, one line: fewer than two pictures, equal ones, too few points, a focal length
+    of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
@@ -56,14 +59,26 @@ def start(images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, f
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with a picture, or not positive")
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
     found = Started(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {})
-    links = {}
-    for names, matches in match_cameras(images).items():
+    links, matched = {}, match_cameras(images)
+    for names, matches in matched.items():
         F, off, by_focal = _fundamental(matches, *(_K(name, focal, sizes) for name in names))
-        fit = fit_link(matches, F, within=AGREE)
+        links[names] = fit_link(matches, F, within=AGREE).link
+        found.off[names], found.by_focal[names] = off, by_focal
+    rig = found.rig.replace(links=links)
+    better = refine_matches(rig, [matched])
+    if better.accepted:
+        rig = better.rig
+        found.off.update(_off(rig, matched))
+    for names, matches in matched.items():
+        fit = with_map(rig.pair(*names), matches)
         links[names] = fit.link
         found.points[names], found.displacement[names] = len(fit.matches.alpha), fit.displacement
-        found.off[names], found.by_focal[names] = off, by_focal
-    return found._replace(rig=found.rig.replace(links=links))
+    return found._replace(rig=rig.replace(links=links))
+
+
+def _off(rig: Rig, matched: Mapping[tuple[str, str], Matches]) -> dict[tuple[str, str], float]:
+    _, held_out = split([matched])
+    return {names: float(line_distances(rig, {names: m}).abs().median()) for names, m in held_out.items()}
 
 
 def _K(name: str, focal: Mapping[str, float], sizes: Mapping[str, HW]) -> Tensor | None:

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Link, Rig, rotation_from_vector
+from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
 from arraygeom.pixels import HW
 
 from .observability import NATURAL
@@ -27,6 +27,8 @@ UNITS = {
     "focal": ("px", 1.0),
     "centre": ("px", 1.0),
 }
+LENS_SIGMA = 0.2
+"""The same part where a lens is not calibrated: it counts in halves of the picture's longer side."""
 LINK_SIGMA = 0.1
 """Of the seven numbers of an F in coordinates that span about -1 to 1: next to nothing is known of them."""
 
@@ -56,19 +58,19 @@ def unknowns(
 
     `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or patterns
     over "camera.kind". `sigma` states standard deviations by kind, instead of `SIGMA`'s. A link between two of the
-    cameras has its F free. Raises ValueError for a pattern that matches nothing.
+    cameras has its F free, and uncalibrated lenses are free. Raises ValueError for a pattern that matches nothing.
     """
     stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
         raise ValueError(f"--sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
     sigma = {**SIGMA, **stated}
-    known = rig.parameters(free=["*"]) if any(isinstance(rig[n], Camera) for n in names) else {}
-    wanted = _matching(known, free)
+    known = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
+    calibrated = {name: like for name, like in known.items() if isinstance(rig.cameras.get(_camera_of(name)), Camera)}
+    wanted = _matching(calibrated, free)
+    wanted += [name for name in known if name not in calibrated and not name.startswith("depth.")]
     fixed = {f"{names[0]}.rotation", f"{names[0]}.translation"}
     found = [
-        _unknown(rig, name, known[name], sigma)
-        for name in wanted
-        if name.rpartition(".")[0] in names and name not in fixed
+        _unknown(rig, name, known[name], sigma) for name in wanted if _camera_of(name) in names and name not in fixed
     ]
     links = [f"{a} > {b}" for a, b in rig.links if a in names and b in names]
     return found + [Unknown(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
@@ -81,6 +83,10 @@ def changed(rig: Rig, given: Sequence[Unknown], z: Float[Tensor, " n"]) -> Rig:
     links = {names: _turned_link(link, values.get(" > ".join(names)), rig, names) for names, link in rig.links.items()}
     cameras = {name: value for name, value in values.items() if " > " not in name}
     return rig.perturbed(cameras).replace(links=links)
+
+
+def _camera_of(parameter: str) -> str:
+    return parameter.rpartition(".")[0]
 
 
 def _matching(known: Mapping[str, Tensor], free: Iterable[str]) -> list[str]:
@@ -104,8 +110,9 @@ def _unknown(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> U
     view = rig[camera]
     if kind == "focal" and isinstance(view, Camera):
         size = size * view.K[:2, :2].det().abs().sqrt()
-    if kind == "distortion" and isinstance(view, Camera) and view.distortion is not None:
-        size = size * torch.tensor(NATURAL[view.distortion.model][: len(size)], dtype=torch.float64)
+    if kind == "distortion" and isinstance(view, LensView) and view.distortion is not None:
+        natural = torch.tensor(NATURAL[view.distortion.model][: len(size)], dtype=torch.float64)
+        size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
     if kind == "translation":
         size = size * _longest_baseline(rig)
     unit, factor = UNITS.get(kind, ("", 1.0))

@@ -20,17 +20,18 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from arraygeom import (
-    Camera,
     Curved,
     Epipolar,
     EpipolarLine,
     HomographyDisplacement,
+    LensView,
     Moved,
     Pair,
     Positions,
     ReceptiveField,
     Rectified,
     Rig,
+    ThroughLenses,
     View,
     Widened,
     apply_homography,
@@ -99,11 +100,18 @@ def fuse(
 ) -> FusedFrame:
     """Fuse one frame at the view of camera `alpha`.
 
+<<<<<<< HEAD
     Lenses: unless `field` is `Curved`, pictures that a lens bends are taken across to pinhole views first (up to 62
     degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha is bent back,
     alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta turned by about
     a quarter or half a turn against alpha is turned upright. Where alpha is known to measure the luminance of linear
     light and one beta the colours, the result is as bright in that sense (`pat.develop.as_bright`).
+=======
+    Lenses: unless `field` is `Curved` or `ThroughLenses`, pictures that a lens bends are taken across to pinhole views
+    first (up to 62 degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha
+    is bent back, alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta
+    turned by about a quarter or half a turn against alpha is turned upright.
+>>>>>>> s4-calib
 
     Args:
         network: `load_weights("mono-colour")`, say.
@@ -258,25 +266,28 @@ def without_lenses(rig: Rig, images: Pictures) -> tuple[Rig, dict[str, Tensor]]:
     straight = dict(images)
     for name, image in images.items():
         camera = rig[name]
-        if isinstance(camera, Camera) and camera.distortion is not None:
-            rig = rig.with_camera(name, pinhole_view(camera))
-            straight[name] = retaken(image, camera, rig[name]).values[0].clamp(min=0)  # type: ignore[arg-type]
+        if isinstance(camera, LensView) and camera.distortion is not None:
+            view = pinhole_view(camera)
+            rig = rig.mapped(name, view.K @ torch.linalg.inv(camera.K), view.hw).with_camera(name, view)
+            straight[name] = retaken(image, camera, view, extended=True).values[0].clamp(min=0)
     return rig, straight
 
 
 def _has_lens(view: View) -> bool:
-    return isinstance(view, Camera) and view.distortion is not None
+    return isinstance(view, LensView) and view.distortion is not None
 
 
 def _follows_lenses(field: ReceptiveField | None) -> bool:
     while isinstance(field, Widened | Moved):
         field = field.field
-    return isinstance(field, Curved)
+    return isinstance(field, Curved | ThroughLenses)
 
 
 def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
     """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
-    if not (isinstance(field, Moved) and isinstance(lens, Camera) and isinstance(pinhole, Camera) and _has_lens(lens)):
+    if not (isinstance(field, Moved) and isinstance(lens, LensView) and isinstance(pinhole, LensView)):
+        return field
+    if lens.distortion is None:
         return field
     x, seen = pixels_between(lens, pinhole)
     rays, valid = lens.to(torch.float64).rays(field.points(x))
@@ -288,7 +299,7 @@ def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> Re
 
 def _bent(frame: FusedFrame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> FusedFrame:
     """The frame at the pixels of alpha's own picture."""
-    if not (isinstance(pinhole, Camera) and isinstance(lens, Camera) and lens.distortion is not None):
+    if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
         return frame
     added = frame.image - _grey(straight)
     inverse = (1 / frame.depth).nan_to_num(0.0)

@@ -12,7 +12,7 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 """
 
 from .approximation import approximated, placement_error
-from .curved import Curved
+from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
 from .protocol import Look, ReceptiveField, lazily, look
@@ -38,6 +38,7 @@ __all__ = [
     "NearestVoxels",
     "ReceptiveField",
     "Rectified",
+    "ThroughLenses",
     "Widened",
     "approximated",
     "covering_displacement",

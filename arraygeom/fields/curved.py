@@ -1,7 +1,8 @@
-"""The field that lenses bend: explicit positions along the picture of each ray."""
+"""Fields that lenses bend: explicit positions along the picture of each ray."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -9,11 +10,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..camera import Camera
+from ..camera import Camera, LensView, View
 from ..epipolar import FRONT
-from ..pixels import HW
+from ..pixels import HW, map_homogeneous
 from ..rig import Pair
-from ..segments import Positions, sample_fractions
+from ..segments import Positions, Segments, sample_fractions
+from ..undistortion import pinhole_view
+from .protocol import ReceptiveField
 from .straight import Epipolar
 
 
@@ -47,6 +50,52 @@ class Curved:
         mask = inside & seen & (pieces.length.sum(-1, keepdim=True) > 0)
         xy = torch.minimum(xy.clamp(min=-0.5), limits)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+
+@dataclass(frozen=True)
+class ThroughLenses:
+    """A straight field seen through lenses: for pairs known by F, or any field other than `Epipolar`.
+
+    The field is asked about the pair without its lenses (`pinhole_view`), and what it answers is bent as beta's lens
+    bends it. Segments are sampled at `samples` positions, evenly spaced before they are bent.
+    """
+
+    field: ReceptiveField
+    samples: int = 96
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+        """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with lenses."""
+        alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
+        link = None if pair.link is None else pair.link.mapped(alpha.A, beta.A)
+        straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
+        there, seen = alpha.straighten(x)
+        found = self.field(straight, there)
+        found = found.positions(self.samples) if isinstance(found, Segments) else found
+        xy, shown = beta.bend(found.xy)
+        mask = found.mask & seen[..., None] & shown & pair.beta.contains(xy)
+        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
+
+
+class _Straight(NamedTuple):
+    """A view, the same without its lens, and A which takes the straightened pixels of the one to those of the other."""
+
+    view: View
+    pinhole: View
+    A: Tensor
+
+    @classmethod
+    def of(cls, view: View) -> _Straight:
+        if not isinstance(view, LensView) or view.distortion is None:
+            return cls(view, view, torch.eye(3, dtype=torch.float64))
+        pinhole = pinhole_view(view)
+        return cls(view, pinhole, pinhole.K @ torch.linalg.inv(view.K))
+
+    def straighten(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        straight, valid = self.view.to(x.dtype).straighten(x)
+        return map_homogeneous(self.A[:2], straight), valid
+
+    def bend(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.view.to(x.dtype).bend(map_homogeneous(torch.linalg.inv(self.A)[:2], x))
 
 
 EDGE = 0.25

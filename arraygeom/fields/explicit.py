@@ -13,6 +13,7 @@ from ..homography import apply_homography
 from ..pixels import pixel_grid
 from ..rig import Pair
 from ..segments import Positions
+from .straight import require_straight
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class NearestVoxels:
     window: int = 80
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole."""
+        """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole. Not for lenses."""
+        require_straight(pair)
         with torch.no_grad():
             line = epipolar_lines(pair.fundamental, x)
             centre, placed = apply_homography(pair.homography, x)
@@ -95,7 +97,8 @@ class Local:
     spacing: float = 1.0
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
-        """Positions (*n, size^2, 2), row by row, centred on H x."""
+        """Positions (*n, size^2, 2), row by row, centred on H x. Raises ValueError for lenses."""
+        require_straight(pair)
         centre, placed = apply_homography(pair.homography, x)
         offsets = pixel_grid((self.size, self.size), dtype=x.dtype, device=x.device) - (self.size - 1) / 2
         xy = centre[..., None, :] + self.spacing * offsets.reshape(-1, 2)

@@ -55,10 +55,11 @@ class EpipolarLine:
     """
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Segments across beta's picture."""
+        """Segments across beta's picture. Raises ValueError for lenses."""
         if pair.link is None and pair.calibrated:
             zero, infinite = (torch.tensor(d, dtype=torch.float64) for d in (NEAREST, torch.inf))
             return _between(pair, zero, infinite, x)
+        require_straight(pair)
         F, (h, w) = pair.fundamental, pair.beta.hw
 
         def across(x: Tensor) -> Segments:
@@ -86,7 +87,11 @@ class HomographyDisplacement:
     displacement: float | None = None
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Segments centred on the point of the line nearest to H x, then clipped to beta's picture."""
+        """Segments centred on the point of the line nearest to H x, then clipped to beta's picture.
+
+        Raises ValueError for lenses.
+        """
+        require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
         given = self.displacement
         reach = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
@@ -167,9 +172,16 @@ def pinhole_track(pair: Pair, x: Float[Tensor, "*n 2"]) -> Track:
 def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
     """Both cameras. Raises ValueError unless they are calibrated and without lenses."""
     alpha, beta = pair.cameras
-    if alpha.distortion is not None or beta.distortion is not None:
-        raise ValueError("a straight field needs pinhole cameras: use Curved, or undistort the pictures first")
+    require_straight(pair)
     return alpha, beta
+
+
+def require_straight(pair: Pair) -> None:
+    """Raises ValueError if a view has a lens."""
+    if pair.bent:
+        raise ValueError(
+            "a straight field needs pinhole cameras: use Curved or ThroughLenses, or undistort the pictures first"
+        )
 
 
 def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) -> Float[Tensor, "*n 2"]:

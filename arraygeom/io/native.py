@@ -28,6 +28,10 @@ Units and the pixel convention stand in the file. Example:
     links:                            # pairs of cameras that have only a size
       - {alpha: mono, beta: colour, F: [[...], [...], [...]], H: [[...], [...], [...]]}
 
+A camera that is not calibrated may have a lens all the same, which says itself how many pixels count as 1 and where its
+centre is: `distortion: {model: ..., coefficients: [...], scale: 320, centre: [319.5, 199.5]}`. F and H of its links are
+between pixels without that lens's bending.
+
 Numbers in pixels are converted to ours (first centre at 0) when read; files are written in our convention.
 """
 
@@ -44,7 +48,7 @@ import torch
 import yaml
 from torch import Tensor
 
-from ..camera import Camera, View, intrinsics
+from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import Distortion
 from ..epipolar import shift_origin
 from ..pixels import shift_matrix
@@ -60,6 +64,7 @@ CAMERA = (
     *("size", "focal", "centre", "K", "rotation", "translation", "position", "distortion"),
     *("response", "frame_rate", "time_offset", "coding", "bayer", "bits", "black_level", "exposure", "gain"),
 )
+NAMED = {"focal": "focal length", "scale": "scale"}
 CALIBRATION = ("focal", "centre", "K", "rotation", "translation", "position", "distortion")
 
 
@@ -131,16 +136,29 @@ class _Reader:
         sensor = self.sensor(entry, fields)
         if not any(key in fields for key in CALIBRATION):
             return View(hw=(height, width), sensor=sensor)
-        K = self.K(entry, fields, (height, width))
+        if not any(key in fields for key in CALIBRATION if key != "distortion"):
+            return self.lens_view(f"{entry}.distortion", fields["distortion"], View(hw=(height, width), sensor=sensor))
         return Camera(
-            K=K,
+            K=self.K(entry, fields, (height, width)),
             cam_from_world=self.pose(entry, fields),
             hw=(height, width),
             distortion=self.distortion(f"{entry}.distortion", fields.get("distortion")),
             sensor=sensor,
         )
 
-    def K(self, entry: str, fields: Mapping[str, Any], hw: tuple[int, int]) -> Tensor:
+    def lens_view(self, entry: str, fields: Any, view: View) -> View:
+        """An uncalibrated view whose lens states its own scale and centre."""
+        self.keys(fields, ("model", "coefficients", "scale", "centre", "K"), entry)
+        if not ("scale" in fields or "K" in fields):
+            raise self.fail(
+                entry,
+                "is of a camera without 'focal': add that, or `scale` (the pixels that count as 1 in the lens model)",
+            )
+        K = self.K(entry, fields, view.hw, scale="scale")
+        lens = self.distortion(entry, {key: fields.get(key) for key in ("model", "coefficients")})
+        return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
+
+    def K(self, entry: str, fields: Mapping[str, Any], hw: tuple[int, int], scale: str = "focal") -> Tensor:
         if "K" in fields:
             K = self.numbers(fields["K"], (3, 3), f"{entry}.K")
             if K[2].tolist() != [0, 0, 1] or K[:2, :2].det().abs() < 1e-9:
@@ -148,11 +166,11 @@ class _Reader:
                     f"{entry}.K", "is not an intrinsic matrix: wanted [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
                 )
             return shift_matrix(self.origin, self.origin) @ K
-        if "focal" not in fields:
-            raise self.fail(entry, "has a pose or a lens but no 'focal' (pixels): add it, or leave only 'size'")
-        focal = self.pair(fields["focal"], f"{entry}.focal")
+        if scale not in fields:
+            raise self.fail(entry, "has a pose or a centre but no 'focal' (pixels): add it, or leave only 'size'")
+        focal = self.pair(fields[scale], f"{entry}.{scale}")
         if min(focal) <= 0:
-            raise self.fail(f"{entry}.focal", f"is {min(focal):g}; a focal length is positive, in pixels")
+            raise self.fail(f"{entry}.{scale}", f"is {min(focal):g}; a {NAMED[scale]} is positive, in pixels")
         K = intrinsics(focal, hw)
         if fields.get("centre") is not None:
             K[:2, 2] = self.numbers(fields["centre"], (2,), f"{entry}.centre") - self.origin
@@ -311,15 +329,19 @@ class _Reader:
 def _camera_entry(camera: View) -> dict[str, Any]:
     h, w = camera.hw
     entry: dict[str, Any] = {"size": [w, h]}
+    calibrated = isinstance(camera, Camera)
     if isinstance(camera, Camera):
-        K = camera.K
-        plain = not bool(K[0, 1] or K[1, 0]) and bool((K.diagonal() > 0).all())
-        entry |= {"focal": K.diagonal()[:2].tolist(), "centre": K[:2, 2].tolist()} if plain else {"K": K.tolist()}
+        entry |= _K_entry(camera.K, "focal")
         entry |= {"rotation": camera.R.tolist(), "translation": camera.t.tolist()}
-        if camera.distortion is not None:
-            lens = camera.distortion
-            entry["distortion"] = {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+    if isinstance(camera, LensView) and (lens := camera.distortion) is not None:
+        entry["distortion"] = {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+        entry["distortion"] |= {} if calibrated else _K_entry(camera.K, "scale")
     return entry | _sensor_entry(camera.sensor)
+
+
+def _K_entry(K: Tensor, scale: str) -> dict[str, Any]:
+    plain = not bool(K[0, 1] or K[1, 0]) and bool((K.diagonal() > 0).all())
+    return {scale: K.diagonal()[:2].tolist(), "centre": K[:2, 2].tolist()} if plain else {"K": K.tolist()}
 
 
 def _sensor_entry(sensor: Sensor) -> dict[str, Any]:

@@ -3,7 +3,26 @@ import dataclasses
 import pytest
 import torch
 
-from arraygeom import Camera, Curved, Distortion, Epipolar, Pair, Pose, Rig, intrinsics, look, rotation_from_vector
+from arraygeom import (
+    Camera,
+    Curved,
+    Distortion,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    LensView,
+    Link,
+    Local,
+    NearestVoxels,
+    Pair,
+    Pose,
+    Rig,
+    ThroughLenses,
+    View,
+    intrinsics,
+    look,
+    rotation_from_vector,
+)
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
 
@@ -162,3 +181,58 @@ def test_batched_rigs_agree_with_single_ones():
 def test_straight_fields_refuse_lenses():
     with pytest.raises(ValueError, match="use Curved"):
         look(Epipolar(), fisheye_rig().pair("alpha", "beta"))
+
+
+def known_by_F(rig: Rig) -> Rig:
+    """The rig's cameras without their poses and focal lengths: lenses that count in other units, F and H."""
+    pair = rig.pair("alpha", "beta")
+    views = {name: LensView(hw=c.hw, K=c.K, distortion=c.distortion) for name, c in rig.cameras.items()}
+    return Rig(views, links={("alpha", "beta"): Link(pair.fundamental, pair.homography)})
+
+
+@pytest.mark.parametrize("lenses", [(BARREL, BARREL), (BARREL, None), (None, BARREL)])
+def test_a_straight_field_through_lenses_follows_the_same_curve(lenses):
+    rig = with_lenses(random_rig(3), *lenses)
+    pair = rig.pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::7, ::7].reshape(-1, 2)
+    exact = Curved(200)(pair, x)
+    whole = exact.mask.all(-1)
+    found = ThroughLenses(Epipolar(), 200)(pair, x)
+    both = whole & found.mask.all(-1)
+    assert both.sum() > 15
+    assert distance_to_polyline(exact.xy[both], found.xy[both]).max() < 0.05
+    assert (found.xy[both][:, 0] - exact.xy[both][:, 0]).norm(dim=-1).max() < 0.5
+    by_F = ThroughLenses(HomographyDisplacement(100.0), 400)(known_by_F(rig).pair("alpha", "beta"), x)
+    near = (exact.xy[both][:, :, None] - by_F.xy[both][:, None]).norm(dim=-1)
+    assert near.masked_fill(~by_F.mask[both][:, None], torch.inf).amin(-1).max() < 0.5
+
+
+def test_through_no_lenses_is_the_field_itself():
+    pair = random_rig(4).pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)
+    straight, through = Epipolar()(pair, x).positions(9), ThroughLenses(Epipolar(), 9)(pair, x)
+    assert torch.equal(through.mask, straight.mask)
+    assert torch.equal(through.xy[through.mask], straight.xy[straight.mask])
+
+
+def test_links_through_lenses_survive_what_is_done_to_pictures():
+    """Resized, cropped and turned: the same points, in the new pixels."""
+    rig = known_by_F(with_lenses(random_rig(3), BARREL, BARREL))
+    x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
+    before = ThroughLenses(HomographyDisplacement(20.0), 21)(rig.pair("alpha", "beta"), x)
+    h, w = rig["beta"].hw
+    changed = rig.resize("beta", (2 * h, 2 * w)).turn("beta", 1).pair("alpha", "beta")
+    after = ThroughLenses(HomographyDisplacement(40.0), 200)(changed, x)
+    doubled = (before.xy + 0.5) * 2 - 0.5
+    turned = torch.stack([doubled[..., 1], 2 * w - 1 - doubled[..., 0]], -1)[before.mask]
+    assert len(turned) > 5
+    assert distance_to_polyline(turned[None], after.xy[after.mask][None]).max() < 0.3
+
+
+@pytest.mark.parametrize("field", [EpipolarLine(), HomographyDisplacement(20.0), NearestVoxels(), Local()])
+def test_fields_of_links_refuse_lenses(field):
+    rig = known_by_F(with_lenses(random_rig(3), None, BARREL))
+    with pytest.raises(ValueError, match="ThroughLenses"):
+        field(rig.pair("alpha", "beta"), torch.tensor([[30.0, 20.0]]))
+    plain = rig.with_camera("beta", View(hw=rig["beta"].hw))
+    field(plain.pair("alpha", "beta"), torch.tensor([[30.0, 20.0]]))

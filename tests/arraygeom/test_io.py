@@ -14,7 +14,7 @@ import pytest
 import scipy.io
 import torch
 
-from arraygeom import Camera, Pose, Rig, View, intrinsics
+from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics
 from arraygeom.distortion import Distortion
 from arraygeom.io import READERS, RigFileError, RigFileWarning, convention, read_rig, recognise, write_rig
 from arraygeom.pose import rotation_from_vector
@@ -547,3 +547,43 @@ def test_a_picture_turned_upside_down_survives_the_native_file(tmp_path):
     rig = Rig({"a": Camera(K=K, cam_from_world=Pose.identity(), hw=(240, 320))}).turn("a", 2)
     rig.save(tmp_path / "rig.yaml")
     assert torch.equal(Rig.load(tmp_path / "rig.yaml")["a"].K, rig["a"].K)
+
+
+def test_lenses_of_uncalibrated_cameras_come_back(tmp_path):
+    lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.01, 1e-3, -2e-3], dtype=torch.float64))
+    views = {
+        "a": LensView(hw=(400, 640), K=intrinsics(320.0, (400, 640)), distortion=lens, sensor=Sensor(response="rgb")),
+        "b": View(hw=(400, 640)),
+    }
+    F = torch.tensor([[0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    rig = Rig(views, links={("a", "b"): Link(F)}).resize("a", (300, 480)).turn("a", 1)
+    rig.save(tmp_path / "rig.yaml")
+    again = Rig.load(tmp_path / "rig.yaml")
+    assert type(again["a"]) is LensView
+    assert type(again["b"]) is View
+    assert again["a"].sensor == views["a"].sensor
+    x = torch.tensor([[10.0, 20.0], [250.0, 470.0]], dtype=torch.float64)
+    assert torch.equal(again["a"].straighten(x)[0], rig["a"].straighten(x)[0])
+    assert (again["a"].straighten(x)[0] - x).norm(dim=-1).max() > 1
+    assert torch.equal(again.links["a", "b"].F, rig.links["a", "b"].F)
+
+
+def test_a_lens_without_focal_length_states_its_scale(tmp_path):
+    path = tmp_path / "rig.yaml"
+    text = "first_pixel_centre: 1\ncameras:\n  a:\n    size: [640, 400]\n    distortion: "
+    path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: 320, centre: [321, 201]}\n")
+    view = Rig.load(path)["a"]
+    assert isinstance(view, LensView)
+    assert not isinstance(view, Camera)
+    assert view.bend(torch.tensor([640.0, 200.0], dtype=torch.float64))[0].tolist() == pytest.approx([672, 200])
+    path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0]}\n")
+    with pytest.raises(RigFileError, match=r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"):
+        Rig.load(path)
+    path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0], scale: -3}\n")
+    with pytest.raises(RigFileError, match=r"distortion\.scale: is -3; a scale is positive"):
+        Rig.load(path)
+    path.write_text(
+        text.replace("640, 400]", "640, 400]\n    focal: 500") + "{model: x, coefficients: [0], scale: 3}\n"
+    )
+    with pytest.raises(RigFileError, match=r"distortion\.scale: unknown key"):
+        Rig.load(path)

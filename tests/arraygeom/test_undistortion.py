@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, Pose, intrinsics, pinhole_view, retaken, rotation_from_vector
+from arraygeom import Camera, Distortion, LensView, Pose, intrinsics, pinhole_view, retaken, rotation_from_vector
 from arraygeom.undistortion import pixels_between
 
 HW = (120, 160)
@@ -80,3 +80,33 @@ def test_one_camera_at_a_time():
     c = camera("brown-conrady")
     with pytest.raises(ValueError, match="one camera at a time"):
         pinhole_view(c.replace(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None])))
+
+
+def test_a_picture_extended_keeps_its_edge_where_nothing_is_seen():
+    c = camera("brown-conrady")
+    view = pinhole_view(c)
+    plain, extended = (retaken(picture(HW), c, view, extended=e) for e in (False, True))
+    assert torch.equal(plain.valid, extended.valid)
+    assert torch.equal(extended.values * extended.valid, plain.values)
+    assert (extended.values > 0).all()
+    for row, column in ((0, 0), (-1, -1)):
+        assert not plain.valid[0, row, column]
+        corner = picture(HW)[:, row, column]
+        assert torch.allclose(extended.values[0, :, row, column], corner, atol=1e-3)
+
+
+def test_a_lens_of_unknown_focal_length_bends_as_that_of_a_camera():
+    c = camera("brown-conrady")
+    view = LensView(hw=c.hw, K=c.K, distortion=c.distortion)
+    pinhole, of_view = pinhole_view(c), pinhole_view(view)
+    assert of_view.hw == pinhole.hw
+    seen = retaken(picture(HW), view, of_view).valid
+    theirs, ours = pixels_between(c, pinhole)[0], pixels_between(view, of_view)[0]
+    assert torch.allclose(theirs[seen[0]], ours[seen[0]])
+    assert seen.float().mean() > 0.7
+    x = torch.tensor([[10.0, 20.0], [150.0, 100.0]], dtype=torch.float64)
+    rays, _ = c.rays(x)
+    straight, valid = view.straighten(x)
+    assert valid.all()
+    assert torch.allclose(straight, c.replace(distortion=None).project_local(rays).x)
+    assert torch.allclose(view.bend(straight)[0], x)

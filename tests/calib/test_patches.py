@@ -29,7 +29,7 @@ def test_points_return_to_where_they_are_seen():
     alpha, beta = warped()
     x = points()
     truth = x @ A.T + SHIFT
-    found = sharpened(alpha, beta, x, truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1)))
+    found = sharpened(alpha, beta, x, truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1))).y
     off = np.linalg.norm(found - truth, axis=1)
     assert np.median(off) < 0.05
     assert (off < 0.15).mean() > 0.95
@@ -40,9 +40,9 @@ def test_what_is_not_alike_is_left_alone():
     other = (texture((240, 320), seed=9)[0].numpy() * 255).astype(np.uint8)
     x = points()
     y = x + SHIFT
-    found = sharpened(alpha, other, x, y, np.tile(A, (60, 1, 1)))
+    found = sharpened(alpha, other, x, y, np.tile(A, (60, 1, 1))).y
     assert (found == y).all(1).mean() > 0.9
-    assert sharpened(alpha, other, x[:0], y[:0], np.zeros((0, 2, 2))).shape == (0, 2)
+    assert sharpened(alpha, other, x[:0], y[:0], np.zeros((0, 2, 2))).y.shape == (0, 2)
 
 
 def test_matches_are_better_for_it():
@@ -51,3 +51,19 @@ def test_matches_are_better_for_it():
     off = np.linalg.norm(matches.alpha.numpy() @ A.T + SHIFT - matches.beta.numpy(), axis=1)
     assert len(off) > 60
     assert np.median(off) < 0.08
+
+
+def test_deviations_tell_good_points_from_bad_ones():
+    """Points without texture have large ones, those that nothing fits infinite ones; the others are as off as stated."""
+    alpha, beta = warped()
+    flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]
+    noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]
+    x = points()
+    truth = x @ A.T + SHIFT
+    found = sharpened(*noisy, x, truth + RANDOM.normal(0, 0.3, x.shape), np.tile(A, (60, 1, 1)))
+    left = (x[:, 0] < 140) & (truth[:, 0] < 140) & np.isfinite(found.deviation)
+    right = (x[:, 0] > 180) & (truth[:, 0] > 180)
+    assert np.median(found.deviation[right]) > 4 * np.median(found.deviation[left])
+    assert np.median(np.linalg.norm(found.y - truth, axis=1)[left]) < 3 * np.median(found.deviation[left])
+    alike, *_ = warped()
+    assert np.isinf(sharpened(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean() > 0.9
