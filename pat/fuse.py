@@ -100,18 +100,12 @@ def fuse(
 ) -> FusedFrame:
     """Fuse one frame at the view of camera `alpha`.
 
-<<<<<<< HEAD
-    Lenses: unless `field` is `Curved`, pictures that a lens bends are taken across to pinhole views first (up to 62
-    degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha is bent back,
-    alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta turned by about
-    a quarter or half a turn against alpha is turned upright. Where alpha is known to measure the luminance of linear
-    light and one beta the colours, the result is as bright in that sense (`pat.develop.as_bright`).
-=======
     Lenses: unless `field` is `Curved` or `ThroughLenses`, pictures that a lens bends are taken across to pinhole views
     first (up to 62 degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha
     is bent back, alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta
-    turned by about a quarter or half a turn against alpha is turned upright.
->>>>>>> s4-calib
+    turned by about a quarter or half a turn against alpha is turned upright. Where alpha is known to measure the
+    luminance of linear light and one beta the colours, the result is as bright in that sense
+    (`pat.develop.as_bright`).
 
     Args:
         network: `load_weights("mono-colour")`, say.
