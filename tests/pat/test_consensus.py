@@ -285,3 +285,21 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_picture_shows_elsewhe
     alpha, beta, segments = beside(scene, 48)
     found = consensus(alpha, beta, beta * tint, *segments)
     assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
+
+
+def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
+    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is blurred."""
+    g = torch.Generator().manual_seed(2)
+    coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
+    alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)
+    truth = 0.8 - 0.6 * alpha
+    beta = blurred(truth, 1.5)
+    places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
+    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
+    found = consensus(alpha, beta, beta, *here).matched + alpha
+    left, lost = ((p - truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
+    assert left < 0.7 * lost
+
+
+def enlarged(picture: torch.Tensor, times: int) -> torch.Tensor:
+    return picture.repeat_interleave(times, -1).repeat_interleave(times, -2)
