@@ -1,0 +1,43 @@
+"""What each of the shipped networks costs: parameters, operations of its convolutions, seconds of a processor.
+
+python -m tests.benchmarks.bench_weights
+"""
+
+from __future__ import annotations
+
+import statistics
+import time
+
+import torch
+from torch.utils.flop_counter import FlopCounterMode
+
+from pat.evaluate import rectified_fusion
+from pat.weights import SHIPPED, load_weights
+
+HW = (384, 448)
+REPEATS = 5
+
+
+def main() -> None:
+    torch.set_num_threads(1)
+    g = torch.Generator().manual_seed(0)
+    alpha, beta = torch.rand(1, *HW, generator=g), torch.rand(3, HW[0] // 2, HW[1] // 2, generator=g)
+    print(f"{HW[1]} x {HW[0]} pixels, one thread; seconds of the processor: median (least to most) of {REPEATS}\n")
+    print("| weights | parameters | GFLOP | seconds |\n|---|---:|---:|---:|")
+    for path in sorted(SHIPPED.glob("*.safetensors")):
+        network = load_weights(path)
+        fuse = rectified_fusion(network)
+        with FlopCounterMode(display=False) as counter:
+            fuse(alpha, beta, 100.0)
+        seconds = []
+        for _ in range(REPEATS):
+            began = time.process_time()
+            fuse(alpha, beta, 100.0)
+            seconds.append(time.process_time() - began)
+        parameters = sum(p.numel() for p in network.parameters())
+        spread = f"{statistics.median(seconds):.2f} ({min(seconds):.2f} to {max(seconds):.2f})"
+        print(f"| {path.stem} | {parameters:,} | {counter.get_total_flops() / 1e9:.1f} | {spread} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
