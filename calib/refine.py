@@ -24,7 +24,7 @@ from arraygeom import Rig
 
 from .lenses import spoken_lenses, with_lenses
 from .matches import ENOUGH, Matches, match_cameras, with_map
-from .photometric import Views, photometric_errors, with_depths
+from .photometric import Attend, Views, photometric_errors, with_depths
 from .residuals import epipolar_residuals, related
 from .unknowns import Unknown, changed, unknowns
 
@@ -125,13 +125,13 @@ def refine(
     *,
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
-    photometric: bool = True,
+    attend: Attend | None = None,
 ) -> Refined:
     """The rig after its free numbers are fitted to points matched in frames, each with a picture of every camera.
 
     The first camera that has pictures keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
     always free, and views that are known by F alone are given lenses where points that were held out come nearer to
-    their lines so. With two frames or more, whole frames are held out, else parts of the picture. With `photometric`,
+    their lines so. With two frames or more, whole frames are held out, else parts of the picture. With `attend`,
     the fusion's own error then has its say, with what the points told as its prior.
     Raises ValueError, one line: a camera that the rig lacks, a picture of another size than the rig says, equal
     pictures, too few points.
@@ -140,9 +140,9 @@ def refine(
         _check(rig, frame)
     fit, solution = fitted(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
     told = fit.report(solution)
-    if not (photometric and told.accepted):
+    if attend is None or not told.accepted:
         return told
-    polished, errors = polish(fit, solution, frames)
+    polished, errors = polish(fit, solution, frames, attend)
     return replace(fit.report(polished) if errors.accepted else told, photometric=errors)
 
 
@@ -218,7 +218,7 @@ class Fit:
         return Refined(rig, accepted, changes, alone, fitted, held_out)
 
 
-def polish(fit: Fit, solution: Solution, frames: Sequence[Frame]) -> tuple[Solution, Photometric]:
+def polish(fit: Fit, solution: Solution, frames: Sequence[Frame], attend: Attend) -> tuple[Solution, Photometric]:
     """The solution moved to where the fusion's photometric error is least, with what the points told as its prior.
 
     Errors are compared with their own deviation and count as one measurement for every `TOGETHER` pixels, because
@@ -230,7 +230,7 @@ def polish(fit: Fit, solution: Solution, frames: Sequence[Frame]) -> tuple[Solut
     root = torch.linalg.cholesky(solution.covariance)[:, solution.active]
 
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
-        parts = [photometric_errors(base.after(z), v, names) for v in views for names in fit.used]
+        parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
         return torch.cat([error[seen & (_marked(error) == held_out)] for error, seen in parts])
 
     noise = _noise(errors(solution.z, held_out=False).detach())

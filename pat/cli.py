@@ -704,13 +704,15 @@ class Refine:
         """Do it."""
         from calib.refine import refine
 
+        from .attention import attend_with_statistics
+
         rig = Rig.load(self.rig)
         found = refine(
             rig,
             frames_of(rig, self.image),
             free=[kind for text in self.free for kind in text.split(",")],
             sigma=_deviations(self.sigma),
-            photometric=self.photometric,
+            attend=attend_with_statistics if self.photometric else None,
         )
         print(found.as_text())
         if found.accepted:
