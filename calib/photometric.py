@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -33,11 +33,19 @@ from arraygeom import (
 from .matches import ENOUGH, Matches, seen_depths
 
 
+@runtime_checkable
 class Attended(Protocol):
     """What attention returns: values (1, D, h, w) and how sure it is of one place (1, h, w)."""
 
-    value: Tensor
-    peak: Tensor
+    @property
+    def value(self) -> Tensor:
+        """What was found."""
+        ...
+
+    @property
+    def peak(self) -> Tensor:
+        """The largest weight."""
+        ...
 
 
 Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Attended]
