@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom import Rig
+from arraygeom import Camera, Rig
 
 from .lenses import spoken_lenses, with_lenses
 from .matches import ENOUGH, Matches, match_cameras, with_map
@@ -31,7 +31,9 @@ from .unknowns import Unknown, changed, unknowns
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
-FREE = ("rotation", "translation", "centre")
+FREE = ("rotation", "centre")
+MORE = ("translation",)
+"""Freed too where points demand it: along their lines pictures tell little of it, and depths would drift."""
 NO_NARROWER = 0.9
 """A number is left alone if the pictures leave more than this part of its standard deviation."""
 HELD_OUT = 4
@@ -161,16 +163,29 @@ def refine_matches(
 def fitted(
     rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
 ) -> tuple[Fit, Solution]:
-    """The fit and what it tells; with lenses for views known by F, if held-out points come nearer to their lines so."""
-    fit = Fit.of(rig, frames, free=free, sigma=sigma)
-    solution = fit.solve()
+    """The fit and what it tells; of more numbers where points that were held out come nearer to their lines so.
+
+    More are translations, if `free` is the default, and lenses of views that are known by F.
+    """
+    free = tuple(free)
+    found = _fitted(rig, frames, free, sigma)
+    if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
+        found = _nearer(found, _fitted(rig, frames, (*FREE, *MORE), sigma))
     bent = with_lenses(rig, rig.names)
-    if bent is rig:
-        return fit, solution
-    other = Fit.of(bent, frames, free=free, sigma=sigma)
-    through = other.solve()
-    off = [line_distances(f.after(s.z), f.held_out) for f, s in ((fit, solution), (other, through))]
-    return (other, through) if nearer(*off) else (fit, solution)
+    return found if bent is rig else _nearer(found, _fitted(bent, frames, free, sigma))
+
+
+def _fitted(
+    rig: Rig, frames: Sequence[Pairs], free: tuple[str, ...], sigma: Mapping[str, float] | None
+) -> tuple[Fit, Solution]:
+    fit = Fit.of(rig, frames, free=free, sigma=sigma)
+    return fit, fit.solve()
+
+
+def _nearer(found: tuple[Fit, Solution], other: tuple[Fit, Solution]) -> tuple[Fit, Solution]:
+    """The other fit if held-out points come nearer to their lines by it."""
+    off = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (found, other)]
+    return other if nearer(*off) else found
 
 
 @dataclass(frozen=True)

@@ -693,8 +693,9 @@ class Refine:
     """NAME=FILE, once for each camera and frame: the first files of all cameras are one frame, and so on."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Rig file to write."""
-    free: tuple[str, ...] = ("rotation", "translation", "centre")
-    """What may change: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation."""
+    free: tuple[str, ...] = ("rotation", "centre")
+    """What may change: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation. Unless
+    it is said, translation too where held-out points come nearer so."""
     sigma: tuple[str, ...] = ()
     """KIND=NUMBER: what it is known to, one standard deviation: degrees, pixels; for translation and focal, a part."""
     photometric: bool = True

@@ -74,6 +74,20 @@ def test_what_pictures_cannot_tell_is_left_alone_and_named():
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
 
 
+def test_translations_are_freed_where_points_demand_it():
+    """What no turn and no shift of the principal points explains; where they do, the baseline stays as it is."""
+    rig = unlike_pair()
+    exact = seen_points(rig, noise=0.0, seed=1)
+    moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
+    found = refine_matches(moved, [seen_points(rig, count=400)])
+    assert any(change.name == "second.translation" for change in found.changes)
+    assert median_off(found.rig, exact) < 0.1
+    turned = refine_matches(worse(rig), [seen_points(rig)])
+    assert not any("translation" in change.name for change in turned.changes)
+    only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
+    assert not any("translation" in change.name for change in only.changes)
+
+
 def test_a_tight_prior_holds():
     rig = unlike_pair()
     found = refine_matches(worse(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)})
