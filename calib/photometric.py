@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -24,12 +25,31 @@ from arraygeom import (
     Positions,
     ReceptiveField,
     Rig,
+    Segments,
     ThroughLenses,
     pixel_grid,
 )
 
 from .matches import ENOUGH, Matches, seen_depths
 
+
+@runtime_checkable
+class Attended(Protocol):
+    """What attention returns: values (1, D, h, w) and how sure it is of one place (1, h, w)."""
+
+    @property
+    def value(self) -> Tensor:
+        """What was found."""
+        ...
+
+    @property
+    def peak(self) -> Tensor:
+        """The largest weight."""
+        ...
+
+
+Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Attended]
+"""Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
 Describe = Callable[[Tensor], Tensor]
 """A grey picture (1, 1, H, W) to features (1, D, H, W) whose inner product says how alike two pixels are."""
 
@@ -68,14 +88,12 @@ class Views:
 
 
 def photometric_errors(
-    rig: Rig, views: Views, names: tuple[str, str]
+    rig: Rig, views: Views, names: tuple[str, str], attend: Attend
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
     """By how much what attention finds in beta misses alpha, at the pixels of the grid, and where it looked at all.
 
     Differentiable in the rig. Pixels count by how sure attention is of one place: errors are weighted by its peak.
     """
-    from pat.attention import attend_with_statistics
-
     alpha, beta = names
     for name in names:
         rig = rig.resize(name, views.hw[name])
@@ -83,7 +101,7 @@ def photometric_errors(
     look = field_of(pair)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
     query, own = (picture[alpha][:, :, rows][..., columns] for picture in (views.keys, views.values))
-    found = attend_with_statistics(query, views.keys[beta], views.values[beta], look)
+    found = attend(query, views.keys[beta], views.values[beta], look)
     seen = look.mask.any(-1) if isinstance(look, Positions) else look.valid
     sure = found.peak[0].detach().sqrt()
     return torch.where(seen, sure * (found.value - own)[0, 0], 0.0), seen

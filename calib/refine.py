@@ -20,18 +20,20 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom import Rig
+from arraygeom import Camera, Rig
 
 from .lenses import spoken_lenses, with_lenses
 from .matches import ENOUGH, Matches, match_cameras, with_map
-from .photometric import Views, photometric_errors, with_depths
+from .photometric import Attend, Views, photometric_errors, with_depths
 from .residuals import epipolar_residuals, related
 from .unknowns import Unknown, changed, unknowns
 
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
-FREE = ("rotation", "translation", "centre")
+FREE = ("rotation", "centre")
+MORE = ("translation",)
+"""Freed too where points demand it: along their lines pictures tell little of it, and depths would drift."""
 NO_NARROWER = 0.9
 """A number is left alone if the pictures leave more than this part of its standard deviation."""
 HELD_OUT = 4
@@ -125,13 +127,13 @@ def refine(
     *,
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
-    photometric: bool = True,
+    attend: Attend | None = None,
 ) -> Refined:
     """The rig after its free numbers are fitted to points matched in frames, each with a picture of every camera.
 
     The first camera that has pictures keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
     always free, and views that are known by F alone are given lenses where points that were held out come nearer to
-    their lines so. With two frames or more, whole frames are held out, else parts of the picture. With `photometric`,
+    their lines so. With two frames or more, whole frames are held out, else parts of the picture. With `attend`,
     the fusion's own error then has its say, with what the points told as its prior.
     Raises ValueError, one line: a camera that the rig lacks, a picture of another size than the rig says, equal
     pictures, too few points.
@@ -140,9 +142,9 @@ def refine(
         _check(rig, frame)
     fit, solution = fitted(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
     told = fit.report(solution)
-    if not (photometric and told.accepted):
+    if attend is None or not told.accepted:
         return told
-    polished, errors = polish(fit, solution, frames)
+    polished, errors = polish(fit, solution, frames, attend)
     return replace(fit.report(polished) if errors.accepted else told, photometric=errors)
 
 
@@ -161,16 +163,29 @@ def refine_matches(
 def fitted(
     rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
 ) -> tuple[Fit, Solution]:
-    """The fit and what it tells; with lenses for views known by F, if held-out points come nearer to their lines so."""
-    fit = Fit.of(rig, frames, free=free, sigma=sigma)
-    solution = fit.solve()
+    """The fit and what it tells; of more numbers where points that were held out come nearer to their lines so.
+
+    More are translations, if `free` is the default, and lenses of views that are known by F.
+    """
+    free = tuple(free)
+    found = _fitted(rig, frames, free, sigma)
+    if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
+        found = _nearer(found, _fitted(rig, frames, (*FREE, *MORE), sigma))
     bent = with_lenses(rig, rig.names)
-    if bent is rig:
-        return fit, solution
-    other = Fit.of(bent, frames, free=free, sigma=sigma)
-    through = other.solve()
-    off = [line_distances(f.after(s.z), f.held_out) for f, s in ((fit, solution), (other, through))]
-    return (other, through) if nearer(*off) else (fit, solution)
+    return found if bent is rig else _nearer(found, _fitted(bent, frames, free, sigma))
+
+
+def _fitted(
+    rig: Rig, frames: Sequence[Pairs], free: tuple[str, ...], sigma: Mapping[str, float] | None
+) -> tuple[Fit, Solution]:
+    fit = Fit.of(rig, frames, free=free, sigma=sigma)
+    return fit, fit.solve()
+
+
+def _nearer(found: tuple[Fit, Solution], other: tuple[Fit, Solution]) -> tuple[Fit, Solution]:
+    """The other fit if held-out points come nearer to their lines by it."""
+    off = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (found, other)]
+    return other if nearer(*off) else found
 
 
 @dataclass(frozen=True)
@@ -218,7 +233,7 @@ class Fit:
         return Refined(rig, accepted, changes, alone, fitted, held_out)
 
 
-def polish(fit: Fit, solution: Solution, frames: Sequence[Frame]) -> tuple[Solution, Photometric]:
+def polish(fit: Fit, solution: Solution, frames: Sequence[Frame], attend: Attend) -> tuple[Solution, Photometric]:
     """The solution moved to where the fusion's photometric error is least, with what the points told as its prior.
 
     Errors are compared with their own deviation and count as one measurement for every `TOGETHER` pixels, because
@@ -230,7 +245,7 @@ def polish(fit: Fit, solution: Solution, frames: Sequence[Frame]) -> tuple[Solut
     root = torch.linalg.cholesky(solution.covariance)[:, solution.active]
 
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
-        parts = [photometric_errors(base.after(z), v, names) for v in views for names in fit.used]
+        parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
         return torch.cat([error[seen & (_marked(error) == held_out)] for error, seen in parts])
 
     noise = _noise(errors(solution.z, held_out=False).detach())

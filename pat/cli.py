@@ -693,8 +693,9 @@ class Refine:
     """NAME=FILE, once for each camera and frame: the first files of all cameras are one frame, and so on."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """Rig file to write."""
-    free: tuple[str, ...] = ("rotation", "translation", "centre")
-    """What may change: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation."""
+    free: tuple[str, ...] = ("rotation", "centre")
+    """What may change: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation. Unless
+    it is said, translation too where held-out points come nearer so."""
     sigma: tuple[str, ...] = ()
     """KIND=NUMBER: what it is known to, one standard deviation: degrees, pixels; for translation and focal, a part."""
     photometric: bool = True
@@ -704,13 +705,15 @@ class Refine:
         """Do it."""
         from calib.refine import refine
 
+        from .attention import attend_with_statistics
+
         rig = Rig.load(self.rig)
         found = refine(
             rig,
             frames_of(rig, self.image),
             free=[kind for text in self.free for kind in text.split(",")],
             sigma=_deviations(self.sigma),
-            photometric=self.photometric,
+            attend=attend_with_statistics if self.photometric else None,
         )
         print(found.as_text())
         if found.accepted:

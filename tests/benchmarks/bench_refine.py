@@ -26,6 +26,7 @@ from arraygeom.pixels import coarse_grid
 from calib.matches import Matches, fit_fundamental, line_distance, match_cameras
 from calib.refine import FREE, Agreement, Fit, agreement, line_distances, polish, refine, refine_matches, split
 from calib.start import start
+from pat.attention import attend_with_statistics
 from pat.demo import ALPHA, load_sample
 from pat.fuse import fuse
 from pat.images import read_image
@@ -120,7 +121,7 @@ def rendered_rigs(draws: int, g: torch.Generator) -> Iterator[str]:
     true, alone = psnr(sample.rig), psnr(start(sample.images).rig)
     for draw in range(1, draws + 1):
         bad = worse(sample.rig, g)
-        rigs = [bad, *(refine(bad, [sample.images], photometric=p).rig for p in (False, True))]
+        rigs = [bad, *(refine(bad, [sample.images], attend=a).rig for a in (None, attend_with_statistics))]
         cells = [f"{p:.2f} dB" for p in (true, *map(psnr, rigs), alone)]
         yield f"| draw {draw} | {' | '.join(cells)} |"
 
@@ -135,7 +136,9 @@ def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
     for draw in range(1, draws + 1):
         fit = Fit.of(worse(sample.rig, g), [points], free=FREE, sigma=None)
         near = fit.prior()._replace(z=0.8 * fit.solve().z)
-        found, _ = polish(fit, near._replace(covariance=0.01 * near.covariance), [sample.images])
+        found, _ = polish(
+            fit, near._replace(covariance=0.01 * near.covariance), [sample.images], attend_with_statistics
+        )
         off = [median(line_distances(fit.after(z), {names: true})) for z in (near.z, found.z)]
         yield f"| draw {draw} | {off[0]:.2f} px | {off[1]:.2f} px |"
 

@@ -23,6 +23,7 @@ from calib.lenses import bending, uncalibrated_lenses, with_lenses
 from calib.matches import Matches, fit_fundamental, match_cameras, straightened
 from calib.photometric import Views, photometric_errors
 from calib.refine import Refined, line_distances, refine_matches
+from pat.attention import attend_with_statistics
 from pat.cli import main
 from pat.images import read_image
 from pat.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
@@ -131,7 +132,7 @@ def test_the_fusions_error_sees_through_lenses():
 
     def error(change):
         changed = views.perturbed({"right.distortion": change})
-        left, seen = photometric_errors(changed, ready, ("left", "right"))
+        left, seen = photometric_errors(changed, ready, ("left", "right"), attend_with_statistics)
         return left[seen].abs().mean()
 
     errors = {k: float(error(vector(k, 0, 0, 0))) for k in (-0.02, 0.0, 0.02)}

@@ -54,7 +54,7 @@ def test_matches_are_better_for_it():
 
 
 def test_deviations_tell_good_points_from_bad_ones():
-    """Points without texture have large ones, those that nothing fits infinite ones; the others are off as stated."""
+    """Points without texture have large ones, those that nothing fits infinite ones; others are as off as they say."""
     alpha, beta = warped()
     flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]
     noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]

@@ -12,6 +12,7 @@ from calib.photometric import Views, photometric_errors
 from calib.refine import Fit, jacobian, line_distances, polish, refine, refine_matches, sampson, solve
 from calib.residuals import epipolar_residuals
 from calib.unknowns import changed, unknowns
+from pat.attention import attend_with_statistics
 from pat.cli import main
 from pat.images import write_image
 from tests.calib.scenes import HW, rectified_pair, rectified_pictures, seen_points, texture, unlike_pair, vector
@@ -71,6 +72,20 @@ def test_what_pictures_cannot_tell_is_left_alone_and_named():
     for name in ("left", "right"):
         assert found.rig[name].K[0, 2] == bad[name].K[0, 2]
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
+
+
+def test_translations_are_freed_where_points_demand_it():
+    """What no turn and no shift of the principal points explains; where they do, the baseline stays as it is."""
+    rig = unlike_pair()
+    exact = seen_points(rig, noise=0.0, seed=1)
+    moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
+    found = refine_matches(moved, [seen_points(rig, count=400)])
+    assert any(change.name == "second.translation" for change in found.changes)
+    assert median_off(found.rig, exact) < 0.1
+    turned = refine_matches(worse(rig), [seen_points(rig)])
+    assert not any("translation" in change.name for change in turned.changes)
+    only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
+    assert not any("translation" in change.name for change in only.changes)
 
 
 def test_a_tight_prior_holds():
@@ -155,13 +170,15 @@ def test_photometric_error_is_least_for_the_true_rig():
 
     def error(pixels):
         moved = rig.perturbed({"right.centre": vector(0, pixels)})
-        left, seen = photometric_errors(moved, views, ("left", "right"))
+        left, seen = photometric_errors(moved, views, ("left", "right"), attend_with_statistics)
         return float(left[seen].abs().mean())
 
     errors = {p: error(p) for p in (-2.0, -1.0, 0.0, 1.0, 2.0)}
     assert min(errors, key=errors.get) == 0.0
     change = torch.zeros(2, dtype=torch.float64, requires_grad=True)
-    left, _ = photometric_errors(rig.perturbed({"right.centre": change + vector(0, 0.7)}), views, ("left", "right"))
+    left, _ = photometric_errors(
+        rig.perturbed({"right.centre": change + vector(0, 0.7)}), views, ("left", "right"), attend_with_statistics
+    )
     (slope,) = torch.autograd.grad(left.square().sum(), change)
     assert slope[1] > 0
 
@@ -169,7 +186,7 @@ def test_photometric_error_is_least_for_the_true_rig():
 def test_the_fusions_error_brings_a_rig_nearer_its_truth():
     rig, images = rectified_pair(), rectified_pictures()
     bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
-    found = refine(bad, [images], free=["rotation"])
+    found = refine(bad, [images], free=["rotation"], attend=attend_with_statistics)
     assert found.accepted
     assert found.photometric is not None
     assert "fusion's own error" in found.as_text()
@@ -187,7 +204,7 @@ def test_the_fusions_error_alone_does_too():
     )
     truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
     before = median_off(fit.rig, truth)
-    found, errors = polish(fit, fit.prior(), [images])
+    found, errors = polish(fit, fit.prior(), [images], attend_with_statistics)
     assert before > 1
     assert median_off(fit.after(found.z), truth) < 0.3 * before
     assert errors.accepted
