@@ -280,8 +280,12 @@ def _colours(
     values, own, brightness = seen.reshape(len(beta), -1, *hw).split([bands, 1, 1], 1)
     consistent = _enlarged((facts[:, :1] < CONSISTENT).to(alpha))
     brightness = levelled_at_matches(brightness, alpha, valid * consistent)
-    matched = _detailed(values - own, brightness, alpha) + own - alpha
-    unlike = avg_pool2d((brightness - _blurred(alpha, balance.blurs[0])).abs(), 3, 1, 1, count_include_pad=False)
+    soft = _blurred(alpha, balance.blurs[0])
+    if bands > 1:
+        matched = _detailed(values - own, brightness, alpha) + own - alpha
+    else:
+        matched = _detailed(values, soft, alpha) - alpha
+    unlike = avg_pool2d((brightness - soft).abs(), 3, 1, 1, count_include_pad=False)
     trust = (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
     planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
     spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
