@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Rig, Sensor, View
-from pat.develop import as_bright, develop, developed, read_views, to_linear
+from pat.develop import as_bright, demosaiced, develop, developed, read_views, to_linear
 from pat.images import luminance, write_image
 from pat.sensors import Coded
 
@@ -77,8 +77,8 @@ def test_colours_come_back_from_behind_each_filter_pattern(tmp_path, pattern):
     sensor = Sensor(coding="linear", bits=12, black_level=100, bayer=pattern)
     read = read_views(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a").images["a"]
     off = (to_linear(read) - light()).abs()[:, 2:-2, 2:-2]
-    assert off.mean() < 0.004
-    assert off.max() < 0.05
+    assert off.mean() < 0.006  # the bands vary independently here, for which the median costs a quarter
+    assert off.max() < 0.08
 
 
 def test_exposures_and_gains_are_brought_to_alphas():
@@ -135,3 +135,13 @@ def test_a_picture_is_as_bright_as_the_light_that_alpha_measured():
     assert (as_bright(fused, alpha, measured) - truth).abs().max() < 1e-4
     for unknown in (Sensor(response="mono"), Sensor(response="nir", coding="linear"), Sensor(coding="linear")):
         assert as_bright(fused, alpha, developed(unknown)) is fused
+
+
+def test_a_mosaic_makes_little_false_colour():
+    """A grey picture with detail of two pixels: 30 % less colour than by interpolation alone."""
+    grey = torch.rand(1, 1, 24, 32, generator=torch.Generator().manual_seed(1))
+    picture = torch.nn.functional.interpolate(grey, HW, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    raw = mosaic(picture.expand(3, -1, -1), "RGGB")
+    plain = cv2.demosaicing((raw[0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB_EA) / 65535
+    plain, ours = (np.abs(rgb - rgb[1:2]).mean() for rgb in (plain.transpose(2, 0, 1), demosaiced(raw, "RGGB").numpy()))
+    assert ours < 0.7 * plain
