@@ -177,17 +177,18 @@ def rendered_cases(folder: Path, *, alpha: str | None = None, beta: str | None =
     if not found or broken:
         what = f"{broken[0]} is not whole ({RENDER_FILE} is missing)" if broken else f"{folder} holds no rendered scene"
         raise ValueError(f"{what}: render it with `pat render`")
-    return (_rendered_case(path, alpha, beta, Generator().manual_seed(seed)) for path in found)
+    names = (str(path.relative_to(folder)) for path in found)
+    return (_rendered_case(n, path, alpha, beta, Generator().manual_seed(seed)) for n, path in zip(names, found))
 
 
-def _rendered_case(folder: Path, alpha: str | None, beta: str | None, g: Generator) -> Case:
+def _rendered_case(name: str, folder: Path, alpha: str | None, beta: str | None, g: Generator) -> Case:
     scene = Rendered(folder)
     first = scene.rig.known(alpha or scene.rig.names[0])
     second = scene.rig.known(beta or next(n for n in scene.rig.names if n != first))
     frames = [scene.frame(name) for name in (first, second)]
     truth, seen = (record(f.rgb[None], [Clip(), Coded()], g).image[0] for f in frames)
     rig = Rig({ALPHA: scene.rig[first], BETA: scene.rig[second]})
-    return _recorded(folder.name, rig, truth, seen, frames[0].depth, g)
+    return _recorded(name, rig, truth, seen, frames[0].depth, g)
 
 
 def _recorded(name: str, rig: Rig, truth: Tensor, seen: Tensor, depth: Tensor, g: Generator) -> Case:

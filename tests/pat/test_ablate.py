@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 import math
 
 import pytest
@@ -115,3 +116,5 @@ def test_rendered_folders(tmp_path, case):
     assert (read.truth - case.truth).abs().max() < 2e-3
     assert read.ratio == pytest.approx(case.ratio)
     assert torch.equal(read.depth, case.depth)
+    shutil.copytree(folder, tmp_path / "others" / "one")
+    assert [c.name for c in rendered_cases(tmp_path)] == ["others/one", "scenes/one"]
