@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import ctypes
+import re
 import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from threading import Thread
 
 
 def parse_bytes(amount: float | str) -> float:
@@ -25,3 +30,32 @@ def give_back() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
             trim(0)
+
+
+def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
+    """Look at a process until it ends; the answer waits for that and is the most it had resident, bytes (0: unknown).
+
+    What `wait4` tells is no less than what the parent had resident when it started the process.
+    """
+    status, found = Path(f"/proc/{pid}/status"), [0.0]
+
+    def watch() -> None:
+        while (line := re.search(r"VmHWM:\s+(\d+) kB", _text(status))) is not None:
+            found[0] = float(line[1]) * 2**10
+            time.sleep(every)
+
+    watching = Thread(target=watch, daemon=True)
+    watching.start()
+
+    def peak() -> float:
+        watching.join()
+        return found[0]
+
+    return peak
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text()
+    except OSError:
+        return ""

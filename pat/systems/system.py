@@ -30,6 +30,7 @@ from pat.develop import as_bright, read_views, to_linear
 from pat.fuse import FusedFrame, fuse
 from pat.hdr import merged, usable_range
 from pat.images import luminance, read_image, to_luma_chroma, write_atomically, write_image, write_text
+from pat.memory import watch_peak
 from pat.metrics import score
 from pat.model import FusionNetwork
 from pat.results import colour_depth, save_frame, save_panels, view_of
@@ -236,6 +237,7 @@ def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out:
     command += ["--bits", "16", "--weights", how.weights, "--max-memory", str(how.max_memory)]
     begin, planned = time.monotonic(), ""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    most = watch_peak(process.pid)
     for line in process.stderr or ():
         planned = line.strip() if line.startswith("plan:") else planned
         if line.strip():
@@ -244,7 +246,7 @@ def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out:
     if status:
         raise ValueError(f"fusing in a process of its own failed (wait status {status})")
     took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
-    peak = f"allowed {how.max_memory}, at most {used.ru_maxrss / 2**20:.2f} GiB resident"
+    peak = f"allowed {how.max_memory}, at most {most() / 2**30:.2f} GiB resident"
     depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
     unknown = torch.full_like(confidence, torch.nan)
