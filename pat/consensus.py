@@ -119,7 +119,10 @@ class Balances(NamedTuple):
 
 
 class _Geometry(NamedTuple):
-    """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32."""
+    """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32.
+
+    `cut` is 1 where a segment may go on beyond beta's edge.
+    """
 
     end: NDArray[np.float32]
     along: NDArray[np.float32]

@@ -60,6 +60,13 @@ def test_workers_do_the_same_and_say_the_same(tmp_path):
         run_tasks(tasks(tmp_path, "bad"), workers=Workers(2))
 
 
+def test_local_workers_keep_freed_memory():
+    """With Dask's own setting glibc gives back every freed picture at once, and two workers were slower than one."""
+    with Workers(2).client() as client:
+        told = client.run(lambda: (os.environ.get("MALLOC_TRIM_THRESHOLD_"), os.environ["OMP_NUM_THREADS"]))
+    assert list(told.values()) == [(None, "1")] * 2
+
+
 def test_a_scheduler_that_is_not_there_is_named(tmp_path):
     pytest.importorskip("distributed")
     with pytest.raises(ValueError, match="no Dask scheduler at nowhere"):
