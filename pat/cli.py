@@ -68,7 +68,7 @@ class Demo:
         from .results import save_frame
 
         sample = load_sample()
-        console.print("classical baseline: semi-global matching, warped colour, guided filter")
+        console.print("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
         baseline = classical(sample.rig, sample.images, ALPHA, BETA)
         console.print(f"fusion with the weights '{self.weights}'")
         frame = fuse_frame(self.weights, sample.rig, sample.images, alpha=ALPHA)
