@@ -62,6 +62,18 @@ ENVIRONMENT = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS
 time of two workers then went into getting the same pages again."""
 
 
+@contextmanager
+def environment_put_back() -> Iterator[None]:
+    """The environment is afterwards as it was: Dask leaves what it tells its workers in their parent too."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        for name in os.environ.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
+
+
 @dataclass(frozen=True)
 class Workers:
     """Where tasks run.
@@ -85,6 +97,7 @@ class Workers:
         if self.scheduler is None:
             options = {"n_workers": self.count, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
             with (
+                environment_put_back(),
                 config.set({"distributed.nanny.pre-spawn-environ": ENVIRONMENT}),
                 LocalCluster(**options, memory_limit=0) as cluster,
                 Client(cluster) as client,

@@ -18,6 +18,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
 
+from ..jobs import environment_put_back
 from .workshop import Order, Outcome, Stopped, Workshop
 
 _LOCAL = threading.local()
@@ -79,7 +80,11 @@ def dask_pool(order: Order, indices: Sequence[int], scheduler: str, workers: int
     Raises Stopped when the job cannot go on; ValueError if Dask is not installed or the scheduler does not answer.
     """
     distributed = _distributed()
-    with _cluster(distributed, scheduler, workers) as address, _client(distributed, address) as client:
+    with (
+        environment_put_back(),
+        _cluster(distributed, scheduler, workers) as address,
+        _client(distributed, address) as client,
+    ):
         futures = {client.submit(make_scene, order, index, pure=False, retries=3): index for index in indices}
         try:
             for future in distributed.as_completed(futures):

@@ -60,11 +60,20 @@ def test_workers_do_the_same_and_say_the_same(tmp_path):
         run_tasks(tasks(tmp_path, "bad"), workers=Workers(2))
 
 
-def test_local_workers_keep_freed_memory():
+def test_local_workers_keep_freed_memory(monkeypatch):
     """With Dask's own setting glibc gives back every freed picture at once, and two workers were slower than one."""
+    for name in ("MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
     with Workers(2).client() as client:
         told = client.run(lambda: (os.environ.get("MALLOC_TRIM_THRESHOLD_"), os.environ["OMP_NUM_THREADS"]))
     assert list(told.values()) == [(None, "1")] * 2
+
+
+def test_what_workers_are_told_does_not_stay_in_this_process(monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    with Workers(1).client():
+        pass
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
 
 
 def test_a_scheduler_that_is_not_there_is_named(tmp_path):
