@@ -51,6 +51,14 @@ class StereoPair:
     calibration: Calibration | None = None
 
 
+class PairFiles(NamedTuple):
+    """Where a rectified pair is, and how far to look in it, in pixels of left."""
+
+    left: Path
+    right: Path
+    max_disparity: float
+
+
 class _Middlebury(NamedTuple):
     """How one Middlebury collection names its files, and the disparity value of one pixel."""
 
@@ -94,12 +102,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     and 4.
     """
     root = _folder(root)
-    scenes = sorted(
-        (file, layout)
-        for key, layout in MIDDLEBURY.items()
-        for file in root.rglob(layout.left)
-        if any(key in folder for folder in file.parts[-3:-1])
-    )
+    scenes = _middlebury_scenes(root)
     if not scenes:
         raise _no_pair(root)
     return (_middlebury_pair(root, left, layout) for left, layout in scenes)
@@ -121,6 +124,20 @@ def flickr_pairs(root: str | Path) -> Iterator[StereoPair]:
 def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
     """Every (near-)rectified pair under `root` whose names follow one of `LEFT_AND_RIGHT`."""
     return (pair for pair, _ in _pairs_and_files(root, max_disparity=max_disparity))
+
+
+def pair_files(root: str | Path) -> list[PairFiles]:
+    """The files of every pair that `middlebury_pairs` and `folder_pairs` read, in order, without reading them.
+
+    Raises FileNotFoundError for no such folder, ValueError where there is no pair.
+    """
+    root = _folder(root)
+    found = {left: PairFiles(left, right, PAPER_DISPARITY) for left, right in _named(root)}
+    for left, layout in _middlebury_scenes(root):
+        found[left] = PairFiles(left, left.with_name(layout.right), 255 / layout.scale)
+    if not found:
+        raise _no_pair(root)
+    return [found[left] for left in sorted(found)]
 
 
 def syntim_pairs(root: str | Path) -> Iterator[StereoPair]:
@@ -146,6 +163,16 @@ def _no_pair(root: Path) -> ValueError:
     return ValueError(f"{root}: holds no stereo pair: check the folder and how its pictures are named")
 
 
+def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:
+    """Left pictures in folders of Middlebury's collections, in order."""
+    return sorted(
+        (file, layout)
+        for key, layout in MIDDLEBURY.items()
+        for file in root.rglob(layout.left)
+        if any(key in folder for folder in file.parts[-3:-1])
+    )
+
+
 def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
     coded = read_image(left.with_name(layout.truth))[0] * 255
     return StereoPair(
@@ -159,10 +186,15 @@ def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
 
 def _pairs_and_files(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[tuple[StereoPair, Path]]:
     root = _folder(root)
-    files = [(left, right) for left in sorted(root.rglob("*")) for right in _right_of(left, root)]
+    files = _named(root)
     if not files:
         raise _no_pair(root)
     return ((_rectified_pair(root, left, right, max_disparity), left) for left, right in files)
+
+
+def _named(root: Path) -> list[tuple[Path, Path]]:
+    """Left and right by their names."""
+    return [(left, right) for left in sorted(root.rglob("*")) for right in _right_of(left, root)]
 
 
 def _rectified_pair(root: Path, left: Path, right: Path, max_disparity: float) -> StereoPair:

@@ -101,7 +101,7 @@ def scene_folders(root: str | Path) -> list[Path]:
 
 
 @contextmanager
-def _reading(folder: Path) -> Iterator[None]:
+def reading(folder: Path) -> Iterator[None]:
     """Errors of what is read name the folder and say what to do."""
     try:
         yield
@@ -112,7 +112,7 @@ def _reading(folder: Path) -> Iterator[None]:
 
 def scene_rig(folder: Path) -> Rig:
     """The cameras of a scene. Raises ValueError if they cannot be read."""
-    with _reading(folder):
+    with reading(folder):
         return Rendered(folder).rig
 
 
@@ -123,7 +123,7 @@ def cut(folder: Path, patches: Patches, *, alpha: str) -> Stack:
     that is not calibrated.
     """
     rig = scene_rig(folder)
-    with _reading(folder):
+    with reading(folder):
         frames = Rendered(folder).first_frames()
     try:
         windows = _windows(rig, alpha, patches)

@@ -42,6 +42,8 @@ class Recording:
     """Chance of one of the paper's four degradations on top, for one beta."""
     miscalibrated: float = 0.0
     """Error of the poses that fields are made from: how far it moves points, root mean square, pixels."""
+    lens: float = 0.0
+    """Chance of a lens that bends (|k1| up to 0.3), its picture straightened again."""
     ideal: bool = False
     """The truth is the scene itself; else it has alpha's luminance as recorded, noise and all."""
 
@@ -96,6 +98,14 @@ class TrainConfig:
     """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
     general_rigs: RigDistribution = GENERAL
+    rendered: float = 0.0
+    """Share of the batches made of rendered scenes, in place of photographs in layers."""
+    rendered_from: tuple[Path, ...] = ()
+    """Folders of rendered scenes, as `pat render` leaves them."""
+    pairs: float = 0.0
+    """Share of the batches made of stereo pairs."""
+    pairs_from: tuple[Path, ...] = ()
+    """Folders of rectified stereo pairs in colour."""
     recording: Recording = Recording()
     field: FieldName = "epipolar"
     """Where the network looks."""
@@ -123,6 +133,18 @@ class TrainConfig:
                 raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
         if min(self.hw) < 16 or any(side % 16 for side in self.hw):
             raise ValueError(f"hw must be multiples of 16, got {self.hw[0]} x {self.hw[1]}")
+        self._check_sources()
+
+    def _check_sources(self) -> None:
+        for name in ("rendered", "pairs"):
+            share, folders = getattr(self, name), getattr(self, f"{name}_from")
+            if not 0 <= share <= 1:
+                raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
+            if bool(share) != bool(folders):
+                said = "there is no folder" if share else f"{folders[0]} is given"
+                raise ValueError(f"{name} is {share:g} and {said}: give both `{name}` and `{name}_from`, or neither")
+        if self.rendered + self.pairs > 1:
+            raise ValueError(f"rendered and pairs are shares of the batches, {self.rendered + self.pairs:g} in all")
 
 
 def recipes() -> tuple[str, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -69,7 +70,7 @@ def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Seen]]:
 
 
 def match_loss(seen: list[Seen], given: Sample) -> Tensor:
-    """How far off the looks were where beta sees the point, pixels, and how wrong the confidence."""
+    """How far off the looks were where beta sees the point, pixels, and how wrong the confidence; 0 if nobody knows."""
     total = given.truth.new_zeros(())
     for told, truth, visible in zip(seen, given.position, given.visible):
         off = (told.attended.position - truth.movedim(-1, 1)).abs().sum(1)
@@ -81,12 +82,14 @@ def match_loss(seen: list[Seen], given: Sample) -> Tensor:
 
 @torch.no_grad()
 def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
-    """Mean PSNR, and the share of visible pixels matched within a pixel and a half."""
+    """Mean PSNR, and the share of visible pixels matched within a pixel and a half (NaN if nobody knows)."""
     psnr, near = [], []
     for given in samples:
         fused = network(given.alpha, given.betas, given.looks)
         error = (fused.image.clamp(0, 1) - given.truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
-        off = (fused.position[0] - given.position[0].movedim(-1, 1)).norm(dim=1)
-        near.append((off[given.visible[0]] < 1.5).float().mean())
-    return {"psnr": float(torch.stack(psnr).mean()), "matched": float(torch.stack(near).mean())}
+        for where, visible in list(zip(given.position, given.visible))[:1]:
+            off = (fused.position[0] - where.movedim(-1, 1)).norm(dim=1)
+            near.append((off[visible] < 1.5).float().mean())
+    matched = float(torch.stack(near).nanmean()) if near else math.nan
+    return {"psnr": float(torch.stack(psnr).mean()), "matched": matched}

@@ -1,5 +1,7 @@
 """Samples made while training: layered scenes from photographs, seen by random rigs, recorded by random cameras.
 
+A share of them may come from rendered scenes, and from stereo pairs.
+
 What a step sees is a pure function of the seed and the number of the step, so that a run goes on where it
 stopped, and so that processes share out a step without talking to each other.
 """
@@ -7,10 +9,10 @@ stopped, and so that processes share out a step without talking to each other.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from itertools import islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -43,6 +45,9 @@ from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
 from .config import FieldName, Recording, TrainConfig
+from .lenses import LOST, through_lenses
+from .scenes import RenderedCrops
+from .stereo import PairCrops
 
 KEPT = 48
 """Groups of scenes that wait to be recorded again."""
@@ -64,7 +69,7 @@ FIELDS: dict[FieldName, Callable[[], ReceptiveField]] = {
 
 
 class Sample(NamedTuple):
-    """What a network is given, what it should answer, and where in each beta it should have looked."""
+    """What a network is given, what it should answer, and, if known, where in each beta it should have looked."""
 
     alpha: Tensor
     betas: list[Tensor]
@@ -91,7 +96,7 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
     for number in range(2**62):
         new = len(kept) < FEW or draw.random() < 1 / config.reuse
         if new:
-            kind = "rectified" if draw.random() < config.rectified else "general"
+            kind = _source(config, draw) or ("rectified" if draw.random() < config.rectified else "general")
             betas = 3 if draw.random() < config.filtered else 1
             dropped = kept.pop() if len(kept) > KEPT else None
             kept.insert(0, Planned(number, kind, betas, None))
@@ -100,16 +105,37 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
             yield kept[int(draw.random() * len(kept))]
 
 
-class Source:
-    """Samples by the number of the step: called with a count it gives the first group of that many steps."""
+def _source(config: TrainConfig, draw: random.Random) -> str | None:
+    """Where scenes come from, if not from photographs. Draws only where there is a choice."""
+    if not (config.rendered or config.pairs):
+        return None
+    drawn = draw.random()
+    return "rendered" if drawn < config.rendered else "pairs" if drawn < config.rendered + config.pairs else None
 
-    def __init__(self, photos: PhotoBank, config: TrainConfig, seed: int, field: ReceptiveField, device: str = "cpu"):
-        self.config, self.seed, self.field = config, seed, field
+
+class Source:
+    """Samples by the number of the step: called with a count it gives the first group of that many steps.
+
+    `photos` may be missing where all batches come from `folders`, which are by the kind of scenes that they hold.
+    """
+
+    def __init__(
+        self,
+        photos: PhotoBank | None,
+        config: TrainConfig,
+        seed: int,
+        field: ReceptiveField,
+        device: str = "cpu",
+        *,
+        folders: Mapping[str, RenderedCrops | PairCrops] | None = None,
+    ):
+        self.config, self.seed, self.field, self.folders = config, seed, field, folders or {}
         kinds = {"rectified": config.rectified_rigs, "general": config.general_rigs}
         self.makers = {
             (kind, betas): LayeredScenes(photos, replace(rigs, betas=betas), hw=config.hw, seed=seed, device=device)
             for kind, rigs in kinds.items()
             for betas in (1, 3)
+            if photos is not None
         }
         self.kept: dict[tuple[int, int], ArrayBatch] = {}
 
@@ -128,11 +154,16 @@ class Source:
         """One group of one step."""
         if (planned.scenes, group) not in self.kept:
             g = _generator(self.seed, SCENE, planned.scenes, group)
-            made = self.makers[planned.kind, planned.betas].sample(self.config.batch, g)
-            self.kept[planned.scenes, group] = made
+            self.kept[planned.scenes, group] = self._made(planned, g)
         g = _generator(self.seed, RECORDING, step, group)
         scene = self.kept[planned.scenes, group]
         return degraded(scene, g, field=self.field, recording=self.config.recording)
+
+    def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
+        if planned.kind in self.folders:
+            crops = self.folders[planned.kind]
+            return crops.sample(self.config.batch, g, number=planned.scenes, betas=planned.betas)
+        return self.makers[planned.kind, planned.betas].sample(self.config.batch, g)
 
     def _forget(self, scenes: int | None) -> None:
         for key in [key for key in self.kept if key[0] == scenes]:
@@ -140,11 +171,34 @@ class Source:
 
 
 def scenes(config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu") -> tuple[Source, Source]:
-    """Sources of samples to learn from and to validate on, from different photographs."""
-    bank, unseen = photographs(config)
-    look = field or FIELDS[config.field]()
+    """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
+    layered = config.rendered + config.pairs < 1
+    bank, unseen = photographs(config) if layered else (None, None)
+    look, n = field or FIELDS[config.field](), config.held_out
     learn, examine = config.seed + 1, config.seed + 2
-    return Source(bank, config, learn, look, device), Source(unseen, config, examine, look, device)
+    known, new = (
+        crops(config, learn, device, lambda i: i % n != 0),
+        crops(config, examine, device, lambda i: i % n == 0),
+    )
+    return (
+        Source(bank, config, learn, look, device, folders=known),
+        Source(unseen, config, examine, look, device, folders=new),
+    )
+
+
+def crops(
+    config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]
+) -> dict[str, RenderedCrops | PairCrops]:
+    """What folders of scenes and of pairs give, by kind; of each those chosen by their number."""
+    found: dict[str, RenderedCrops | PairCrops] = {}
+    common: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device, "choose": choose}
+    if config.rendered_from:
+        rigs = config.general_rigs
+        found["rendered"] = RenderedCrops(config.rendered_from, resolutions=rigs.resolutions, **common)
+    if config.pairs_from:
+        rigs = config.rectified_rigs
+        found["pairs"] = PairCrops(config.pairs_from, resolutions=rigs.resolutions, **common)
+    return found
 
 
 def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
@@ -171,20 +225,33 @@ def degraded(
 ) -> Sample:
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
     ideal = scene.images[0]
-    alpha = record(luminance(ideal), steps(g, recording), g).image
+    cameras = scene.cameras
+    alpha = recorded(luminance(ideal), cameras[0], g, recording)
     betas, looks, position, visible = [], [], [], []
     for i, picture in enumerate(scene.images[1:], 1):
         band = picture if len(scene.images) == 2 else picture[:, i - 1 : i]
-        betas.append(_enlarged(record(band, steps(g, recording), g).image, scene.hw[0]))
+        betas.append(_enlarged(recorded(band, cameras[i], g, recording, lost=LOST), scene.hw[0]))
         if len(scene.images) == 2 and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
-        where, seen = truth_in(pair, scene.depth[0], scene.depth[i])
-        position.append(where)
-        visible.append(seen)
+        if scene.depth:
+            where, seen = truth_in(pair, scene.depth[0], scene.depth[i])
+            position.append(where)
+            visible.append(seen)
     truth = ideal if recording.ideal else ideal + (alpha - luminance(ideal))
     return Sample(alpha, betas, looks, truth, position, visible)
+
+
+def recorded(picture: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Tensor:
+    """What a camera makes of a picture: perhaps bent by a lens and straightened, up to `lost` of it on each side."""
+
+    def record_here(picture: Tensor) -> Tensor:
+        return record(picture, steps(g, recording), g).image
+
+    if recording.lens and _chance(recording.lens, g):
+        return through_lenses(picture, camera, record_here, g, lost=lost)
+    return record_here(picture)
 
 
 def steps(g: Generator, recording: Recording) -> list[Step]:
@@ -220,7 +287,10 @@ def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
 
 
 def truth_in(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Where alpha's pixels are in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w)."""
+    """Where alpha's pixels are in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w).
+
+    What has no depth (NaN) is not visible, and at (0, 0).
+    """
     hw = pair.alpha.hw
     track = pinhole_track(pair, pixel_grid(hw, device=depth.device).reshape(1, -1, 2))
     z = depth.reshape(len(depth), -1)
@@ -230,7 +300,7 @@ def truth_in(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
     scale = x.new_tensor([beta_depth.shape[-1] / pair.beta.hw[1], beta_depth.shape[-2] / pair.beta.hw[0]])
     found = sample(native, (x + 0.5) * scale - 0.5, interpolation="nearest")
     visible = found.valid & ((found.values[:, 0] * expected - 1).abs() < 0.02)
-    return x.reshape(-1, *hw, 2), visible.reshape(-1, *hw)
+    return x.nan_to_num(0.0).reshape(-1, *hw, 2), visible.reshape(-1, *hw)
 
 
 def alone(given: Sample, i: int) -> Sample:

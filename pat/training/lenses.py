@@ -1,0 +1,79 @@
+"""Pictures taken through lenses that bend, and straightened again by what `pat fuse` straightens with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Generator, Tensor
+
+from arraygeom.camera import Camera
+from arraygeom.distortion import BROWN_CONRADY, Distortion
+from arraygeom.pixels import pixel_grid
+from arraygeom.pose import Pose
+from arraygeom.undistortion import retaken
+
+STRONGEST = 0.3
+"""|k1| of the strongest lens."""
+STRETCHED = 0.4
+"""By how much a lens stretches or squeezes at most, along the radius, in the corner farthest from its axis."""
+LOST = 0.1
+"""Share of the height or width that a straightened beta lacks at most on each side."""
+
+
+def through_lenses(
+    pictures: Float[Tensor, "b c h w"],
+    cameras: Camera,
+    recorded: Callable[[Tensor], Tensor],
+    g: Generator,
+    *,
+    lost: float = 0.0,
+) -> Float[Tensor, "b c h w"]:
+    """What is `recorded` of pictures that a lens bends, one for each of the pinholes, straightened back to those.
+
+    A straightened picture repeats its edge where the lens saw nothing: up to the share `lost` on each side.
+    """
+    pinholes = [one_camera(cameras, i) for i in range(len(pictures))]
+    lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
+    bent = [
+        retaken(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(pictures.cpu(), pinholes, lenses)
+    ]
+    seen = recorded(torch.cat(bent).clamp(0, 1).to(pictures.device)).cpu()
+    back = [retaken(p, lens, pinhole, extended=True).values for p, lens, pinhole in zip(seen, lenses, pinholes)]
+    return torch.cat(back).clamp(min=0).to(pictures)
+
+
+def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
+    """A camera with a random lens and as many pixels, that sees all that the pinhole sees, but for what is lost."""
+    x = border(pinhole)
+    rays, _ = pinhole.rays(x)
+    widest = float(rays[..., :2].square().sum(-1).max())
+    k1 = (2 * float(torch.rand((), generator=g)) - 1) * min(STRONGEST, STRETCHED / (3 * widest))
+    lens = pinhole.replace(distortion=Distortion(BROWN_CONRADY, pinhole.K.new_tensor([k1, 0, 0, 0])))
+    bent, _ = lens.bend(x)
+    low, high = bent.amin(0) - 0.5, bent.amax(0) + 0.5
+    cut = lost * torch.rand(2, 2, generator=g, dtype=torch.float64) * (high - low)
+    low, high = low + cut[0], high - cut[1]
+    return lens.mapped(filling(low, high, pinhole.hw), pinhole.hw)
+
+
+def border(camera: Camera) -> Float[Tensor, "n 2"]:
+    """The pixels on the border of a picture."""
+    x = pixel_grid(camera.hw, dtype=torch.float64)
+    return torch.cat([x[0], x[-1], x[:, 0], x[:, -1]])
+
+
+def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, int]) -> Float[Tensor, "3 3"]:
+    """The map of pixels that takes the area between two corners to a picture of a size."""
+    scale = torch.tensor([hw[1], hw[0]], dtype=torch.float64) / (high - low)
+    A = torch.eye(3, dtype=torch.float64)
+    A[0, 0], A[1, 1] = scale
+    A[:2, 2] = -scale * low - 0.5
+    return A
+
+
+def one_camera(cameras: Camera, i: int) -> Camera:
+    """One of a batch, on the CPU, in float64."""
+    one = cameras.replace(K=cameras.K[i], cam_from_world=Pose(cameras.R[i], cameras.t[i]))
+    return one.to("cpu", torch.float64)

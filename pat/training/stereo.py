@@ -1,0 +1,119 @@
+"""Stereo pairs as training samples: a random window of one picture as alpha and truth, of the other as beta.
+
+Nobody knows where their points are, so the loss is on the picture alone. Their cameras are made up: rectified ones with
+the disparities that the pair may have, and a metre apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from PIL import Image, UnidentifiedImageError
+from torch import Generator, Tensor
+
+from arraygeom.camera import Camera, intrinsics
+from arraygeom.pixels import HW
+from arraygeom.pose import Pose
+from pat.data.pairs import PairFiles, pair_files
+from pat.data.patches import reduced
+from pat.images import read_image
+from pat.synthesis.layered import ArrayBatch
+from pat.synthesis.rigs import scaled
+
+from .scenes import HELD, below, chosen, in_hand, one_of
+
+REDUCED = 2
+"""How many times a window is reduced at most: pictures from the net are often less sharp than their pixels."""
+
+
+class PairCrops:
+    """Random windows of the rectified stereo pairs in folders; `hw` is alpha's size in the samples.
+
+    `resolutions` are those of betas, as in `RigDistribution`; `choose` says by its number whether a pair is taken.
+    Raises ValueError for a folder without pairs, for a pair whose pictures differ in size, are not in colour or are
+    smaller than `hw`; when it comes up, for a picture that cannot be read.
+    """
+
+    def __init__(
+        self,
+        roots: Sequence[Path],
+        *,
+        hw: HW,
+        resolutions: tuple[float, ...] = (1.0,),
+        seed: int = 0,
+        device: str = "cpu",
+        choose: Callable[[int], bool] = lambda i: True,
+    ):
+        self.hw, self.resolutions, self.seed, self.device = hw, resolutions, seed, device
+        found = [pair for root in roots for pair in pair_files(root)]
+        self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
+        for pair in self.pairs:
+            check_pair(pair, hw)
+        self._pictures = lru_cache(HELD)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
+
+    def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
+        """Windows of group `number`, of the pairs whose turn it is. Several betas are in one place.
+
+        There is no `depth`.
+        """
+        hand = in_hand(number, len(self.pairs), self.seed)
+        sizes = [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
+        drawn = [self._window(one_of(hand, generator), generator) for _ in range(batch)]
+        alpha, beta = (torch.stack(pictures) for pictures in list(zip(*drawn))[:2])
+        side, disparity = (torch.tensor(numbers, dtype=torch.float64) for numbers in list(zip(*drawn))[2:])
+        images = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
+        return made_up(images, side, disparity, self.device)
+
+    def _window(self, i: int, g: Generator) -> tuple[Tensor, Tensor, float, float]:
+        """Alpha, beta, 1 where alpha is left and -1 where it is right, and the largest disparity."""
+        pictures, (h, w) = self._pictures(i), self.hw
+        hw = pictures[0].shape[1:]
+        times = 1 + below(min(REDUCED, hw[0] // h, hw[1] // w), g)
+        top, left = (below(whole - times * n + 1, g) for whole, n in zip(hw, self.hw))
+        cut = [p[:, top : top + times * h, left : left + times * w] for p in pictures]
+        small = [reduced(p[None], self.hw)[0].clamp(max=1) for p in cut]
+        far = self.pairs[i].max_disparity / times
+        return (small[0], small[1], 1.0, far) if below(2, g) else (small[1], small[0], -1.0, far)
+
+
+def made_up(images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str) -> ArrayBatch:
+    """The pictures, alpha first, with cameras a metre apart that put the nearest points `disparity` pixels apart."""
+    batch, _, h, w = images[0].shape
+    K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
+    t = torch.zeros(batch, 3, dtype=torch.float64)
+    alpha = Camera(K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w))
+    beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
+    cameras = [alpha, *(beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:])]
+    Ks, Rs, ts = ([getattr(c, name).to(device, torch.float32) for c in cameras] for name in ("K", "R", "t"))
+    near = w / disparity
+    bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(device, torch.float32)
+    return ArrayBatch([p.to(device) for p in images], [], Ks, Rs, ts, [c.hw for c in cameras], bounds)
+
+
+def check_pair(pair: PairFiles, hw: HW) -> None:
+    """Raises ValueError unless both pictures are in colour, of one size, and at least `hw`."""
+    left, right = _header(pair.left), _header(pair.right)
+    if left != right:
+        raise ValueError(f"{pair.left} is {_said(left)} and {pair.right.name} {_said(right)}: pairs must be alike")
+    if left[2] == 1:
+        raise ValueError(f"{pair.left} is grey: pairs to train on must be in colour")
+    if left[0] < hw[0] or left[1] < hw[1]:
+        raise ValueError(f"{pair.left} is {_said(left)}, smaller than the samples, {hw[1]}x{hw[0]}: lower `hw`")
+
+
+def _header(file: Path) -> tuple[int, int, int]:
+    """Height, width and channels (1 or 3) of a picture, without reading it whole."""
+    try:
+        with Image.open(file) as picture:
+            return picture.height, picture.width, 1 if picture.mode[0] in "1LIF" else 3
+    except (OSError, UnidentifiedImageError):
+        raise ValueError(f"{file}: not a picture that can be read: give a whole PNG, TIFF or JPEG file") from None
+
+
+def _said(header: tuple[int, int, int]) -> str:
+    h, w, channels = header
+    return f"{w}x{h} {'grey' if channels == 1 else 'in colour'}"
