@@ -12,6 +12,7 @@ from arraygeom.camera import Camera
 from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pixels import pixel_grid
 from arraygeom.pose import Pose
+from arraygeom.sampling import Sampled
 from arraygeom.undistortion import retaken
 
 STRONGEST = 0.3
@@ -29,10 +30,10 @@ def through_lenses(
     g: Generator,
     *,
     lost: float = 0.0,
-) -> Float[Tensor, "b c h w"]:
+) -> Sampled:
     """What is `recorded` of pictures that a lens bends, one for each of the pinholes, straightened back to those.
 
-    A straightened picture repeats its edge where the lens saw nothing: up to the share `lost` on each side.
+    Where the lens saw nothing, up to the share `lost` on each side, a picture repeats its edge and is not valid.
     """
     pinholes = [one_camera(cameras, i) for i in range(len(pictures))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
@@ -40,8 +41,9 @@ def through_lenses(
         retaken(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(pictures.cpu(), pinholes, lenses)
     ]
     seen = recorded(torch.cat(bent).clamp(0, 1).to(pictures.device)).cpu()
-    back = [retaken(p, lens, pinhole, extended=True).values for p, lens, pinhole in zip(seen, lenses, pinholes)]
-    return torch.cat(back).clamp(min=0).to(pictures)
+    back = [retaken(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(seen, lenses, pinholes)]
+    values, valid = (torch.cat(parts) for parts in zip(*back))
+    return Sampled(values.clamp(min=0).to(pictures), valid.to(pictures.device))
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:

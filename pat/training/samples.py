@@ -38,6 +38,7 @@ from arraygeom import (
     sample,
 )
 from arraygeom.fields import pinhole_track
+from arraygeom.sampling import Sampled
 from pat.images import luminance
 from pat.model import Look
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
@@ -226,32 +227,34 @@ def degraded(
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
     ideal = scene.images[0]
     cameras = scene.cameras
-    alpha = recorded(luminance(ideal), cameras[0], g, recording)
+    alpha = recorded(luminance(ideal), cameras[0], g, recording).values
     betas, looks, position, visible = [], [], [], []
     for i, picture in enumerate(scene.images[1:], 1):
         band = picture if len(scene.images) == 2 else picture[:, i - 1 : i]
-        betas.append(_enlarged(recorded(band, cameras[i], g, recording, lost=LOST), scene.hw[0]))
+        seen = recorded(band, cameras[i], g, recording, lost=LOST)
+        betas.append(_enlarged(seen.values, scene.hw[0]))
         if len(scene.images) == 2 and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
         if scene.depth:
-            where, seen = truth_in(pair, scene.depth[0], scene.depth[i])
-            position.append(where)
-            visible.append(seen)
+            found = truth_in(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
+            position.append(found[0])
+            visible.append(found[1])
     truth = ideal if recording.ideal else ideal + (alpha - luminance(ideal))
     return Sample(alpha, betas, looks, truth, position, visible)
 
 
-def recorded(picture: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Tensor:
+def recorded(picture: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Sampled:
     """What a camera makes of a picture: perhaps bent by a lens and straightened, up to `lost` of it on each side."""
 
     def record_here(picture: Tensor) -> Tensor:
         return record(picture, steps(g, recording), g).image
 
+    b, _, h, w = picture.shape
     if recording.lens and _chance(recording.lens, g):
         return through_lenses(picture, camera, record_here, g, lost=lost)
-    return record_here(picture)
+    return Sampled(record_here(picture), picture.new_ones(b, h, w, dtype=torch.bool))
 
 
 def steps(g: Generator, recording: Recording) -> list[Step]:

@@ -18,6 +18,7 @@ from torch import Generator, Tensor
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.pose import Pose
+from arraygeom.rig import Rig
 from arraygeom.undistortion import pinhole_view, retaken
 from pat.data.patches import reading, reduced, reduced_depth, scene_folders, scene_rig
 from pat.data.scenes import coded
@@ -68,7 +69,9 @@ class RenderedCrops:
         self.hw, self.resolutions, self.seed, self.device = hw, resolutions, seed, device
         found = [folder for root in roots for folder in scene_folders(root)]
         self.folders = chosen(found, choose, f"rendered scenes of {', '.join(map(str, roots))}")
-        self.alphas = [large_enough(folder, hw) for folder in self.folders]
+        rigs = [scene_rig(folder) for folder in self.folders]
+        self.names = [rig.names for rig in rigs]
+        self.alphas = [large_enough(folder, rig, hw) for folder, rig in zip(self.folders, rigs)]
         self._view = lru_cache(3 * HELD)(lambda scene, name: read_view(self.folders[scene], name))
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
@@ -85,7 +88,7 @@ class RenderedCrops:
     def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[View]:
         """Alpha's window and one of each beta."""
         name = one_of(self.alphas[scene], g)
-        names = [n for n in scene_rig(self.folders[scene]).names if n != name]
+        names = [n for n in self.names[scene] if n != name]
         order = [names[i] for i in torch.randperm(len(names), generator=g).tolist()]
         whole = self._view(scene, name)
         times = 1 + below(min(REDUCED, *(a // b for a, b in zip(whole.camera.hw, self.hw))), g)
@@ -121,9 +124,8 @@ def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
     return kept
 
 
-def large_enough(folder: Path, hw: HW) -> list[str]:
+def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
-    rig = scene_rig(folder)
     cameras = {name: rig[name] for name in rig.names}
     sizes = {name: pinhole_of(c).hw for name, c in cameras.items() if isinstance(c, Camera)}
     if len(sizes) < max(len(cameras), 2):

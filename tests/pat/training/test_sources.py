@@ -1,0 +1,403 @@
+"""Rendered scenes, stereo pairs and lenses as sources of samples: what they give, and what is wrong with them."""
+
+import json
+import math
+import shutil
+from dataclasses import replace
+from itertools import islice, pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Generator
+
+from arraygeom import Camera, Pose, Rig, intrinsics, rotation_from_vector
+from arraygeom.distortion import BROWN_CONRADY, Distortion
+from arraygeom.sampling import sample
+from arraygeom.undistortion import retaken
+from pat.farm.backends import LayeredSettings
+from pat.images import luminance, write_image
+from pat.model import PATConfig
+from pat.synthesis.check import Limits
+from pat.synthesis.layered import LayeredScenes
+from pat.synthesis.patterns import patterns
+from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rendered import Rendered, save_frame
+from pat.synthesis.rigs import RigDistribution
+from pat.train import save_config, train
+from pat.training.config import Recording, TrainConfig, parse_config
+from pat.training.lenses import lens_over, one_camera, through_lenses
+from pat.training.loop import new_network
+from pat.training.losses import explained, match_loss, validation
+from pat.training.samples import degraded, pair_of, plan, scenes, truth_in
+from pat.training.scenes import HELD, SKY, TURN, RenderedCrops, View, batched, in_hand, window
+from pat.training.stereo import PairCrops
+
+from .runs import losses, short_run
+from .test_loop import command, one_thread, stopped  # noqa: F401
+
+EXACT = Recording(gain=0, blur=0, noise=0, paper=0)
+
+
+def generator(seed: int = 0) -> Generator:
+    return Generator().manual_seed(seed)
+
+
+def make_rig() -> Rig:
+    """Alpha, a wider beta that is turned, and one that sees half as much."""
+    turned = rotation_from_vector(torch.tensor([0.01, 0.03, 0.02]).double())
+    wide, tele = (torch.tensor(t).double() for t in ([-0.1, 0.01, 0.0], [0.08, 0.02, 0.01]))
+    cameras = {
+        "mono": Camera(K=intrinsics(130.0, (96, 128)), cam_from_world=Pose.identity(), hw=(96, 128)),
+        "wide": Camera(K=intrinsics(80.0, (80, 112)), cam_from_world=Pose(turned, wide), hw=(80, 112)),
+        "tele": Camera(K=intrinsics(250.0, (96, 128)), cam_from_world=Pose(turned.mT, tele), hw=(96, 128)),
+    }
+    return Rig(cameras, depth=(2.0, 12.0))
+
+
+@pytest.fixture(scope="module")
+def rendered(tmp_path_factory):
+    """Four layered scenes of patterns; copy what you break."""
+    root = tmp_path_factory.mktemp("rendered")
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    for seed in range(4):
+        renderer.render(seed, root / "scenes" / f"{seed:06d}")
+    return root
+
+
+@pytest.fixture
+def broken(rendered, tmp_path):
+    shutil.copytree(rendered, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def stereo(folder, *, count: int = 4, hw: tuple[int, int] = (80, 120), disparity: int = 6):
+    """Pairs cut from wide smooth pictures: what left has at x, right has at x - disparity."""
+    for i in range(count):
+        coarse = torch.rand(1, 3, hw[0] // 6, hw[1] // 6, generator=generator(i))
+        wide = torch.nn.functional.interpolate(coarse, (hw[0], hw[1] + disparity), mode="bicubic").clamp(0, 1)[0]
+        write_image(folder / f"{i}_L.png", wide[:, :, :-disparity])
+        write_image(folder / f"{i}_R.png", wide[:, :, disparity:])
+    return folder
+
+
+# What steps are made of ------------------------------------------------------------------------------------
+
+
+def test_without_these_sources_steps_are_what_they_were():
+    """The weights of the package were trained on this sequence."""
+    kinds = "".join(f"{p.kind[0]}{p.betas}" for p in islice(plan(TrainConfig(), 1), 20))
+    assert kinds == "r1g1r1g1r3g1g3r1g1r1g3r3r1r1r3g3r1g1r1r1"
+
+
+def test_shares_are_shares():
+    config = TrainConfig(rendered=0.3, rendered_from=(Path("a"),), pairs=0.2, pairs_from=(Path("b"),), reuse=1.0)
+    kinds = [p.kind for p in islice(plan(config, 0), 2000)]
+    assert kinds.count("rendered") / 2000 == pytest.approx(0.3, abs=0.03)
+    assert kinds.count("pairs") / 2000 == pytest.approx(0.2, abs=0.03)
+    assert kinds.count("rectified") == pytest.approx(kinds.count("general"), rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("rendered: 1.5", "rendered is a share of the batches, 0 to 1, got 1.5"),
+        ("rendered: 0.5", "rendered is 0.5 and there is no folder: give both `rendered` and `rendered_from`"),
+        ("pairs_from: a", "pairs is 0 and a is given: give both"),
+        ("{rendered: 0.7, rendered_from: a, pairs: 0.7, pairs_from: [b]}", "shares of the batches, 1.4 in all"),
+    ],
+)
+def test_what_is_wrong_with_shares(text, message):
+    with pytest.raises(ValueError) as caught:
+        parse_config(text)
+    assert message in str(caught.value)
+
+
+def test_all_items_have_their_turn_equally_often():
+    count = HELD + 5
+    drawn = [in_hand(number, count, 3) for number in range(20 * TURN * count)]
+    assert all(len(hand) == HELD for hand in drawn)
+    assert all(len(set(a) ^ set(b)) <= 2 or len(set(b)) < HELD for a, b in pairwise(drawn))
+    times = torch.bincount(torch.tensor(drawn[TURN * HELD :]).flatten())
+    assert len(times) == count
+    assert times.max() <= 1.2 * times.min()
+    assert in_hand(40, count, 3) == drawn[40] != in_hand(40, count, 4)
+
+
+# Rendered scenes -------------------------------------------------------------------------------------------
+
+
+def through(root):
+    """Put lenses in front of two cameras of every scene: their pictures bent, nothing known beyond the old ones."""
+    for folder in (root / "scenes").iterdir():
+        source = Rendered(folder)
+        rig = source.rig
+        for name, k1 in (("mono", -0.1), ("wide", 0.15)):
+            lens = Distortion(BROWN_CONRADY, torch.tensor([k1, 0.01, 0, 0]).double())
+            camera, frame = rig[name], source.frame(name)
+            bent = camera.replace(distortion=lens)
+            depth = retaken(frame.depth[None], camera, bent, interpolation="nearest")
+            rgb = retaken(frame.rgb, camera, bent).values[0].clamp(min=0)
+            known = torch.where(depth.valid[0], depth.values[0, 0], torch.nan)
+            plain = replace(frame, rgb=rgb, depth=known, normals=None, flow=None)
+            save_frame(folder / source.about["frames"][name][0]["file"], plain)
+            rig = rig.with_camera(name, bent)
+        rig.save(folder / "rig.yaml")
+    return root
+
+
+@pytest.mark.parametrize("lenses", [False, True])
+def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
+    crops = RenderedCrops([through(broken) if lenses else broken], hw=(32, 48))
+    seen, moved, visible = [], [], []
+    for number in range(6):
+        given = degraded(crops.sample(4, generator(number), number=number), generator(), recording=EXACT)
+        assert given.position[0].isfinite().all()
+        found = sample(given.betas[0], given.position[0].to(given.truth).flatten(1, 2)).values.unflatten(2, (32, 48))
+        for image, collected in ((given.truth, seen), (given.truth.roll(3, -1), moved)):
+            collected.append((found - image).abs().mean(1)[given.visible[0]].quantile(0.8))
+        visible.append(given.visible[0].float().mean())
+    assert torch.stack(visible).mean() > 0.5
+    assert torch.stack(seen).mean() < 0.015
+    assert torch.stack(moved).mean() > 3 * torch.stack(seen).mean()
+
+
+def test_any_camera_is_alpha_and_betas_are_others(rendered):
+    crops = RenderedCrops([rendered], hw=(32, 48), resolutions=(0.5,))
+    focal = {round(float(c.K[0, 0])) for c in make_rig().cameras.values()}
+    batches = [crops.sample(3, generator(number), number=number, betas=3) for number in range(12)]
+    drawn = torch.cat([b.K[0][:, 0, 0] for b in batches])
+    assert {round(float(f) * times) for f in drawn for times in (1, 2)} >= focal
+    for batch in batches:
+        assert [tuple(image.shape) for image in batch.images] == [(3, 3, 32, 48), *[(3, 3, 16, 24)] * 3]
+        assert (batch.K[1][:, 0, 0] / batch.K[0][:, 0, 0]).sub(0.5).abs().max() < 0.03
+        assert torch.equal(batch.t[1], batch.t[3])
+        assert not torch.equal(batch.t[1], batch.t[2])
+        assert (batch.t[1].norm(dim=1) > 0.05).all()
+
+
+def test_samples_of_scenes_depend_on_their_number_alone(rendered):
+    used, fresh = (RenderedCrops([rendered], hw=(32, 48)) for _ in range(2))
+    for number in range(3):
+        used.sample(2, generator(number), number=number)
+    one, other = (crops.sample(2, generator(9), number=7) for crops in (used, fresh))
+    assert all(torch.equal(a, b) for a, b in zip(one.images + one.depth + one.K, other.images + other.depth + other.K))
+
+
+def test_the_sky_is_seen_by_both_at_infinity():
+    """Two cameras apart and turned: points without end are where the infinite homography puts them."""
+    turn = rotation_from_vector(torch.tensor([0.05, 0.1, 0.02]).double())
+    beta = Pose(turn, torch.tensor([-0.5, 0.0, 0.1]).double())
+    K = intrinsics(60.0, (32, 48))
+    cameras = [Camera(K=K, cam_from_world=pose, hw=(32, 48)) for pose in (Pose.identity(), beta)]
+    sky = torch.full((32, 48), torch.inf)
+    views = [window(View(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras]
+    batch = batched([views], "cpu")
+    assert batch.depth_range.max() <= SKY
+    position, visible = truth_in(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
+    x = K @ turn @ torch.linalg.inv(K) @ torch.tensor([20.0, 12.0, 1.0]).double()
+    torch.testing.assert_close(position[0, 12, 20].double(), (x / x[2])[:2], atol=1e-3, rtol=0)
+    assert visible[0, 12, 20]
+    assert visible.float().mean() > 0.5
+
+
+def test_what_is_wrong_with_scenes(broken, tmp_path):
+    def said(root, hw=(32, 48), **how):
+        with pytest.raises(ValueError) as caught:
+            RenderedCrops([root], hw=hw, **how).sample(8, generator(), number=0)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    (tmp_path / "empty").mkdir()
+    assert "holds no rendered scene" in said(tmp_path / "empty")
+    assert "000000: no picture is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
+        broken, (128, 256)
+    )
+    assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
+    scene = broken / "scenes" / "000002"
+    rig = Rig.load(scene / "rig.yaml")
+    frames = Rendered(scene).about["frames"]
+    for name in rig.names:
+        rig = rig.with_camera(name, rig[name].resize((90, 120)))
+    rig.save(scene / "rig.yaml")
+    assert "000002: the picture of '" in (error := said(broken))
+    assert "its rig says 120x90: remove it" in error
+    (scene / frames["wide"][0]["file"]).write_bytes(b"half")
+    (scene / frames["mono"][0]["file"]).write_bytes(b"half")
+    (scene / frames["tele"][0]["file"]).write_bytes(b"half")
+    assert "000002: cannot be read (" in said(broken)
+    (scene / "render.json").unlink()
+    assert "000002: is not a whole scene (no render.json)" in said(broken)
+    rig.replace(cameras={"mono": rig["mono"]}).save(broken / "scenes" / "000000" / "rig.yaml")
+    assert "has 1 calibrated cameras of 1: all must be, two at least" in said(broken / "scenes" / "000000")
+
+
+# Stereo pairs ----------------------------------------------------------------------------------------------
+
+
+def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
+    """6 pixels of disparity are (6 / 120) of the nearest depth's: beta has there what alpha has."""
+    crops = PairCrops([stereo(tmp_path)], hw=(32, 48))
+    sides, reductions = set(), set()
+    for number in range(4):
+        batch = crops.sample(3, generator(number), number=number)
+        given = degraded(batch, generator(), recording=EXACT)
+        assert (given.position, given.visible, batch.depth) == ([], [], [])
+        near, baseline = batch.depth_range[:, 0], batch.t[1][:, 0]
+        sides |= set(baseline.sign().tolist())
+        reductions |= set((120 / (48 / near)).round().int().tolist())
+        depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
+        where, _ = truth_in(pair_of(batch, 1, generator()), depth, depth)
+        found = sample(given.betas[0], where.to(given.truth).flatten(1, 2)).values.unflatten(2, (32, 48))
+        assert (found - given.truth)[..., 8:-8].abs().max() < 0.03
+        assert (given.betas[0] - given.truth)[..., 8:-8].abs().max() > 0.1
+        torch.testing.assert_close(given.alpha, luminance(given.truth), atol=0.003, rtol=0)
+        held = given.looks[0].at(torch.tensor([[24.0, 16.0]]).double())
+        assert held.valid.all()
+    assert (sides, reductions) == ({-1.0, 1.0}, {1, 2})
+
+
+def test_betas_of_pairs_are_reduced_and_three_are_bands(tmp_path):
+    crops = PairCrops([stereo(tmp_path)], hw=(32, 48), resolutions=(0.25,))
+    batch = crops.sample(2, generator(), number=0, betas=3)
+    assert [tuple(i.shape[2:]) for i in batch.images] == [(32, 48), (8, 12), (8, 12), (8, 12)]
+    given = degraded(batch, generator(), recording=EXACT)
+    assert [tuple(b.shape) for b in given.betas] == [(2, 1, 32, 48)] * 3
+
+
+def test_nobody_knows_where_a_pairs_points_are(tmp_path):
+    config = short_run(tmp_path)
+    crops = PairCrops([stereo(tmp_path / "stereo")], hw=(32, 48))
+    given = degraded(crops.sample(2, generator(), number=0), generator())
+    network = new_network(config)
+    fused, seen = explained(network, given)
+    assert match_loss(seen, given) == 0
+    (fused.image - given.truth).square().mean().backward()
+    assert all(p.grad is not None for p in network.parameters())
+    facts = validation(network, [given])
+    assert math.isnan(facts["matched"])
+    assert facts["psnr"] > 5
+
+
+def test_middleburys_collections_say_how_far_to_look(shared_data):
+    crops = PairCrops([shared_data / "middlebury"], hw=(96, 192))
+    assert {round(pair.max_disparity) for pair in crops.pairs} >= {64, 85, 128}
+    assert crops.sample(2, generator(), number=0).images[0].std() > 0.05
+
+
+def test_what_is_wrong_with_pairs(tmp_path):
+    def said(root, hw=(32, 48)):
+        with pytest.raises(ValueError) as caught:
+            PairCrops([root], hw=hw).sample(8, generator(), number=0)
+        assert "\n" not in str(caught.value)
+        return str(caught.value)
+
+    (tmp_path / "empty").mkdir()
+    assert "holds no stereo pair" in said(tmp_path / "empty")
+    root = stereo(tmp_path / "pairs")
+    assert "0_L.png is 120x80 in colour, smaller than the samples, 256x96" in said(root, (96, 256))
+    file = root / "2_R.png"
+    whole = file.read_bytes()
+    write_image(file, torch.rand(3, 80, 119))
+    assert "2_L.png is 120x80 in colour and 2_R.png 119x80 in colour: pairs must be alike" in said(root)
+    write_image(file, torch.rand(1, 80, 120))
+    assert "2_R.png 120x80 grey: pairs must be alike" in said(root)
+    write_image(root / "2_L.png", torch.rand(1, 80, 120))
+    assert "2_L.png is grey: pairs to train on must be in colour" in said(root)
+    file.write_bytes(b"nothing")
+    assert "2_R.png: not a picture that can be read" in said(root)
+    for i in range(4):
+        for side in "LR":
+            (root / f"{i}_{side}.png").write_bytes(whole[: len(whole) // 2])
+    assert "not a picture that can be read: give a whole PNG" in said(root)
+
+
+# Lenses ----------------------------------------------------------------------------------------------------
+
+
+def layered(seed: int = 0, mode: str = "general"):
+    bank = PhotoBank(patterns(np.random.default_rng(0), 6))
+    rigs = RigDistribution(mode=mode, parallax=(4.0, 12.0), resolutions=(1.0,))
+    return LayeredScenes(bank, rigs, hw=(48, 64)).sample(3, generator(seed))
+
+
+@pytest.mark.parametrize("mode", ["rectified", "general"])
+def test_a_lens_sees_all_that_the_pinhole_sees_but_for_what_is_lost(mode):
+    strengths = []
+    for seed in range(8):
+        pinhole = one_camera(layered(seed, mode).cameras[1], 0)
+        lens = lens_over(pinhole, generator(seed))
+        rays, valid = pinhole.rays(torch.tensor([[0.0, 0.0], [63, 0], [0, 47], [63, 47], [30, 20]]).double())
+        x = lens.project_local(rays)
+        assert (valid & x.valid & lens.contains(x.x)).all()
+        strengths.append(float(lens.distortion.coefficients[0]))
+        lossy = lens_over(pinhole, generator(seed), 0.2)
+        assert not lossy.contains(lossy.project_local(rays[:4]).x).all()
+    assert min(strengths) < 0 < max(strengths)
+    assert max(map(abs, strengths)) <= 0.3
+
+
+def test_straightened_pictures_show_what_they_showed_and_say_what_they_lost():
+    scene = layered()
+    smooth = torch.nn.functional.avg_pool2d(scene.images[1], 5, 1, 2)
+    kept = through_lenses(smooth, scene.cameras[1], lambda bent: bent, generator(1))
+    assert kept.valid[:, 1:-1, 1:-1].all()
+    assert (kept.values - smooth)[..., 3:-3, 3:-3].abs().max() < 0.03
+    bent = []
+    cut = through_lenses(smooth, scene.cameras[1], lambda b: bent.append(b) or b, generator(1), lost=0.3)
+    assert (bent[0] - smooth).abs().max() > 0.1
+    assert 0.3 < cut.valid.float().mean() < 0.95
+    assert ((cut.values - smooth).abs().amax(1)[cut.valid] < 0.05).float().mean() > 0.97
+
+
+def test_what_a_lens_lost_is_not_visible():
+    scene = layered()
+    plain, bent = (degraded(scene, generator(2), recording=replace(EXACT, lens=p)) for p in (0.0, 1.0))
+    torch.testing.assert_close(plain.truth, scene.images[0], atol=0.003, rtol=0)
+    assert not (bent.visible[0] & ~degraded(scene, generator(2), recording=EXACT).visible[0]).any()
+    assert bent.visible[0].float().mean() < plain.visible[0].float().mean()
+    assert (bent.truth - plain.truth)[..., 4:-4, 4:-4].abs().mean() < 0.01
+
+
+# Runs ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def mixed(rendered, tmp_path_factory):
+    """A run on all sources, never stopped."""
+    folder = tmp_path_factory.mktemp("mixed")
+    sources = {"rendered": 0.5, "rendered_from": (rendered,), "pairs": 0.5, "pairs_from": (stereo(folder / "pairs"),)}
+    cheap = {"network": PATConfig(dim=4), "filtered": 0.0, "steps": 6, "validate": 3, "photos": (), "cache": None}
+    config = replace(short_run(folder), **sources, **cheap, recording=Recording(lens=0.5), out=folder / "whole")
+    train(config)
+    return config
+
+
+def test_a_run_on_all_sources_goes_on_bit_for_bit(mixed, monkeypatch):
+    kinds = {p.kind for p in islice(plan(mixed, mixed.seed + 1), mixed.steps)}
+    assert {"rendered", "pairs"} == kinds
+    config = replace(mixed, out=mixed.out.with_name("stopped"))
+    stopped(config, 5, monkeypatch)
+    train(config)
+    assert losses(config.out) == losses(mixed.out)
+    lines = [json.loads(line) for line in (mixed.out / "log.jsonl").read_text().splitlines()]
+    assert lines[-1]["psnr"] > 5
+
+
+@pytest.mark.slow
+def test_two_processes_on_all_sources_are_as_one(mixed):
+    config = replace(mixed, out=mixed.out.with_name("two"))
+    save_config(config, config.out.with_suffix(".yaml"))
+    running = command(config.out.with_suffix(".yaml"), processes=2)
+    said, _ = running.communicate()
+    assert running.returncode == 0, said
+    ours, theirs = ([[float(x) for x in row] for row in losses(c.out)[1:]] for c in (config, mixed))
+    torch.testing.assert_close(torch.tensor(ours), torch.tensor(theirs), rtol=0, atol=1e-4)
+
+
+def test_photographs_are_not_needed_where_everything_comes_from_folders(mixed):
+    learn, examine = scenes(mixed)
+    assert len(list(learn(3))) == 3
+    assert {str(f) for f in learn.folders["rendered"].folders}.isdisjoint(map(str, examine.folders["rendered"].folders))
+    assert set(learn.folders["pairs"].pairs).isdisjoint(examine.folders["pairs"].pairs)
