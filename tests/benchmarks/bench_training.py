@@ -29,9 +29,10 @@ from pat.ablate import sample_photographs
 from pat.attention import attend
 from pat.attention.reference import Attended
 from pat.training.config import TrainConfig, load_config
-from pat.training.loop import new_network
+from pat.training.loop import convolutions, in_bfloat16, new_network
 from pat.training.losses import Objective
 from pat.training.samples import FIELDS, Sample, Source
+from pat.weights import Network
 
 
 @dataclass
@@ -151,24 +152,50 @@ def attention(objective: Objective, given: Sample, straight: Sample, repeats: in
     print(f"  field of segments alone        {timed(lambda: straight.looks[0].at(x), repeats)}")
 
 
-def our_networks(repeats: int) -> None:
-    print("\nOurs, 4 samples of 192 x 96, one step:\n")
-    for name in ("mono-colour", "mono-colour-small"):
+HOW = {
+    "float32": (False, False),
+    "bfloat16": (True, False),
+    "compiled": (False, True),
+    "bfloat16, compiled": (True, True),
+}
+"""Convolutions: in bfloat16 or not, compiled or not."""
+
+
+def our_networks(repeats: int, names: tuple[str, ...]) -> None:
+    for name in names:
         config = replace(load_config(name), reuse=1.0, filtered=0.0)
-        given, objective = next(source(config)(1)), Objective(new_network(config), "psnr")
-        times = timed(lambda: step(objective, given, adam(objective)), repeats)  # noqa: B023
-        print(f"{name:42s} {times}  {config.batch / times.median:6.2f} samples/s")
+        given = next(source(config)(1))
+        print(f"\n{name}, {config.batch} samples of {config.hw[1]} x {config.hw[0]}, one step:\n")
+        for how, (half, compiled) in HOW.items():
+            objective = Objective(prepared(config, half=half, compiled=compiled), config.loss)
+            times = timed(lambda: step(objective, given, adam(objective)), repeats)  # noqa: B023
+            print(f"{how:42s} {times}  {config.batch / times.median:6.2f} samples/s", flush=True)
+
+
+def prepared(config: TrainConfig, *, half: bool, compiled: bool) -> Network:
+    """A new network whose convolutions compute as `precision` and `compile` have them."""
+    torch.manual_seed(0)
+    network = new_network(config)
+    for part in convolutions(network):
+        if half:
+            in_bfloat16(part)
+        if compiled:
+            part.compile()
+    return network
 
 
 def adam(objective: Objective) -> torch.optim.Optimizer:
     return torch.optim.Adam(objective.parameters(), lr=0.0)
 
 
-def main(batch: int = 2, repeats: int = 3) -> None:
-    """Measure and print."""
+def main(
+    batch: int = 2, repeats: int = 3, paper: bool = True, names: tuple[str, ...] = ("mono-colour", "mono-colour-small")
+) -> None:
+    """Measure and print: the paper's network if `paper`, and those of ours that are named."""
     torch.set_num_threads(1)
-    papers_network(batch, repeats)
-    our_networks(repeats)
+    if paper:
+        papers_network(batch, repeats)
+    our_networks(repeats, names)
 
 
 if __name__ == "__main__":
