@@ -45,7 +45,7 @@ FLOOR = 1e-3
 """Regulariser (variance of brightness) of the regression of colour on brightness where colour is spread."""
 FILLS = 2
 """Ways in which colour is spread: along its regression on brightness, and as it is."""
-DETAIL_RADIUS, DETAIL_FLOOR = 3, 3e-3
+DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
@@ -307,13 +307,17 @@ def _colours(
 def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
     """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it.
 
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution.
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
+    slope is reduced to the share of colour's variance that the regression explains.
     """
 
     mean = partial(_mean, radius=DETAIL_RADIUS)
-    middle = mean(brightness)
+    middle, centre = mean(brightness), mean(colour)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
-    slope = (mean(colour * brightness) - mean(colour) * middle) / (variance + DETAIL_FLOOR)
+    spread = (mean(colour.square()) - centre.square()).clamp(min=0)
+    common = mean(colour * brightness) - centre * middle
+    explained = common.square() / ((variance + 1e-6) * (spread + 1e-6))
+    slope = common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
     return colour + slope * (alpha - brightness).clamp(-0.2, 0.2)
 
 
