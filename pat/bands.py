@@ -41,7 +41,7 @@ SMOOTH = 4
 class Mix(NamedTuple):
     """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times bands.
 
-    slopes: (B, C), by how much each band rises where the combination rises by 1.
+    slopes: (B, C), by how much each band rises where the combination rises by 1; less where this is far from alpha.
     gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another spectrum. 0
         for one band, which has no say in that.
     """
@@ -141,8 +141,10 @@ def _fit(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
         rest = y - middle[-1] - weights @ (x - middle[:-1, None])
         trust = first * torch.exp(-(rest / OUTLIER).square())
     covariance = (x - middle[:-1, None]) * share @ (x - middle[:-1, None]).T
-    slopes = covariance @ weights / (weights @ covariance @ weights).clamp(min=1e-12)
-    gain = 1 / (1 + (_smooth_misfit(rest.view_as(alpha), share.view_as(alpha)) / MISFIT) ** 6)
+    variance = share @ (y - middle[-1]).square()
+    slopes = covariance @ weights / (weights @ covariance @ weights).maximum(variance).clamp(min=1e-12)
+    explained = 1 - first @ rest.square() / (first @ (y - middle[-1]).square()).clamp(min=1e-12)
+    gain = explained.clamp(min=0) / (1 + (_smooth_misfit(rest.view_as(alpha), share.view_as(alpha)) / MISFIT) ** 6)
     back = order.argsort()
     return weights[back], middle[-1] - weights @ middle[:-1], slopes[back], gain
 

@@ -168,14 +168,15 @@ def _fuse_straight(
     groups = together(rig, names, fields, network.joins_bands)
     betas = [_joined_beta(network, rig, images, alpha, group, fields.get(group[0]), levels) for group in groups]
     one_colour = len(names) == 1 and betas[0].picture.shape[1] == 3
-    order = _band_order(names, groups, {name: images[name].shape[0] for name in names})
     planned = _planned(network, own, betas, how)
     if how.announce:
         how.announce(planned)
     betas = [surveyed(network, own, beta, survey_tiles(network, rig[alpha].hw)) for beta in betas]
     frame = _fused_in_tiles(network, own, betas, planned.tiles, how)
     image = as_bright(frame.image, own[0], rig[alpha].sensor) if one_colour else frame.image
-    return frame._replace(image=image[order] if len(groups) < len(names) else image)
+    if len(groups) < len(names):
+        image = image[_band_order(names, groups, {name: images[name].shape[0] for name in names})]
+    return frame._replace(image=image)
 
 
 def together(
@@ -188,11 +189,11 @@ def together(
     groups: list[list[str]] = []
     for name in names:
         near = [] if which == "no" else groups[-1:] if which == "neighbours" else groups
-        home = next((g for g in near if fields.get(g[0]) is fields.get(name) and _same_view(rig[g[0]], rig[name])), None)
-        if home is None:
-            groups.append([name])
+        home = [g for g in near if fields.get(g[0]) is fields.get(name) and _same_view(rig[g[0]], rig[name])]
+        if home:
+            home[0].append(name)
         else:
-            home.append(name)
+            groups.append([name])
     return groups
 
 
@@ -200,11 +201,16 @@ def _same_view(one: View, other: View) -> bool:
     """Whether two calibrated cameras differ at most in their sensors."""
     if not (isinstance(one, Camera) and isinstance(other, Camera)) or one.hw != other.hw:
         return False
-    lenses = [c.distortion for c in (one, other)]
-    alike = all(torch.equal(getattr(one, k), getattr(other, k)) for k in ("K", "R", "t"))
-    if lenses[0] is None or lenses[1] is None:
-        return alike and lenses[0] is lenses[1]
-    return alike and lenses[0].model == lenses[1].model and torch.equal(*(lens.coefficients for lens in lenses))
+    if (one.distortion is None) != (other.distortion is None):
+        return False
+    if one.distortion and other.distortion and one.distortion.model != other.distortion.model:
+        return False
+    return all(torch.equal(*numbers) for numbers in zip(_calibration(one), _calibration(other)))
+
+
+def _calibration(camera: Camera) -> list[Tensor]:
+    lens = [] if camera.distortion is None else [camera.distortion.coefficients]
+    return [camera.K, camera.R, camera.t, *lens]
 
 
 def _joined_beta(
@@ -225,12 +231,8 @@ def _joined_beta(
 
 def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Mapping[str, int]) -> list[int]:
     """Which of the groups' bands, one after the other, are those of the betas in the order of their names."""
-    place = {name: [] for name in names}
-    count = 0
-    for name in (name for group in groups for name in group):
-        place[name] = list(range(count, count + bands[name]))
-        count += bands[name]
-    return [i for name in names for i in place[name]]
+    joined = [(name, band) for group in groups for name in group for band in range(bands[name])]
+    return [joined.index((name, band)) for name in names for band in range(bands[name])]
 
 
 def _planned(network: FusionNetwork, own: Tensor, betas: list[Beta], how: _How) -> Plan:
