@@ -41,7 +41,8 @@ SMOOTH = 4
 class Mix(NamedTuple):
     """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times bands.
 
-    slopes: (B, C), by how much each band rises where the combination rises by 1; less where this is far from alpha.
+    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next; less if its
+        detail is not alpha's.
     gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another spectrum. 0
         for one band, which has no say in that.
     """
@@ -140,13 +141,19 @@ def _fit(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
         weights, middle, share = _combination(x, y, trust / trust.sum())
         rest = y - middle[-1] - weights @ (x - middle[:-1, None])
         trust = first * torch.exp(-(rest / OUTLIER).square())
-    covariance = (x - middle[:-1, None]) * share @ (x - middle[:-1, None]).T
-    variance = share @ (y - middle[-1]).square()
-    slopes = covariance @ weights / (weights @ covariance @ weights).maximum(variance).clamp(min=1e-12)
+    detail, own = _detail(bands[order]).flatten(1), _detail(alpha).flatten()
+    combined = weights @ detail
+    varying = (share @ combined.square()).maximum(share @ own.square())
+    slopes = detail @ (share * combined) / varying.clamp(min=1e-12)
     explained = 1 - first @ rest.square() / (first @ (y - middle[-1]).square()).clamp(min=1e-12)
     gain = explained.clamp(min=0) / (1 + (_smooth_misfit(rest.view_as(alpha), share.view_as(alpha)) / MISFIT) ** 6)
     back = order.argsort()
     return weights[back], middle[-1] - weights @ middle[:-1], slopes[back], gain
+
+
+def _detail(planes: Tensor) -> Tensor:
+    """What pixels of (c, h, w) have beyond the mean of those around: how materials differ does not count."""
+    return planes - avg_pool2d(planes[None], 3, 1, 1, count_include_pad=False)[0]
 
 
 def _combination(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
