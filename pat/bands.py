@@ -122,7 +122,8 @@ def _matched(values: Tensor, alpha: Tensor, mix: Mix, balance: Balance) -> tuple
     brightness, soft = mix.of(values), balance.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
     beyond = (alpha - soft) + gain * (soft - brightness)
-    slope = local_slope(values, brightness, mix.rises(values))
+    rises = mix.rises(values)
+    slope = rises + local_slope(values - rises * brightness, brightness)
     return values + slope * beyond.clamp(-MOST_DETAIL, MOST_DETAIL) - alpha, brightness - soft
 
 

@@ -45,7 +45,7 @@ FLOOR = 1e-3
 """Regulariser (variance of brightness) of the regression of colour on brightness where colour is spread."""
 FILLS = 2
 """Ways in which colour is spread: along its regression on brightness, and as it is."""
-DETAIL_RADIUS, DETAIL_FLOOR = 3, 3e-3
+DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
 MOST_DETAIL = 0.2
 """Differences of brightness beyond this are no detail that beta lost."""
@@ -341,18 +341,19 @@ def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
     return colour + local_slope(colour, brightness) * (alpha - brightness).clamp(-MOST_DETAIL, MOST_DETAIL)
 
 
-def local_slope(
-    colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"], prior: float | Tensor = 0.0
-) -> Float[Tensor, "b c h w"]:
-    """The slope of the regression of colour on brightness around each pixel; `prior` where brightness hardly varies.
+def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+    """The slope of the regression of colour on brightness around each pixel.
 
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution.
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
+    slope is reduced to the share of colour's variance that the regression explains.
     """
     mean = partial(_mean, radius=DETAIL_RADIUS)
-    middle = mean(brightness)
+    middle, centre = mean(brightness), mean(colour)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
-    covariance = mean(colour * brightness) - mean(colour) * middle
-    return (covariance + DETAIL_FLOOR * prior) / (variance + DETAIL_FLOOR)
+    spread = (mean(colour.square()) - centre.square()).clamp(min=0)
+    common = mean(colour * brightness) - centre * middle
+    explained = common.square() / ((variance + 1e-6) * (spread + 1e-6))
+    return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
 
 
 def _regressed(

@@ -230,6 +230,24 @@ def test_a_match_has_the_detail_that_beta_lost():
     assert left < 0.75 * lost
 
 
+def test_colour_that_does_not_follow_brightness_is_left_alone():
+    """Red and green change places where brightness does not show it, beside edges of brightness."""
+    g = torch.Generator().manual_seed(5)
+    fine, other = (
+        torch.rand(1, 1, 24, 32, generator=g).round().repeat_interleave(4, -1).repeat_interleave(4, -2) for _ in "ab"
+    )
+    alpha = 0.35 + 0.3 * fine
+    other = other.roll((2, 2), (-1, -2)) - 0.5
+    truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
+    beta = torch.cat([blurred(band, 1.0) for band in truth.split(1, 1)], 1)
+    places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
+    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
+    found = consensus(alpha, luminance(beta), beta, *here)
+    chroma = [picture - luminance(picture) for picture in (found.matched, beta, truth)]
+    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].square().mean() for c in chroma[:2])
+    assert left < 1.05 * lost
+
+
 def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
     """Two pictures of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
     alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
