@@ -42,6 +42,8 @@ class Recording:
     """Chance of one of the paper's four degradations on top, for one beta."""
     miscalibrated: float = 0.0
     """Error of the poses that fields are made from: how far it moves points, root mean square, pixels."""
+    spectral: float = 0.0
+    """Chance of random bands, one to four if one beta has them all, in the place of red, green and blue."""
     ideal: bool = False
     """The truth is the scene itself; else it has alpha's luminance as recorded, noise and all."""
 

@@ -43,6 +43,7 @@ from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
 from .config import FieldName, Recording, TrainConfig
+from .spectra import MOST, Spectra
 
 KEPT = 48
 """Groups of scenes that wait to be recorded again."""
@@ -170,21 +171,31 @@ def degraded(
     recording: Recording = Recording(),  # noqa: B008
 ) -> Sample:
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
-    ideal = scene.images[0]
-    alpha = record(luminance(ideal), steps(g, recording), g).image
+    pictures, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
+    ideal, grey = pictures[0], luminance(scene.images[0])
+    alpha = record(grey, steps(g, recording), g).image
     betas, looks, position, visible = [], [], [], []
-    for i, picture in enumerate(scene.images[1:], 1):
-        band = picture if len(scene.images) == 2 else picture[:, i - 1 : i]
+    for i, picture in enumerate(pictures[1:], 1):
+        band = picture if alone else picture[:, i - 1 : i]
         betas.append(_enlarged(record(band, steps(g, recording), g).image, scene.hw[0]))
-        if len(scene.images) == 2 and _chance(recording.paper, g):
+        if alone and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
         where, seen = truth_in(pair, scene.depth[0], scene.depth[i])
         position.append(where)
         visible.append(seen)
-    truth = ideal if recording.ideal else ideal + (alpha - luminance(ideal))
+    truth = ideal if recording.ideal else ideal + (alpha - grey)
     return Sample(alpha, betas, looks, truth, position, visible)
+
+
+def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
+    """The scene's pictures, by this chance in other bands than red, green and blue."""
+    if spectral == 0 or not _chance(spectral, g):
+        return scene.images
+    count = 1 + int(torch.randint(MOST, (), generator=g)) if len(scene.images) == 2 else len(scene.images) - 1
+    spectra = Spectra.drawn(len(scene.images[0]), count, g)
+    return [spectra.of(picture) for picture in scene.images]
 
 
 def steps(g: Generator, recording: Recording) -> list[Step]:
