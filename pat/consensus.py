@@ -15,7 +15,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
@@ -47,6 +47,8 @@ FILLS = 2
 """Ways in which colour is spread: along its regression on brightness, and as it is."""
 DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
+MOST_DETAIL = 0.2
+"""Differences of brightness beyond this are no detail that beta lost."""
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
 
@@ -74,10 +76,6 @@ class Consensus(NamedTuple):
         whole = (..., slice(top, bottom), slice(left, right))
         return Consensus(self.reach[half], self.facts[half], self.matched[whole], self.colour[whole])
 
-    def band(self, i: int) -> Consensus:
-        """The same of one band alone."""
-        return self._replace(matched=self.matched[:, i : i + 1], colour=self.colour[:, :, i : i + 1])
-
 
 class Balance(NamedTuple):
     """How beta's brightness is levelled to alpha's, and with what either is then blurred, for each of a batch.
@@ -99,6 +97,10 @@ class Balance(NamedTuple):
     def levelled(self, beta: Tensor) -> Tensor:
         """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
         return _levelled(beta, self.level)
+
+    def softened(self, alpha: Tensor) -> Tensor:
+        """Alpha (or a part of it), no sharper than beta."""
+        return _blurred(alpha, self.blurs[0])
 
     def equally_sharp(self, alpha: Tensor, levelled: Tensor) -> tuple[Tensor, Tensor]:
         """Both (or parts of them), the sharper one blurred."""
@@ -146,17 +148,24 @@ def consensus(
     parts. On the CPU, with as many threads as torch may use; the same whatever their number.
     """
     balances = balances or Balances.of(alpha, guide)
+    reach, facts = agreement(alpha, guide, blocks, balances.half)
+    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts, balances.whole))
+
+
+def agreement(
+    alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, balance: Balance
+) -> tuple[Float[Tensor, "b 1 h2 w2"], Float[Tensor, "b 3 h2 w2"]]:
+    """`reach` and `facts` of the consensus alone; `balance` is that of half the size."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    own, other = balances.half.equally_sharp(own, balances.half.levelled(other))
-    geometry = _geometry(blocks, len(alpha), (beta.shape[-2], beta.shape[-1]))
+    own, other = balance.equally_sharp(own, balance.levelled(other))
+    geometry = _geometry(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
     found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
     planes = zip(found, consistent, _bytes(avg_pool2d(alpha, FINE)))
     spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
     smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, spread)])
     reach = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
-    facts = torch.from_numpy(told).movedim(-1, 1).to(alpha)
-    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts, balances.whole))
+    return reach, torch.from_numpy(told).movedim(-1, 1).to(alpha)
 
 
 def levelled_at_matches(
@@ -274,22 +283,45 @@ def _colours(
     alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor, balance: Balance
 ) -> tuple[Tensor, Tensor]:
     """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
-    hw, bands = alpha.shape[-2:], beta.shape[1]
-    position = matches(segments, reach).reshape(len(beta), -1, 2).to(beta)
-    valid = on_picture(position, (beta.shape[-2], beta.shape[-1])).reshape(-1, 1, *hw)
-    level = balance.levelled(guide)
-    inside = position.clamp(min=0).minimum(position.new_tensor([beta.shape[-1] - 1, beta.shape[-2] - 1]))
-    seen = sample(torch.cat([beta, guide, level], 1), inside, interpolation="bicubic").values
-    values, own, brightness = seen.reshape(len(beta), -1, *hw).split([bands, 1, 1], 1)
-    consistent = _enlarged((facts[:, :1] < CONSISTENT).to(alpha))
+    bands = beta.shape[1]
+    seen, valid = at_matches(torch.cat([beta, guide, balance.levelled(guide)], 1), segments, reach)
+    values, own, brightness = seen.split([bands, 1, 1], 1)
+    consistent = agreed_on(facts)
     brightness = levelled_at_matches(brightness, alpha, valid * consistent)
-    soft = _blurred(alpha, balance.blurs[0])
+    soft = balance.softened(alpha)
     if bands > 1:
         matched = _detailed(values - own, brightness, alpha) + own - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
-    unlike = avg_pool2d((brightness - soft).abs(), 3, 1, 1, count_include_pad=False)
-    trust = (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+    return matched, spread_from(matched, alpha, trusted(brightness - soft, consistent, valid))
+
+
+def at_matches(
+    beta: Float[Tensor, "b c hb wb"], segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]
+) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
+    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, reach).to(beta)
+    position = middle.reshape(len(beta), -1, 2)
+    inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
+    values = sample(beta, inside, interpolation="bicubic").values
+    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_picture(middle, hw)[:, None]
+
+
+def agreed_on(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where the two views agree on the match."""
+    return _enlarged((facts[:, :1] < CONSISTENT).to(facts))
+
+
+def trusted(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
+    """How far a match is to be trusted whose brightness is not alpha's by `unlike`; always more than 0."""
+    unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
+    return (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+
+
+def spread_from(
+    matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], trust: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b fills c h w"]:
+    """Bands spread by trust over what is connected in alpha, in each of the `FILLS` ways."""
     planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
     spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
 
@@ -301,24 +333,27 @@ def _colours(
         spread[i, 1] = _filled(colour, weight, like, COLOUR_FILL)
 
     in_parallel([partial(how, i) for i in range(len(planes)) for how in (along_brightness, as_it_is)])
-    return matched, torch.from_numpy(spread).to(alpha)
+    return torch.from_numpy(spread).to(alpha)
 
 
 def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
-    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it.
+    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it."""
+    return colour + local_slope(colour, brightness) * (alpha - brightness).clamp(-MOST_DETAIL, MOST_DETAIL)
+
+
+def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+    """The slope of the regression of colour on brightness around each pixel.
 
     The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
     slope is reduced to the share of colour's variance that the regression explains.
     """
-
     mean = partial(_mean, radius=DETAIL_RADIUS)
     middle, centre = mean(brightness), mean(colour)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
     spread = (mean(colour.square()) - centre.square()).clamp(min=0)
     common = mean(colour * brightness) - centre * middle
     explained = common.square() / ((variance + 1e-6) * (spread + 1e-6))
-    slope = common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
-    return colour + slope * (alpha - brightness).clamp(-0.2, 0.2)
+    return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
 
 
 def _regressed(

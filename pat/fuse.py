@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from arraygeom import (
+    Camera,
     Curved,
     Epipolar,
     EpipolarLine,
@@ -163,18 +164,75 @@ def _fuse_straight(
 ) -> FusedFrame:
     own = _grey(_picture(rig, images, alpha))[None]
     levels = own if how.match_levels else None
-    betas = [
-        _prepare(network, rig.pair(alpha, name), _picture(rig, images, name)[None], fields.get(name), levels, name)
-        for name in rig.betas(alpha)
-        if name in images
-    ]
+    names = [name for name in rig.betas(alpha) if name in images]
+    groups = together(rig, names, fields, network.joins_bands)
+    betas = [_joined_beta(network, rig, images, alpha, group, fields.get(group[0]), levels) for group in groups]
+    one_colour = len(names) == 1 and betas[0].picture.shape[1] == 3
     planned = _planned(network, own, betas, how)
     if how.announce:
         how.announce(planned)
     betas = [surveyed(network, own, beta, survey_tiles(network, rig[alpha].hw)) for beta in betas]
-    one_colour = len(betas) == 1 and betas[0].picture.shape[1] == 3
     frame = _fused_in_tiles(network, own, betas, planned.tiles, how)
-    return frame._replace(image=as_bright(frame.image, own[0], rig[alpha].sensor)) if one_colour else frame
+    image = as_bright(frame.image, own[0], rig[alpha].sensor) if one_colour else frame.image
+    if len(groups) < len(names):
+        image = image[_band_order(names, groups, {name: images[name].shape[0] for name in names})]
+    return frame._replace(image=image)
+
+
+def together(
+    rig: Rig, names: Sequence[str], fields: Fields, which: Literal["no", "neighbours", "all"]
+) -> list[list[str]]:
+    """The betas in groups that see the same from one place (K, R, t, lens and size), and are looked at alike.
+
+    `which` says whether such are put together only if they follow each other, or all, or none.
+    """
+    groups: list[list[str]] = []
+    for name in names:
+        near = [] if which == "no" else groups[-1:] if which == "neighbours" else groups
+        home = [g for g in near if fields.get(g[0]) is fields.get(name) and _same_view(rig[g[0]], rig[name])]
+        if home:
+            home[0].append(name)
+        else:
+            groups.append([name])
+    return groups
+
+
+def _same_view(one: View, other: View) -> bool:
+    """Whether two calibrated cameras differ at most in their sensors."""
+    if not (isinstance(one, Camera) and isinstance(other, Camera)) or one.hw != other.hw:
+        return False
+    if (one.distortion is None) != (other.distortion is None):
+        return False
+    if one.distortion and other.distortion and one.distortion.model != other.distortion.model:
+        return False
+    return all(torch.equal(*numbers) for numbers in zip(_calibration(one), _calibration(other)))
+
+
+def _calibration(camera: Camera) -> list[Tensor]:
+    lens = [] if camera.distortion is None else [camera.distortion.coefficients]
+    return [camera.K, camera.R, camera.t, *lens]
+
+
+def _joined_beta(
+    network: FusionNetwork,
+    rig: Rig,
+    images: Pictures,
+    alpha: str,
+    group: list[str],
+    field: ReceptiveField | None,
+    levels: Tensor | None,
+) -> Beta:
+    """The betas of a group as one; with `levels`, each is levelled by itself."""
+    pictures = [_picture(rig, images, name)[None] for name in group]
+    if levels is not None and len(group) > 1:
+        pictures, levels = [levelled(picture, levels) for picture in pictures], None
+    return _prepare(network, rig.pair(alpha, group[0]), torch.cat(pictures, 1), field, levels, " and ".join(group))
+
+
+def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Mapping[str, int]) -> list[int]:
+    """Which of the groups' bands, one after the other, are those of the betas in the order of their names."""
+    joined = [(name, band) for group in groups for name in group for band in range(bands[name])]
+    return [joined.index((name, band)) for name in names for band in range(bands[name])]
 
 
 def _planned(network: FusionNetwork, own: Tensor, betas: list[Beta], how: _How) -> Plan:

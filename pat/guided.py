@@ -8,9 +8,9 @@ that are certain to those that are not, and adds it to alpha.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -38,7 +38,8 @@ class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
     Attention reaches `window` pixels to either side of the consensus, with `taps` samples. Colour is carried
-    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. `keep_luminance` lets
+    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
+    nothing is added to what was found and carried. `keep_luminance` lets
     the network add colour to alpha, and never luminance.
     """
 
@@ -70,6 +71,11 @@ class Seen(NamedTuple):
     logit: Tensor
     choice: Tensor
 
+    def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> Seen:
+        """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
+        of = slice(band, band + 1)
+        return self._replace(colour=(self.colour - base)[:, of], spread=(self.spread - base[:, None])[:, :, of])
+
 
 class Encoded(NamedTuple):
     """Features at 1/2 of the size, and at 1/4 with context."""
@@ -87,6 +93,7 @@ class GuidedPAT(nn.Module):
 
     multiple = 16
     equal_pitch = True
+    joins_bands: Literal["no", "neighbours", "all"] = "neighbours"
     halo = 640
     """Encoder 85, judge 176, trust 8, carrying 148, propagation 180 and head 16: the sum, rounded up."""
     beta_halo = 96
@@ -101,16 +108,18 @@ class GuidedPAT(nn.Module):
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
         self.trust = Trust(c.judge_dim + w2 + 4 + 12, c.trust_dim)
         self.carry = nn.ModuleList(Carry(w4, c.carry_dim, step) for step in c.carry_steps)
-        self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
-        self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
+        if c.head_dim:
+            self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
+            self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
-    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"]) -> Balances:
-        """How the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
-        return Balances.of(alpha, _guide(beta))
+    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
+        """The look with how the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
+        return replace(look, balances=Balances.of(alpha, _guide(beta)))
 
     def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
         """What can be known before attention looks, of whole pictures; for pieces of them it is cut, not redone."""
-        return self._agreed(alpha, beta, look, _segments(look, hw_of(alpha), 1, alpha.double()))
+        whole, blocks = (segments_of(look, hw_of(alpha), step, alpha.double()) for step in (1, FINE))
+        return consensus(alpha, _guide(beta), beta, whole, blocks, look.balances)
 
     def forward(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
@@ -129,23 +138,23 @@ class GuidedPAT(nn.Module):
         if bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
         own = self.encoder(alpha)
-        seen = [self._see(own, alpha, beta, look) for beta, look in zip(betas, looks)]
+        seen = [self.seen(own, alpha, beta, look) for beta, look in zip(betas, looks)]
+        residual = self.blended(own, alpha, seen)
+        if self.config.keep_luminance:
+            residual = residual - luminance(residual)
+        return fused_from(alpha + residual, seen), seen
+
+    def blended(self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], seen: Sequence[Seen]) -> Float[Tensor, "b c h w"]:
+        """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
         certain = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in seen], 1)
         colour = torch.cat([s.colour for s in seen], 1)
         rest = torch.cat([self._unseen(own, s) for s in seen], 1)
+        blend = torch.lerp(rest, colour, certain)
+        if not self.config.head_dim:
+            return blend
         rough = avg_pool2d(torch.cat([colour * certain, certain], 1), COARSE)
         context = self.propagate(torch.cat([own.quarter, rough], 1))
-        blend = torch.lerp(rest, colour, certain)
-        residual = blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
-        if self.config.keep_luminance:
-            residual = residual - luminance(residual)
-        fused = Fused(
-            alpha + residual,
-            [s.attended.position for s in seen],
-            [s.attended.spread for s in seen],
-            [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in seen],
-        )
-        return fused, seen
+        return blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
 
     def _unseen(self, own: Encoded, seen: Seen) -> Tensor:
         """Colour for where beta does not see the point: carried at 1/4 of the size from certain pixels to others
@@ -158,15 +167,19 @@ class GuidedPAT(nn.Module):
         choices = torch.cat([enlarge(colour, COARSE)[:, None], seen.spread], 1)
         return (seen.choice.softmax(1)[:, :, None] * choices).sum(1)
 
-    def _see(self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look) -> Seen:
-        other = self.encoder(_guide(beta))
-        segments = _segments(look, hw_of(alpha), 1, self._exact(alpha))
-        known = look.known if look.known is not None else self._agreed(alpha, beta, look, segments)
+    def seen(
+        self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look, *, guide: Callable[[Tensor], Tensor] | None = None
+    ) -> Seen:
+        """What one beta of any bands tells; `guide` is what of these is compared with alpha."""
+        of = guide or _guide
+        other = self.encoder(of(beta))
+        segments = segments_of(look, hw_of(alpha), 1, self._exact(alpha))
+        known = look.known if look.known is not None else self.survey(alpha, beta, look)
         window = window_around(known.reach, segments, self.config.window)
         query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
         found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
         value = found.value.to(alpha)
-        facts = torch.cat([_guide(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
+        facts = torch.cat([of(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
         judged = self._judged(own, known, facts, segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
@@ -181,13 +194,19 @@ class GuidedPAT(nn.Module):
         context = self.judge(torch.cat([own.quarter, rough], 1))
         return self.trust(torch.cat([enlarge(context), own.half, agreed, pixel_unshuffle(facts, 2)], 1))
 
-    def _agreed(self, alpha: Tensor, beta: Tensor, look: Look, segments: Segments) -> Consensus:
-        blocks = _segments(look, hw_of(alpha), FINE, alpha.double())
-        return consensus(alpha, _guide(beta), beta, segments, blocks, look.balances)
-
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
         return x if self.training else x.double()
+
+
+def fused_from(image: Float[Tensor, "b c h w"], seen: Sequence[Seen]) -> Fused:
+    """The image with where each beta was looked at, and with what confidence."""
+    return Fused(
+        image,
+        [s.attended.position for s in seen],
+        [s.attended.spread for s in seen],
+        [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in seen],
+    )
 
 
 def _guide(beta: Tensor) -> Tensor:
@@ -243,7 +262,7 @@ def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: f
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
-def _segments(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:
+def segments_of(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:
     """The segments of every `step`-th block of alpha pixels, at its centre: (B or 1, h / step, w / step)."""
     grid = (hw[0] // step, hw[1] // step)
     x = (pixel_grid(grid, dtype=like.dtype, device=like.device) + 0.5) * step - 0.5

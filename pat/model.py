@@ -18,6 +18,7 @@ from torch import Tensor, nn
 from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_grid
 
 from .attention import Attended, attend_with_statistics
+from .bands import Mix
 from .blocks import ResidualASPP, ResidualBlock
 from .consensus import Balances, Consensus
 
@@ -27,14 +28,15 @@ class Look:
     """Where to look in one beta: `at` maps alpha pixels (n, 2) to segments or positions in beta's pixels.
 
     `at` may answer for one rig (n) or for a batch of rigs (B, n). Segments are looked at in `samples` places.
-    `known` is what a survey of the whole pictures has found, for networks that make one, and `balances` what the
-    survey of a piece is to know of the whole.
+    `known` is what a survey of the whole pictures has found, for networks that make one, and `balances` and `mix` what
+    the survey of a piece is to know of the whole.
     """
 
     at: Callable[[Tensor], Segments | Positions]
     samples: int
     known: Consensus | None = None
     balances: Balances | None = None
+    mix: Mix | None = None
 
     @classmethod
     def along(cls, field: ReceptiveField, pair: Pair) -> Look:
@@ -82,8 +84,12 @@ class FusionNetwork(Protocol):
     equal_pitch: bool
     """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
 
-    def balance(self, alpha: Tensor, beta: Tensor) -> Balances | None:
-        """What surveys of pieces are to know of the whole pictures, if anything."""
+    joins_bands: Literal["no", "neighbours", "all"]
+    """Which betas that see the same from one place are to come as one of several bands: none, those that follow each
+    other (where the order of the bands matters), or all."""
+
+    def balance(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
+        """The look with what surveys of pieces are to know of the whole pictures (of whole multiples), if anything."""
         ...
 
     def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> Consensus | None:
@@ -125,6 +131,7 @@ class PAT(nn.Module):
     beta_halo = 64
     multiple = 1
     equal_pitch = False
+    joins_bands: Literal["no", "neighbours", "all"] = "no"
     bytes_per_pixel = 1600.0
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
@@ -152,8 +159,9 @@ class PAT(nn.Module):
             image = image + self._enlarged(alpha)
         return Fused(image, *(list(part) for part in list(zip(*attended))[1:]))
 
-    def balance(self, alpha: Tensor, beta: Tensor) -> None:
-        """Nothing."""
+    def balance(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
+        """The same look: nothing need be known."""
+        return look
 
     def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
         """Nothing: each piece of a frame is fused by itself."""

@@ -38,7 +38,8 @@ def save_frame(
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The picture
     is written last: where it is, the others are. Each appears whole or not at all. Without any known depth there are
-    no depth files. Returns what was written.
+    no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on, their mean to fused.png.
+    Returns what was written.
     """
     prefix = f"{name}_" if name else ""
     picture, confidence = out / f"{prefix}fused.{kind}", out / f"{prefix}confidence.png"
@@ -52,7 +53,13 @@ def save_frame(
     if view is not None:
         view.save(out / "view.yaml")
         written.append(out / "view.yaml")
-    write_image(picture, to_linear(frame.image) if bits == 32 else frame.image, bits=bits)
+    image = to_linear(frame.image) if bits == 32 else frame.image
+    if len(image) not in (1, 3):
+        bands = {out / f"{prefix}fused_{i}.{kind}": band[None] for i, band in enumerate(image, 1)}
+        for file, band in bands.items():
+            write_image(file, band, bits=bits)
+        written, image = [*bands, *written], image.mean(0, keepdim=True)
+    write_image(picture, image, bits=bits)
     return [picture, *written]
 
 

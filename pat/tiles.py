@@ -223,13 +223,12 @@ def surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta, pieces: list[Til
     """The beta with what the network wants to know before it fuses pieces of a frame."""
     m = network.multiple
     with torch.no_grad():
+        told = replace(beta, look=network.balance(padded(alpha, m), padded(beta.picture, m), beta.look))
         if len(pieces) == 1:
-            known = network.survey(padded(alpha, m), padded(beta.picture, m), beta.look)
+            known = network.survey(padded(alpha, m), padded(beta.picture, m), told.look)
         else:
-            balances = network.balance(padded(alpha, m), padded(beta.picture, m))
-            told = replace(beta, look=replace(beta.look, balances=balances))
             known = _joined(((p, survey_piece(network, alpha, told, p)) for p in pieces), network, alpha)
-    return replace(beta, look=replace(beta.look, known=known))
+    return replace(told, look=replace(told.look, known=known))
 
 
 def survey_piece(network: FusionNetwork, alpha: Tensor, beta: Beta, tile: Tile) -> Consensus | None:

@@ -44,6 +44,8 @@ class Recording:
     """Error of the poses that fields are made from: how far it moves points, root mean square, pixels."""
     lens: float = 0.0
     """Chance of a lens that bends (|k1| up to 0.3), its picture straightened again."""
+    spectral: float = 0.0
+    """Chance of random bands, one to four if one beta has them all, in the place of red, green and blue."""
     ideal: bool = False
     """The truth is the scene itself; else it has alpha's luminance as recorded, noise and all."""
 

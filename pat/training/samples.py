@@ -48,6 +48,7 @@ from pat.synthesis.photos import PhotoBank
 from .config import FieldName, Recording, TrainConfig
 from .lenses import LOST, through_lenses
 from .scenes import RenderedCrops
+from .spectra import MOST, Spectra
 from .stereo import PairCrops
 
 KEPT = 48
@@ -225,15 +226,15 @@ def degraded(
     recording: Recording = Recording(),  # noqa: B008
 ) -> Sample:
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
-    ideal = scene.images[0]
-    cameras = scene.cameras
-    alpha = recorded(luminance(ideal), cameras[0], g, recording).values
+    pictures, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
+    ideal, grey, cameras = pictures[0], luminance(scene.images[0]), scene.cameras
+    alpha = recorded(grey, cameras[0], g, recording).values
     betas, looks, position, visible = [], [], [], []
-    for i, picture in enumerate(scene.images[1:], 1):
-        band = picture if len(scene.images) == 2 else picture[:, i - 1 : i]
+    for i, picture in enumerate(pictures[1:], 1):
+        band = picture if alone else picture[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
         betas.append(_enlarged(seen.values, scene.hw[0]))
-        if len(scene.images) == 2 and _chance(recording.paper, g):
+        if alone and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
         looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
@@ -241,8 +242,17 @@ def degraded(
             found = truth_in(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
             position.append(found[0])
             visible.append(found[1])
-    truth = ideal if recording.ideal else ideal + (alpha - luminance(ideal))
+    truth = ideal if recording.ideal else ideal + (alpha - grey)
     return Sample(alpha, betas, looks, truth, position, visible)
+
+
+def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
+    """The scene's pictures, by this chance in other bands than red, green and blue."""
+    if spectral == 0 or not _chance(spectral, g):
+        return scene.images
+    count = 1 + int(torch.randint(MOST, (), generator=g)) if len(scene.images) == 2 else len(scene.images) - 1
+    spectra = Spectra.drawn(len(scene.images[0]), count, g)
+    return [spectra.of(picture) for picture in scene.images]
 
 
 def recorded(picture: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Sampled:

@@ -103,7 +103,7 @@ class Watch:
 
 @torch.no_grad()
 def contact_sheet(network: nn.Module, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
-    """One row for the first scene of each group: beta (or its three bands), alpha, fused, truth, confidence."""
+    """One row for the first scene of each group: beta (three bands, or one), alpha, fused, truth, confidence."""
     return torch.cat([_row(network, given) for given in samples], -2).cpu()
 
 
@@ -113,7 +113,8 @@ def _row(network: nn.Module, given: Sample) -> Tensor:
     confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)
     hw = (given.truth.shape[-2], given.truth.shape[-1])
     columns = [beta, given.alpha[:1], fused.image[:1], given.truth[:1], confidence]
-    row = [interpolate(c.float(), hw, mode="bilinear", align_corners=False).expand(-1, 3, -1, -1) for c in columns]
+    three = [c[:, :3] if c.shape[1] > 2 else c[:, :1].expand(-1, 3, -1, -1) for c in columns]
+    row = [interpolate(c.float(), hw, mode="bilinear", align_corners=False) for c in three]
     return torch.cat(row, -1)[0].clamp(0, 1)
 
 

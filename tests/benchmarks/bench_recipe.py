@@ -147,7 +147,8 @@ def lines(args: Args) -> Iterator[str]:
         if number < SEEDS:
             seeds.append(found.psnr)
         yield row(variant.name, found.psnr, found.psnr - seeds[0], found.matched, found.seconds)
-    yield f"\nThe base with {SEEDS} seeds: {min(seeds):.2f} to {max(seeds):.2f} dB: differences of that size say nothing."
+    low, high = min(seeds), max(seeds)
+    yield f"\nThe base with {SEEDS} seeds: {low:.2f} to {high:.2f} dB: differences of that size say nothing."
 
 
 def main(args: Args) -> None:

@@ -114,13 +114,13 @@ def test_tables_hold_every_row(tmp_path):
 class Matcher:
     """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch = 0, 2, 1, 1.0, True
+    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
 
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
 
-    def balance(self, alpha, beta):
-        return None
+    def balance(self, alpha, beta, look):
+        return look
 
     def survey(self, alpha, beta, look):
         return None
@@ -211,10 +211,10 @@ def test_controls_fall_on_real_pairs(shared_data):
 class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch = 0, 2, 1, 1.0, True
+    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
 
-    def balance(self, alpha, beta):
-        return None
+    def balance(self, alpha, beta, look):
+        return look
 
     def survey(self, alpha, beta, look):
         return None

@@ -23,6 +23,7 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.matches import match_points, seen_depths
+from pat.bandwise import BandwisePAT, BandwisePATConfig
 from pat.data.pairs import flickr_pairs, kitti_pairs
 from pat.demo import load_sample
 from pat.develop import LIGHT, to_linear
@@ -51,6 +52,10 @@ def network_of(kind: str):
     torch.manual_seed(1)
     if kind == "PAT":
         return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
+    if kind == "BandwisePAT":
+        network = BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8))).eval()
+        torch.nn.init.normal_(network.single.head.last.weight, std=0.2)
+        return network
     network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
     torch.nn.init.normal_(network.head.last.weight, std=0.2)
     return network
@@ -65,7 +70,12 @@ def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
 
 @pytest.mark.parametrize(
     ("kind", "dtype", "bound"),
-    [("PAT", torch.float32, 1e-5), ("GuidedPAT", torch.float64, 1e-9), ("GuidedPAT", torch.float32, 1e-5)],
+    [
+        ("PAT", torch.float32, 1e-5),
+        ("GuidedPAT", torch.float64, 1e-9),
+        ("GuidedPAT", torch.float32, 1e-5),
+        ("BandwisePAT", torch.float32, 1e-5),
+    ],
 )
 def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
     """At every pixel, the tiles' borders included. The frame is wider than a tile with its halo."""

@@ -148,7 +148,7 @@ def through(root):
     return root
 
 
-@pytest.mark.parametrize("lenses", [False, True])
+@pytest.mark.parametrize("lenses", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
     crops = RenderedCrops([through(broken) if lenses else broken], hw=(32, 48))
     seen, moved, visible = [], [], []
@@ -403,6 +403,7 @@ def mixed(rendered, tmp_path_factory):
         "steps": 6,
         "validate": 6,
         "batch": 1,
+        "hw": (16, 32),
         "photos": (),
         "cache": None,
     }

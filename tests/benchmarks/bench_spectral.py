@@ -1,0 +1,118 @@
+"""Fusion with betas of single bands: at one place, at three, with bands that are not red, green and blue.
+
+    python -m tests.benchmarks.bench_spectral --photos DIR
+
+Layered scenes of photographs that training holds out. The classical baseline sees red, green and blue at one place as
+one colour picture, and all other bands one by one. Table 2 on real pairs is `pat evaluate --protocol table2`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+import tyro
+from torch import Generator, Tensor
+
+from arraygeom import Camera, Pose, Rig
+from pat.demo import classical
+from pat.fuse import fuse
+from pat.images import luminance
+from pat.metrics import score
+from pat.model import FusionNetwork
+from pat.sensors import Clip, Noise, Quantise, record
+from pat.synthesis.layered import LayeredScenes
+from pat.synthesis.rigs import RigDistribution
+from pat.systems.system import classical_baseline
+from pat.training.config import TrainConfig
+from pat.training.samples import photographs
+from pat.training.spectra import Spectra
+from pat.weights import load_weights
+
+HW = (240, 320)
+RIGS = RigDistribution(mode="rectified", parallax=(10.0, 60.0), resolutions=(0.5,))
+KINDS = {
+    "red, green, blue at one place": (1, 0),
+    "red, green, blue at three places": (3, 0),
+    "one random band": (1, 1),
+    "two random bands at one place": (1, 2),
+    "four random bands at one place": (1, 4),
+    "three random bands at three places": (3, 3),
+}
+"""Number of places, and of random bands (0 for red, green and blue)."""
+
+
+@dataclass
+class Args:
+    photos: tuple[Path, ...]
+    """Folders of photographs: those of the training, of which it holds some out."""
+    weights: tuple[str, ...] = ("mono-spectral", "mono-colour")
+    scenes: int = 10
+    cache: Path | None = None
+    """File (.npz) of photographs read before, or to be written."""
+    seed: int = 9
+
+
+def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str, Tensor], Tensor]]:
+    """A rig, its pictures (alpha and one of each band) and the truth."""
+    _, unseen = photographs(TrainConfig(photos=args.photos, cache=args.cache))
+    scenes, g = LayeredScenes(unseen, replace(RIGS, betas=places), hw=HW, seed=args.seed), Generator()
+    g.manual_seed(args.seed)
+    for _ in range(args.scenes):
+        made = scenes.sample(1, g)
+        spectra = Spectra.drawn(1, random, g) if random else None
+        pictures = [spectra.of(image) if spectra else image for image in made.images]
+        cameras = [_single(camera) for camera in made.cameras]
+        count = random or 3
+        at = {f"band {i}": 1 + i % places for i in range(count)}
+        images = {"alpha": luminance(made.images[0])} | {
+            name: pictures[place][:, i : i + 1] for i, (name, place) in enumerate(at.items())
+        }
+        near, far = (float(d) for d in made.depth_range[0])
+        rig = Rig({"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far))
+        steps = [Noise(8000, 3), Clip(), Quantise(8)]
+        yield rig, {name: record(p, steps, g).image[0] for name, p in images.items()}, pictures[0][0]
+
+
+def _single(camera: Camera) -> Camera:
+    """The only camera of a batch of one."""
+    pose = Pose(camera.R[0].double(), camera.t[0].double())
+    return camera.replace(K=camera.K[0].double(), cam_from_world=pose)
+
+
+def baseline(rig: Rig, images: dict[str, Tensor], places: int, random: int) -> Tensor:
+    if places > 1 or random:
+        return classical_baseline(rig, images, "alpha")
+    names = rig.betas("alpha")
+    one = Rig({"alpha": rig["alpha"], "colour": rig[names[0]]}, depth=rig.depth)
+    return classical(
+        one, {"alpha": images["alpha"], "colour": torch.cat([images[n] for n in names])}, "alpha", "colour"
+    )
+
+
+def row(args: Args, networks: dict[str, FusionNetwork], places: int, random: int) -> list[str]:
+    found: dict[str, list[tuple[float, float]]] = {}
+    for rig, images, truth in cases(args, places, random):
+        answers = {"classical": baseline(rig, images, places, random)}
+        for name, network in networks.items():
+            if name == "mono-spectral" or len(truth) == 3:
+                answers[name] = fuse(network, rig, images, alpha="alpha").image
+        for name, image in answers.items():
+            found.setdefault(name, []).append(tuple(score(image.clamp(0, 1), truth)))
+    cells = {name: "{:.2f} / {:.4f}".format(*np.mean(values, 0)) for name, values in found.items()}
+    return [cells.get(name, "") for name in ("classical", *networks)]
+
+
+def main(args: Args) -> None:
+    networks = {name: load_weights(name) for name in args.weights}
+    print(f"{args.scenes} layered scenes of {HW[1]} x {HW[0]}, betas of half the resolution; mean PSNR / SSIM\n")
+    print("| bands | classical | " + " | ".join(networks) + " |\n|---" + "|---:" * (1 + len(networks)) + "|")
+    for kind, (places, random) in KINDS.items():
+        print(f"| {kind} | {' | '.join(row(args, networks, places, random))} |", flush=True)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Args))
