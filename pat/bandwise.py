@@ -52,7 +52,8 @@ class BandwisePAT(nn.Module):
         super().__init__()
         self.config = config
         self.single = GuidedPAT(GuidedPATConfig(**asdict(config)))
-        nn.init.zeros_(self.single.head.last.bias)
+        if config.head_dim and self.single.head.last.bias is not None:
+            nn.init.zeros_(self.single.head.last.bias)
 
     def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
         """The look with how the bands of the whole pictures are combined, levelled and made equally sharp."""

@@ -38,7 +38,8 @@ class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
     Attention reaches `window` pixels to either side of the consensus, with `taps` samples. Colour is carried
-    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. `keep_luminance` lets
+    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
+    nothing is added to what was found and carried. `keep_luminance` lets
     the network add colour to alpha, and never luminance.
     """
 
@@ -107,8 +108,9 @@ class GuidedPAT(nn.Module):
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
         self.trust = Trust(c.judge_dim + w2 + 4 + 12, c.trust_dim)
         self.carry = nn.ModuleList(Carry(w4, c.carry_dim, step) for step in c.carry_steps)
-        self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
-        self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
+        if c.head_dim:
+            self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
+            self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
     def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
         """The look with how the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
@@ -147,9 +149,11 @@ class GuidedPAT(nn.Module):
         certain = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in seen], 1)
         colour = torch.cat([s.colour for s in seen], 1)
         rest = torch.cat([self._unseen(own, s) for s in seen], 1)
+        blend = torch.lerp(rest, colour, certain)
+        if not self.config.head_dim:
+            return blend
         rough = avg_pool2d(torch.cat([colour * certain, certain], 1), COARSE)
         context = self.propagate(torch.cat([own.quarter, rough], 1))
-        blend = torch.lerp(rest, colour, certain)
         return blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
 
     def _unseen(self, own: Encoded, seen: Seen) -> Tensor:

@@ -26,8 +26,9 @@ from arraygeom.pixels import coarse_grid
 from calib.matches import Matches, fit_fundamental, line_distance, match_cameras
 from calib.refine import FREE, Agreement, Fit, agreement, line_distances, polish, refine, refine_matches, split
 from calib.start import start
+from pat.ablate import Case, rendered_cases
 from pat.attention import attend_with_statistics
-from pat.demo import ALPHA, load_sample
+from pat.demo import load_sample
 from pat.fuse import fuse
 from pat.images import read_image
 from pat.metrics import score
@@ -109,21 +110,24 @@ def fast_and_slow(data: Path) -> Iterator[str]:
         yield f"| {names[1]} | {len(held_out[names].alpha)} | {medians} |"
 
 
-def rendered_rigs(draws: int, g: torch.Generator) -> Iterator[str]:
-    """The sample array, which is rendered: its rig is the truth, and so are the colours at alpha's view."""
-    head = "| sample array | true rig | made worse | by points | and by the fusion's error | from pictures alone |"
-    yield head + "\n| --- | " + "---: | " * 5
+def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
+    """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at alpha's view."""
+    head = "| rendered | draw | true rig | made worse | by points | and by the fusion's error | from pictures alone |"
+    yield head + "\n| --- | " + "---: | " * 6
     network, sample = load_weights("mono-colour"), load_sample()
+    found = rendered_cases(scenes) if scenes else ()
+    ours = Case("sample array", sample.rig, sample.images, sample.truth, torch.empty(0))
+    for case in chain([ours], found):
 
-    def psnr(rig: Rig) -> float:
-        return score(fuse(network, rig, sample.images, alpha=ALPHA).image.clamp(0, 1), sample.truth)[0]
+        def psnr(rig: Rig, case: Case = case) -> float:
+            return score(fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.truth)[0]
 
-    true, alone = psnr(sample.rig), psnr(start(sample.images).rig)
-    for draw in range(1, draws + 1):
-        bad = worse(sample.rig, g)
-        rigs = [bad, *(refine(bad, [sample.images], attend=a).rig for a in (None, attend_with_statistics))]
-        cells = [f"{p:.2f} dB" for p in (true, *map(psnr, rigs), alone)]
-        yield f"| draw {draw} | {' | '.join(cells)} |"
+        true, alone = psnr(case.rig), psnr(start(case.images).rig)
+        for draw in range(1, draws + 1):
+            bad = worse(case.rig, g)
+            rigs = [bad, *(refine(bad, [case.images], attend=a).rig for a in (None, attend_with_statistics))]
+            cells = [f"{p:.2f} dB" for p in (true, *map(psnr, rigs), alone)]
+            yield f"| {case.name} | {draw} | {' | '.join(cells)} |"
 
 
 def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
@@ -159,13 +163,14 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared/data"))
     parser.add_argument("--draws", type=int, default=3)
     parser.add_argument("--only", nargs="*", choices=["array", "rendered", "photometry", "real"])
+    parser.add_argument("--scenes", type=Path, help="a folder of scenes rendered by pat render, two cameras each")
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     cv2.setRNGSeed(0)
     g = torch.Generator().manual_seed(0)
     tables = {
         "array": lambda: fast_and_slow(options.data),
-        "rendered": lambda: rendered_rigs(options.draws, g),
+        "rendered": lambda: rendered_rigs(options.draws, g, options.scenes),
         "photometry": lambda: by_photometry(options.draws, g),
         "real": lambda: real_pairs(options.data, options.draws, g),
     }

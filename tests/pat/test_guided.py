@@ -78,3 +78,14 @@ def test_nowhere_to_look_is_no_confidence():
     fused = network(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere])
     assert fused.confidence[0].max() == 0
     assert fused.image.isfinite().all()
+
+
+def test_without_a_head_the_image_is_what_was_found_and_carried():
+    torch.manual_seed(0)
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), head_dim=0, keep_luminance=False))
+    assert not [name for name in network.state_dict() if name.startswith(("head", "propagate"))]
+    alpha, beta = torch.rand(1, 1, *HW), torch.rand(1, 3, *HW)
+    torch.nn.init.constant_(network.trust[2].bias, 20.0)
+    fused, (seen,) = network.explain(alpha, [beta], [rectified()])
+    assert seen.logit.max() > 15
+    assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)
