@@ -7,6 +7,7 @@ bands are corrected together. All sums over bands are of sorted summands, so tha
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import torch
@@ -24,6 +25,7 @@ from .consensus import (
     agreed_on,
     agreement,
     at_matches,
+    box_mean,
     local_slope,
     spread_from,
     trusted,
@@ -31,18 +33,23 @@ from .consensus import (
 
 OUTLIER = 0.06
 """Difference from alpha at which a match counts 1 / e in the second of two fits."""
-EQUAL = 1e-3
+EQUAL = 1e-4
 """How strongly the combination is drawn to one of equal parts: share of the bands' mean variance."""
-MISFIT = 0.013
+MISFIT = 0.016
 """Difference from alpha, averaged over `SMOOTH` pixels to either side, at which the combination tells half."""
 SMOOTH = 4
+DILUTED = 0.8
+"""Wrong matches make least squares' weights too small. They are enlarged until the combination varies as much as alpha,
+as if no less than this share of alpha's variance were explained."""
+WIDE = 4
+"""Bands are compared with alpha within squares whose radius is the picture's longer side over this."""
 
 
 class Mix(NamedTuple):
     """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times bands.
 
-    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next; less if its
-        detail is not alpha's.
+    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next; less if
+        that explains alpha badly.
     gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another spectrum. 0
         for one band, which has no say in that.
     """
@@ -62,7 +69,8 @@ class Mix(NamedTuple):
     def fitted(
         cls, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
     ) -> Mix:
-        """The one that is most like alpha by weighted least squares, twice, the second time without outliers."""
+        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the second time
+        without outliers."""
         parts = [_fit(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(part) for part in zip(*parts)))
 
@@ -136,20 +144,23 @@ def _reduced(segments: Segments, factor: int) -> Segments:
 def _fit(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
     order = bands.flatten(1).sum(1).argsort()
-    x, y = bands[order].flatten(1), alpha.flatten()
-    first = trust = weight.flatten() + 1e-6
+    weight = weight + 1e-6
+    first = trust = weight.flatten()
+    x, y = (_local(planes, weight).flatten(1) for planes in (bands[order], alpha))
     for _ in range(2):
-        weights, middle, share = _combination(x, y, trust / trust.sum())
-        rest = y - middle[-1] - weights @ (x - middle[:-1, None])
+        share = trust / trust.sum()
+        weights = _combination(x, y[0], share)
+        rest = y[0] - weights @ x
         trust = first * torch.exp(-(rest / OUTLIER).square())
-    detail, own = _detail(bands[order]).flatten(1), _detail(alpha).flatten()
+    explained = (1 - first @ rest.square() / (first @ y[0].square()).clamp(min=1e-12)).clamp(min=0)
+    weights = weights / explained.clamp(min=DILUTED).sqrt()
+    detail = _detail(bands[order]).flatten(1)
     combined = weights @ detail
-    varying = (share @ combined.square()).maximum(share @ own.square())
-    slopes = detail @ (share * combined) / varying.clamp(min=1e-12)
-    explained = 1 - first @ rest.square() / (first @ (y - middle[-1]).square()).clamp(min=1e-12)
-    gain = explained.clamp(min=0) / (1 + (_smooth_misfit(rest.view_as(alpha), share.view_as(alpha)) / MISFIT) ** 6)
+    slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
+    gain = explained / (1 + (_smooth_misfit(rest.view_as(alpha), share.view_as(alpha)) / MISFIT) ** 6)
+    offset = share @ (alpha.flatten() - weights @ bands[order].flatten(1))
     back = order.argsort()
-    return weights[back], middle[-1] - weights @ middle[:-1], slopes[back], gain
+    return weights[back], offset, slopes[back], gain
 
 
 def _detail(planes: Tensor) -> Tensor:
@@ -157,16 +168,21 @@ def _detail(planes: Tensor) -> Tensor:
     return planes - avg_pool2d(planes[None], 3, 1, 1, count_include_pad=False)[0]
 
 
-def _combination(x: Tensor, y: Tensor, share: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Weights (C) with which bands x (C, n) make y (n), drawn to equal ones; the means of both (C + 1); the shares."""
-    middle = torch.cat([x @ share, (y @ share)[None]])
-    x, y = x - middle[:-1, None], y - middle[-1]
+def _local(planes: Tensor, weight: Tensor) -> Tensor:
+    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views, slowly."""
+    radius = max(planes.shape[-2:]) // WIDE
+    mean = partial(box_mean, radius=radius)
+    return planes - (mean((planes * weight)[None]) / mean(weight[None]))[0]
+
+
+def _combination(x: Tensor, y: Tensor, share: Tensor) -> Tensor:
+    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones."""
     mean = x.mean(0)
     scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
     equal = scale.expand(len(x)) / len(x)
     covariance = x * share @ x.T
     ridge = (EQUAL * covariance.trace() / len(x) + 1e-12) * torch.eye(len(x)).to(x)
-    return equal + torch.linalg.solve(covariance + ridge, x * share @ (y - equal @ x)), middle, share
+    return equal + torch.linalg.solve(covariance + ridge, x * share @ (y - equal @ x))
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:

@@ -183,7 +183,7 @@ def levelled_at_matches(
     return (picture - means[0]) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + means[1]
 
 
-def _mean(x: Tensor, radius: int) -> Tensor:
+def box_mean(x: Tensor, radius: int) -> Tensor:
     """Over squares around each pixel, as far as these are on the picture."""
     side = 2 * radius + 1
     rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
@@ -347,7 +347,7 @@ def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1
     The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
     slope is reduced to the share of colour's variance that the regression explains.
     """
-    mean = partial(_mean, radius=DETAIL_RADIUS)
+    mean = partial(box_mean, radius=DETAIL_RADIUS)
     middle, centre = mean(brightness), mean(colour)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
     spread = (mean(colour.square()) - centre.square()).clamp(min=0)

@@ -6,6 +6,7 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Pair, Rectified, View
 from pat.bands import Mix, coarse_mix
+from pat.consensus import box_mean
 from pat.guided import segments_of
 from pat.model import Look
 
@@ -23,15 +24,17 @@ def seen_in(bands: torch.Tensor) -> torch.Tensor:
     return (WEIGHTS[None, :, None, None] * bands).sum(1, keepdim=True)
 
 
-def test_the_combination_is_that_of_least_squares():
-    bands, weight = texture(3, (48, 64)), torch.rand(1, 1, 48, 64)
+def test_the_combination_is_that_of_least_squares_around_each_pixel():
+    """NumPy's, of what bands and alpha have beyond their means in squares of 33 pixels."""
+    bands = texture(3, (48, 64))
+    drift = torch.linspace(0, 0.2, 64).expand(1, 1, 48, 64)
     alpha = seen_in(bands) + 0.05 + 0.01 * torch.randn(1, 1, 48, 64, generator=torch.Generator().manual_seed(1))
-    mix = Mix.fitted(bands, alpha, weight)
-    design = np.concatenate([bands[0].flatten(1).numpy().T, np.ones((48 * 64, 1))], 1)
-    root = weight.flatten().sqrt().numpy()
-    expected = np.linalg.lstsq(design * root[:, None], alpha.flatten().numpy() * root, rcond=None)[0]
-    assert np.abs(mix.weights[0].numpy() - expected[:3]).max() < 0.01
-    assert abs(float(mix.offset) - expected[3]) < 0.01
+    mix = Mix.fitted(bands, alpha + drift, torch.ones_like(alpha))
+    local = [(p - box_mean(p, 16)).flatten(2)[0].double().numpy() for p in (bands, alpha + drift)]
+    expected = np.linalg.lstsq(local[0].T, local[1][0], rcond=None)[0]
+    assert np.abs(mix.weights[0].numpy() / np.sum(mix.weights[0].numpy()) - expected / expected.sum()).max() < 0.01
+    assert abs(float(mix.weights.sum()) - 1) < 0.03
+    assert abs(float((mix.of(bands) - alpha - drift).mean())) < 1e-3
 
 
 def test_slopes_are_those_of_detail_whatever_materials_do():
