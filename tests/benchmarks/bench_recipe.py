@@ -58,6 +58,7 @@ VARIANTS = (
     Variant("carried once, spacing 3", network={"carry_steps": (3,)}),
     Variant("luminance free", network={"keep_luminance": False}),
     Variant("window 3 px, 13 taps", network={"window": 3.0, "taps": 13}),
+    Variant("head of 8 channels", network={"head_dim": 8}),
     Variant("head of 16 channels", network={"head_dim": 16}),
     Variant("half the rate", {"rate": 1e-3}),
     Variant("twice the rate", {"rate": 4e-3}),
@@ -147,8 +148,8 @@ def lines(args: Args) -> Iterator[str]:
         if number < SEEDS:
             seeds.append(found.psnr)
         yield row(variant.name, found.psnr, found.psnr - seeds[0], found.matched, found.seconds)
-    low, high = min(seeds), max(seeds)
-    yield f"\nThe base with {SEEDS} seeds: {low:.2f} to {high:.2f} dB: differences of that size say nothing."
+    span = f"{min(seeds):.2f} to {max(seeds):.2f} dB"
+    yield f"\nThe base with {SEEDS} seeds: {span}: differences of that size say nothing."
 
 
 def main(args: Args) -> None:
