@@ -152,12 +152,7 @@ def attention(objective: Objective, given: Sample, straight: Sample, repeats: in
     print(f"  field of segments alone        {timed(lambda: straight.looks[0].at(x), repeats)}")
 
 
-HOW = {
-    "float32": (False, False),
-    "bfloat16": (True, False),
-    "compiled": (False, True),
-    "bfloat16, compiled": (True, True),
-}
+HOW = {"float32": (False, False), "bfloat16": (True, False), "compiled": (False, True)}
 """Convolutions: in bfloat16 or not, compiled or not."""
 
 
