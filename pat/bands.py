@@ -38,6 +38,9 @@ EQUAL = 1e-4
 MISFIT = 0.016
 """Difference from alpha, averaged over `SMOOTH` pixels to either side, at which the combination tells half."""
 SMOOTH = 4
+ALIKE = 0.08
+"""Where the combination's black and white are so near to alpha's, black is taken for black and white for white, and the
+difference for that of two exposures."""
 DILUTED = 0.8
 """Wrong matches make least squares' weights too small. They are enlarged until the combination varies as much as alpha,
 as if no less than this share of alpha's variance were explained."""
@@ -159,6 +162,8 @@ def _fit(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
     slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
     gain = explained / (1 + (_smooth_misfit(rest.view_as(alpha), share.view_as(alpha)) / MISFIT) ** 6)
     offset = share @ (alpha.flatten() - weights @ bands[order].flatten(1))
+    if max(abs(weights.sum() + offset - 1), abs(offset)) < ALIKE:
+        weights, offset, slopes = weights / weights.sum(), 0 * offset, slopes * weights.sum()
     back = order.argsort()
     return weights[back], offset, slopes[back], gain
 
