@@ -124,21 +124,18 @@ def consensus_of_bands(
     """`consensus` of alpha and the mix of the bands; all are carried to alpha's view."""
     reach, facts = agreement(alpha, mix.of(beta), blocks, balances.half)
     values, valid = at_matches(beta, segments, reach)
-    matched, unlike, follows = _matched(values, alpha, mix, balances.whole)
-    spread = spread_from(matched, alpha, trusted(unlike, agreed_on(facts), valid))
-    return Consensus(reach, facts, matched, spread, follows)
+    matched, unlike = _matched(values, alpha, mix, balances.whole)
+    return Consensus(reach, facts, matched, spread_from(matched, alpha, trusted(unlike, agreed_on(facts), valid)))
 
 
-def _matched(values: Tensor, alpha: Tensor, mix: Mix, balance: Balance) -> tuple[Tensor, Tensor, Tensor]:
-    """Bands minus alpha, with the detail that alpha has and they have not; how unlike alpha they are; how far what
-    they have beyond common rises follows brightness."""
+def _matched(values: Tensor, alpha: Tensor, mix: Mix, balance: Balance) -> tuple[Tensor, Tensor]:
+    """Bands minus alpha, with the detail that alpha has and they have not; how unlike alpha they are."""
     brightness, soft = mix.of(values), balance.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
     beyond = (alpha - soft) + gain * (soft - brightness)
     rises = mix.rises(values)
-    own, follows = local_slope(values - rises * brightness, brightness)
-    detail = (rises + own) * beyond.clamp(-MOST_DETAIL, MOST_DETAIL)
-    return values + detail - alpha, brightness - soft, follows
+    slope = rises + local_slope(values - rises * brightness, brightness)
+    return values + slope * beyond.clamp(-MOST_DETAIL, MOST_DETAIL) - alpha, brightness - soft
 
 
 def _reduced(segments: Segments, factor: int) -> Segments:

@@ -49,7 +49,6 @@ DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
 MOST_DETAIL = 0.2
 """Differences of brightness beyond this are no detail that beta lost."""
-FOLLOWS_RADIUS = 3
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
 
@@ -63,23 +62,19 @@ class Consensus(NamedTuple):
         others, and its cost; each 0 to 1.
     matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
     colour: (B, fills, C, H, W), the same from pixels with trust spread to those without.
-    follows: (B, 1, H, W), the share of colour's variance around the match that follows brightness, 0 to 1: the rest
-        is noise, or edges of colour alone.
     """
 
     reach: Tensor
     facts: Tensor
     matched: Tensor
     colour: Tensor
-    follows: Tensor
 
     def cut(self, box: tuple[int, int, int, int]) -> Consensus:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        full = (part[whole] for part in (self.matched, self.colour, self.follows))
-        return Consensus(self.reach[half], self.facts[half], *full)
+        return Consensus(self.reach[half], self.facts[half], self.matched[whole], self.colour[whole])
 
 
 class Balance(NamedTuple):
@@ -286,9 +281,8 @@ def _contrast(picture: Float[Tensor, "1 h w"]) -> Tensor:
 
 def _colours(
     alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor, balance: Balance
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Beta's bands minus alpha at the matches, the same spread by trust over what is connected in alpha, and how far
-    colour follows brightness."""
+) -> tuple[Tensor, Tensor]:
+    """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
     bands = beta.shape[1]
     seen, valid = at_matches(torch.cat([beta, guide, balance.levelled(guide)], 1), segments, reach)
     values, own, brightness = seen.split([bands, 1, 1], 1)
@@ -296,12 +290,10 @@ def _colours(
     brightness = levelled_at_matches(brightness, alpha, valid * consistent)
     soft = balance.softened(alpha)
     if bands > 1:
-        detailed, follows = _detailed(values - own, brightness, alpha)
-        matched = detailed + own - alpha
+        matched = _detailed(values - own, brightness, alpha) + own - alpha
     else:
-        detailed, follows = _detailed(values, soft, alpha)
-        matched = detailed - alpha
-    return matched, spread_from(matched, alpha, trusted(brightness - soft, consistent, valid)), follows
+        matched = _detailed(values, soft, alpha) - alpha
+    return matched, spread_from(matched, alpha, trusted(brightness - soft, consistent, valid))
 
 
 def at_matches(
@@ -344,33 +336,24 @@ def spread_from(
     return torch.from_numpy(spread).to(alpha)
 
 
-def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
-    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it.
-
-    And how far it follows brightness.
-    """
-    slope, follows = local_slope(colour, brightness)
-    return colour + slope * (alpha - brightness).clamp(-MOST_DETAIL, MOST_DETAIL), follows
+def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
+    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it."""
+    return colour + local_slope(colour, brightness) * (alpha - brightness).clamp(-MOST_DETAIL, MOST_DETAIL)
 
 
-def local_slope(
-    colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"]
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """The slope of the regression of colour on brightness around each pixel, and the share that follows it.
+def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+    """The slope of the regression of colour on brightness around each pixel.
 
     The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
-    slope is reduced to the share of each band's variance that the regression explains. The share told is of the
-    variance of all bands, and of wider surroundings.
+    slope is reduced to the share of colour's variance that the regression explains.
     """
     mean = partial(box_mean, radius=DETAIL_RADIUS)
     middle, centre = mean(brightness), mean(colour)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
     spread = (mean(colour.square()) - centre.square()).clamp(min=0)
     common = mean(colour * brightness) - centre * middle
-    share = common.square() / (variance + 1e-6)
-    slope = common / (variance + DETAIL_FLOOR) * (share / (spread + 1e-6)).clamp(max=1)
-    follows = share.sum(1, keepdim=True) / (spread.sum(1, keepdim=True) + 1e-6)
-    return slope, box_mean(follows.clamp(max=1), FOLLOWS_RADIUS)
+    explained = common.square() / ((variance + 1e-6) * (spread + 1e-6))
+    return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
 
 
 def _regressed(

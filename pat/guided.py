@@ -29,8 +29,6 @@ COARSE = 4
 """Context is worked out at a quarter of the size."""
 UNSURE = 1e-3
 """The certainty that every pixel has at least."""
-HALF_FOLLOWS = 0.2
-"""The share of colour's variance that follows brightness at which `by_detail` prefers neither."""
 NOWHERE = -10.0
 """The logit of the confidence where there is nowhere to look."""
 
@@ -41,9 +39,8 @@ class GuidedPATConfig:
 
     Attention reaches `window` pixels to either side of the consensus, with `taps` samples. Colour is carried
     within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
-    nothing is added to what was found and carried. With `by_detail` the consensus's match is preferred to attention's
-    mean the more, the more colour follows brightness: the mean has less noise, the match more detail.
-    `keep_luminance` lets the network add colour to alpha, and never luminance.
+    nothing is added to what was found and carried. `keep_luminance` lets
+    the network add colour to alpha, and never luminance.
     """
 
     widths: tuple[int, int, int, int] = (16, 32, 40, 48)
@@ -55,7 +52,6 @@ class GuidedPATConfig:
     carry_dim: int = 8
     carry_steps: tuple[int, ...] = (1, 3, 8)
     head_dim: int = 32
-    by_detail: float = 0.0
     bands: int = 3
     keep_luminance: bool = True
 
@@ -187,7 +183,6 @@ class GuidedPAT(nn.Module):
         judged = self._judged(own, known, facts, segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
-        exact = exact + self.config.by_detail * (known.follows - HALF_FOLLOWS)
         colour = torch.lerp(value - alpha, known.matched, exact.sigmoid())
         return Seen(found, colour, known.colour, logit, choice)
 
