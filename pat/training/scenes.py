@@ -48,12 +48,10 @@ class View(NamedTuple):
     camera: Camera
 
 
-class RenderedCrops:
-    """Random windows of the rendered scenes in folders; `hw` is alpha's size in the samples.
+class Crops:
+    """Random windows of what is in folders; `hw` is alpha's size in the samples.
 
-    `resolutions` are those of betas, as in `RigDistribution`; `choose` says by its number whether a scene is taken.
-    Raises ValueError for a folder without scenes or with one that is not whole, for a scene of one camera, and for
-    one of which no picture is as large as `hw`; when it comes up, for one whose pictures cannot be read.
+    `resolutions` are those of betas, as in `RigDistribution`; `choose` says by its number whether an item is taken.
     """
 
     def __init__(
@@ -67,11 +65,30 @@ class RenderedCrops:
         choose: Callable[[int], bool] = lambda i: True,
     ):
         self.hw, self.resolutions, self.seed, self.device = hw, resolutions, seed, device
+        self._find(roots, choose)
+
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
+        """Looks at what is there, and refuses what cannot be used."""
+        raise NotImplementedError
+
+    def beta_sizes(self, betas: int, generator: Generator) -> list[HW]:
+        """Sizes of betas, drawn."""
+        return [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
+
+
+class RenderedCrops(Crops):
+    """Random windows of the rendered scenes in folders.
+
+    Raises ValueError for a folder without scenes or with one that is not whole, for a scene of one camera, and for
+    one of which no picture is as large as `hw`; when it comes up, for one whose pictures cannot be read.
+    """
+
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
         found = [folder for root in roots for folder in scene_folders(root)]
         self.folders = chosen(found, choose, f"rendered scenes of {', '.join(map(str, roots))}")
         rigs = [scene_rig(folder) for folder in self.folders]
         self.names = [rig.names for rig in rigs]
-        self.alphas = [large_enough(folder, rig, hw) for folder, rig in zip(self.folders, rigs)]
+        self.alphas = [large_enough(folder, rig, self.hw) for folder, rig in zip(self.folders, rigs)]
         self._view = lru_cache(3 * HELD)(lambda scene, name: read_view(self.folders[scene], name))
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
@@ -80,7 +97,7 @@ class RenderedCrops:
         A scene with fewer other cameras than betas are wanted has several betas in one place.
         """
         scenes = in_hand(number, len(self.folders), self.seed)
-        sizes = [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
+        sizes = self.beta_sizes(betas, generator)
         with torch.no_grad():
             drawn = [self._windows(one_of(scenes, generator), sizes, generator) for _ in range(batch)]
         return batched(drawn, self.device)

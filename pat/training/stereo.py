@@ -22,37 +22,25 @@ from pat.data.pairs import PairFiles, pair_files
 from pat.data.patches import reduced
 from pat.images import read_image
 from pat.synthesis.layered import ArrayBatch
-from pat.synthesis.rigs import scaled
 
-from .scenes import HELD, below, chosen, in_hand, one_of
+from .scenes import HELD, Crops, below, chosen, in_hand, one_of
 
 REDUCED = 2
 """How many times a window is reduced at most: pictures from the net are often less sharp than their pixels."""
 
 
-class PairCrops:
-    """Random windows of the rectified stereo pairs in folders; `hw` is alpha's size in the samples.
+class PairCrops(Crops):
+    """Random windows of the rectified stereo pairs in folders.
 
-    `resolutions` are those of betas, as in `RigDistribution`; `choose` says by its number whether a pair is taken.
     Raises ValueError for a folder without pairs, for a pair whose pictures differ in size, are not in colour or are
     smaller than `hw`; when it comes up, for a picture that cannot be read.
     """
 
-    def __init__(
-        self,
-        roots: Sequence[Path],
-        *,
-        hw: HW,
-        resolutions: tuple[float, ...] = (1.0,),
-        seed: int = 0,
-        device: str = "cpu",
-        choose: Callable[[int], bool] = lambda i: True,
-    ):
-        self.hw, self.resolutions, self.seed, self.device = hw, resolutions, seed, device
+    def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
         found = [pair for root in roots for pair in pair_files(root)]
         self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
         for pair in self.pairs:
-            check_pair(pair, hw)
+            check_pair(pair, self.hw)
         self._pictures = lru_cache(HELD)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
@@ -61,7 +49,7 @@ class PairCrops:
         There is no `depth`.
         """
         hand = in_hand(number, len(self.pairs), self.seed)
-        sizes = [scaled(self.hw, one_of(self.resolutions, generator)) for _ in range(betas)]
+        sizes = self.beta_sizes(betas, generator)
         drawn = [self._window(one_of(hand, generator), generator) for _ in range(batch)]
         alpha, beta = (torch.stack(pictures) for pictures in list(zip(*drawn))[:2])
         side, disparity = (torch.tensor(numbers, dtype=torch.float64) for numbers in list(zip(*drawn))[2:])
