@@ -39,7 +39,7 @@ showcase: $(READY)
 
 readme: demo showcase
 	@echo "== bringing README.md up to date"
-	@$(BIN)/python -m pat.readme --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
+	@$(BIN)/python -m docs.update_readme --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
 		--picture out/demo/demo.png docs/demo.jpg
 
 test: $(READY)

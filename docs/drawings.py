@@ -9,8 +9,8 @@ from matplotlib.figure import Figure
 
 from arraygeom import Dense, Epipolar, EpipolarLine, HomographyDisplacement, Local, NearestVoxels, Rectified
 from arraygeom.viz import draw_fields, draw_look, draw_rig, show_picture
-from pat.demo import ALPHA, BETA, SampleArray, load_sample
-from pat.results import save_figure
+from pat.data.sample_array import ALPHA, BETA, SampleArray, load_sample
+from pat.fusion.results import save_figure
 
 OUT = Path(__file__).parent / "drawings"
 FAMILIES = {

@@ -59,7 +59,7 @@ def shown(output: dict[str, Any]) -> str:
 
 def commands() -> str:
     """Every command with what its --help says."""
-    from pat.cli import Command
+    from pat.cli.main import Command
 
     return "\n".join(f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in paths(Command))
 
@@ -85,7 +85,7 @@ def subcommands(group: type) -> Any:
 
 def help_of(path: tuple[str, ...]) -> str:
     """What `pat PATH --help` prints, without colours."""
-    from pat.cli import main
+    from pat.cli.main import main
 
     os.environ |= {"COLUMNS": "110", "NO_COLOR": "1", "TERM": "dumb"}
     printed = io.StringIO()

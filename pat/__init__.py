@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .weights import Network
+    from .networks.weights import Network
 
 
 def from_pretrained(name: str | Path) -> Network:
@@ -15,6 +15,6 @@ def from_pretrained(name: str | Path) -> Network:
     Shapes and version are checked, and nothing is unpickled. Raises FileNotFoundError for neither, ValueError for a
     file that is not of this format or does not fit.
     """
-    from .weights import load_weights
+    from .networks.weights import load_weights
 
     return load_weights(name)

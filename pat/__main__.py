@@ -1,5 +1,5 @@
 """`python -m pat` is `pat`: torchrun starts it so."""
 
-from .cli import main
+from .cli.main import main
 
 main()

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from pat.images import write_image
+from pat.media.images import write_image
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted((ROOT / "docs").glob("*.md"))
@@ -75,7 +75,7 @@ def test_a_notebook_is_a_page_and_is_found_from_the_readme(notebook):
 
 def test_commands_in_the_pages_exist():
     """Every `pat ...` that a page shows parses: its --help is printed."""
-    from pat.cli import Command
+    from pat.cli.main import Command
 
     sys.path.insert(0, str(ROOT / "docs"))
     try:

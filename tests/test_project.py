@@ -15,7 +15,7 @@ import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from pat.images import write_image
+from pat.media.images import write_image
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("arraygeom", "pat", "calib")

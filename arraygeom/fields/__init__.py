@@ -16,14 +16,7 @@ from .curved import Curved, ThroughLenses
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
 from .protocol import Look, ReceptiveField, lazily, look
-from .straight import (
-    Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Rectified,
-    covering_displacement,
-    pinhole_track,
-)
+from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, covering_displacement, pinhole_track
 from .widened import Widened
 
 __all__ = [

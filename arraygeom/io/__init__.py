@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..atomic import write_text
 from ..camera import Camera
 from ..pixels import HW
 from ..pose import Pose
@@ -33,7 +34,6 @@ from . import (
 )
 from .errors import RigFileError
 from .source import RigFileWarning, Source, unit_doubt
-from .whole import write_text
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {

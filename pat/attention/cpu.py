@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from arraygeom.segments import sample_fractions
 from pat.attention import cpu_kernels as kernels
 from pat.attention.reference import EDGE_SLACK, Look
-from pat.threads import in_parallel
+from pat.support.threads import in_parallel
 
 PIECE_SAMPLES = 2**15
 """Samples that a thread takes at a time: a fraction of a millisecond."""

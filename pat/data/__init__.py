@@ -13,8 +13,8 @@ from pat.data.pairs import (
     syntim_pairs,
 )
 from pat.data.patches import Patches, scene_folders
-from pat.data.protocol import MonoColourTask, mono_colour_task, reduce_by
 from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
+from pat.evaluation.protocols import MonoColourTask, mono_colour_task, reduce_by
 
 __all__ = [
     "PAPER_DISPARITY",

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
+from arraygeom.atomic import write_atomically
 from arraygeom.pixels import HW
 from arraygeom.segments import Positions
-from pat.images import write_atomically
 
 
 def index_files(folder: str | Path, name: str, beta: int | None = None) -> tuple[Path, Path]:

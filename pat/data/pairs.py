@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from pat.images import read_image
+from pat.media.images import read_image
 
 
 class Disparity(NamedTuple):

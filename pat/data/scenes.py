@@ -16,7 +16,7 @@ from arraygeom.camera import Camera
 from arraygeom.fields import ReceptiveField
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
-from pat.model import Look
+from pat.networks.protocol import Look
 from pat.sensors import (
     Case,
     Clip,

@@ -42,7 +42,7 @@ from arraygeom import (
 from arraygeom.fields import covering_displacement
 from arraygeom.pixels import HW
 
-from ..images import luminance
+from ..media.colour import luminance
 
 
 @dataclass(frozen=True)

@@ -19,11 +19,11 @@ from arraygeom.pixels import HW
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from pat.sensors import Linear, record
+from pat.support.schema import from_document
 from pat.synthesis.blender.lens import lens_for
 from pat.synthesis.blender.settings import RenderSettings
 from pat.synthesis.blender.task import fitted, render_here, shots
 from pat.synthesis.check import Limits, Report, check_views
-from pat.synthesis.document import from_document
 from pat.synthesis.generators import GENERATORS
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns

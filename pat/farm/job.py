@@ -13,8 +13,8 @@ import yaml
 
 from arraygeom.rig import Rig
 from pat.sensors import seed_for
+from pat.support.schema import from_document, read_yaml, to_document
 from pat.synthesis.check import Limits as CheckLimits
-from pat.synthesis.document import from_document, read_yaml, to_document
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
 from .folders import JobFolder, write_whole

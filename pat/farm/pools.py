@@ -18,7 +18,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from ..jobs import environment_put_back
+from ..support.jobs import environment_put_back
 from .workshop import Order, Outcome, Stopped, Workshop
 
 _LOCAL = threading.local()

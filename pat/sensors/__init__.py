@@ -11,17 +11,7 @@ Steps that change the pixel grid say how through `pixel_matrix`; K' = A K with t
 """
 
 from .cases import Case, Pairs, augment, paper_cases
-from .chain import (
-    Light,
-    LitStep,
-    Recorded,
-    RecordedArray,
-    Step,
-    generator_for,
-    record,
-    record_array,
-    seed_for,
-)
+from .chain import Light, LitStep, Recorded, RecordedArray, Step, generator_for, record, record_array, seed_for
 from .electronics import Clip, Exposure, Jitter, Noise, Quantise
 from .grids import Crop, Demosaic, Mosaic, Resample
 from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting, circle_of_confusion

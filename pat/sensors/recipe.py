@@ -21,7 +21,7 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from pat.synthesis.document import from_document, near
+from pat.support.schema import from_document, near
 
 from .cases import Case
 from .chain import Step

@@ -12,6 +12,7 @@ from torch import Generator, Tensor
 
 from arraygeom.sensor import Band, Curve
 
+from ..media.colour import linear_from_srgb, srgb_from_linear
 from .chain import Step
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
@@ -28,8 +29,7 @@ class Linear(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The linear values; the straight part of the curve continues below zero."""
-        toe = image <= 0.04045
-        return torch.where(toe, image / 12.92, ((torch.where(toe, 0.5, image) + 0.055) / 1.055) ** 2.4)
+        return linear_from_srgb(image)
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,7 @@ class Coded(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The coded values."""
-        toe = image <= 0.04045 / 12.92
-        return torch.where(toe, 12.92 * image, 1.055 * torch.where(toe, 0.5, image) ** (1 / 2.4) - 0.055)
+        return srgb_from_linear(image)
 
 
 @dataclass(frozen=True)

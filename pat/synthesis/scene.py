@@ -19,8 +19,9 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from ..images import write_text
-from .document import from_document, to_document
+from arraygeom.atomic import write_text
+
+from ..support.schema import from_document, to_document
 
 Vec3 = tuple[float, float, float]
 Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "room"]

@@ -12,11 +12,12 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
+from arraygeom.atomic import write_atomically
 from arraygeom.rig import Rig
 
-from ..images import write_atomically, write_image
+from ..media.images import write_image
 from .blender import RenderSettings, Worker
-from .pictures import coded, light
+from .image_files import coded, light
 from .rendered import Frame, Rendered
 from .scene import Scene
 

@@ -107,7 +107,7 @@ class Stage(LayeredScenes):
 def _textures(photos: Path | None, seed: int) -> PhotoBank:
     if photos is not None:
         return PhotoBank.load(photos, seed=seed)
-    from pat.synthesis.sample import photographs
+    from pat.data.make_sample import photographs
 
     pictures = photographs()
     return PhotoBank(pictures + patterns(np.random.default_rng(seed), 10), photos=len(pictures))

@@ -23,21 +23,23 @@ from tifffile import imread
 from torch import Generator, Tensor
 
 from arraygeom import Rig
+from arraygeom.atomic import write_atomically, write_text
 from arraygeom.io.native import write as rig_text
-from pat.classical import classical_band_calibrated
-from pat.demo import classical
-from pat.develop import as_bright, read_views, to_linear
-from pat.fuse import FusedFrame, fuse
-from pat.hdr import merged, usable_range
-from pat.images import luminance, read_image, to_luma_chroma, write_atomically, write_image, write_text
-from pat.memory import watch_peak
-from pat.metrics import score
-from pat.model import FusionNetwork
-from pat.results import colour_depth, save_frame, save_panels, view_of
+from pat.evaluation.baseline import classical, classical_band_calibrated
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.fusion.results import FusedFrame, colour_depth, save_frame, save_panels, view_of
+from pat.fusion.sequence import PictureFiles, SequenceFusion, flicker
+from pat.fusion.views import read_views
+from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
+from pat.media.images import read_image, write_image
+from pat.media.raw import as_bright
+from pat.media.video import write_video
+from pat.networks.protocol import FusionNetwork
+from pat.networks.weights import load_weights
 from pat.sensors import Coded
-from pat.sequence import PictureFiles, SequenceFusion, flicker
-from pat.video import write_video
-from pat.weights import load_weights
+from pat.support.memory import watch_peak
+from pat.systems.hdr import merged, usable_range
 
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
 
@@ -222,7 +224,7 @@ def _still(
             *_ranges(rig, recording, images, frame, merged_frame, alpha),
             *_permuted(load_weights(how.weights), read, images, alpha, frame),
         ]
-        write_image(out / "merged.tif", to_linear(merged_frame.image.clamp(min=0)), bits=32)
+        write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
     white = 1.0 if not recording.light else float(truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
     panels |= {"truth": truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
@@ -348,10 +350,10 @@ def _ranges(
 ) -> list[str]:
     """A table of the range of light that each picture tells right to a quarter."""
     lines = ["", "| light told right to a quarter | darkest | brightest | stops |", "| --- | ---: | ---: | ---: |"]
-    told = {name: (to_linear(images[name])[0], recording.light[name][0]) for name in rig.names}
-    truth = to_linear(recording.truth[0])
+    told = {name: (linear_from_srgb(images[name])[0], recording.light[name][0]) for name in rig.names}
+    truth = linear_from_srgb(recording.truth[0])
     for name, picture in {"fusion": frame.image, "fusion, exposures merged": joint.image}.items():
-        told[name] = (luminance(to_linear(picture.clamp(min=0)))[0], luminance(truth)[0])
+        told[name] = (luminance(linear_from_srgb(picture.clamp(min=0)))[0], luminance(truth)[0])
     for name, (value, light) in told.items():
         found = usable_range([value], [light])
         lines.append(f"| {name} | {found.low:.4f} | {found.high:.3f} | {found.stops:.1f} |")

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
-from pat.images import write_atomically
-from pat.weights import misfit
+from arraygeom.atomic import write_atomically
+from pat.networks.weights import misfit
 
 FORMAT = "pat-checkpoint 1"
 KEPT = 2

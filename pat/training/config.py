@@ -11,13 +11,13 @@ from typing import Any, Literal
 import tyro
 import yaml
 
-from pat.bandwise import BandwisePATConfig
-from pat.guided import GuidedPATConfig
-from pat.images import write_text
-from pat.model import PATConfig
-from pat.synthesis.document import from_document, near, to_document
+from arraygeom.atomic import write_text
+from pat.networks.bandwise import BandwisePATConfig
+from pat.networks.guided import GuidedPATConfig
+from pat.networks.paper import PATConfig
+from pat.networks.weights import NETWORKS
+from pat.support.schema import from_document, near, to_document
 from pat.synthesis.rigs import RigDistribution
-from pat.weights import NETWORKS
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))

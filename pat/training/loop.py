@@ -18,9 +18,9 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils._pytree import tree_map
 
 from arraygeom import ReceptiveField
-from pat.images import write_atomically
-from pat.model import AttentionEngine
-from pat.weights import NETWORKS, Network, load_weights, save_weights
+from arraygeom.atomic import write_atomically
+from pat.networks.paper import AttentionEngine
+from pat.networks.weights import NETWORKS, Network, load_weights, save_weights
 
 from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
 from .config import TrainConfig, config_text, difference, parse_config, save_config

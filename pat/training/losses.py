@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
-from pat.bandwise import BandwisePAT
-from pat.guided import GuidedPAT, Seen
-from pat.model import Fused
-from pat.weights import Network
+from pat.networks.bandwise import BandwisePAT
+from pat.networks.guided import GuidedPAT, Seen
+from pat.networks.protocol import Fused
+from pat.networks.weights import Network
 
 from .samples import Sample
 

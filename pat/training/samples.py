@@ -39,8 +39,8 @@ from arraygeom import (
 )
 from arraygeom.fields import pinhole_track
 from arraygeom.sampling import Sampled
-from pat.images import luminance
-from pat.model import Look
+from pat.media.colour import luminance
+from pat.networks.protocol import Look
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank

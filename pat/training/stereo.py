@@ -20,7 +20,7 @@ from arraygeom.pixels import HW
 from arraygeom.pose import Pose
 from pat.data.pairs import PairFiles, pair_files
 from pat.data.patches import reduced
-from pat.images import read_image
+from pat.media.images import read_image
 from pat.synthesis.layered import ArrayBatch
 
 from .scenes import HELD, Crops, below, chosen, in_hand, one_of

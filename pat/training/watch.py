@@ -14,7 +14,8 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
-from pat.images import write_image, write_text
+from arraygeom.atomic import write_text
+from pat.media.images import write_image
 
 from .config import TrainConfig
 from .losses import explained

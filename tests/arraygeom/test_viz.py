@@ -5,19 +5,7 @@ import pytest
 import torch
 from matplotlib.figure import Figure
 
-from arraygeom import (
-    Distortion,
-    Epipolar,
-    HomographyDisplacement,
-    Link,
-    Local,
-    Rig,
-    Segments,
-    View,
-    Widened,
-    look,
-    viz,
-)
+from arraygeom import Distortion, Epipolar, HomographyDisplacement, Link, Local, Rig, Segments, View, Widened, look, viz
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 
 X = torch.tensor([[20.0, 20.0], [40.0, 30.0], [30.0, 25.0]], dtype=torch.float64)

@@ -26,9 +26,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
+from arraygeom.atomic import write_text
 from arraygeom.segments import Segments
 from pat.attention import attend
-from pat.images import write_text
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 REPEATS, ENOUGH = 9, 6.0

@@ -17,12 +17,12 @@ from typing import NamedTuple
 import numpy as np
 
 from arraygeom import Camera, Rig
+from arraygeom.atomic import write_text
 from arraygeom.io import read_rig
-from arraygeom.io.whole import write_text
-from calib.boards import parse_board
-from calib.bundle import adjust
-from calib.calibrate import Calibration, calibrate, epipolar_errors, fit_alone
-from calib.collect import collect_folder
+from calib.boards.bundle import adjust
+from calib.boards.calibrate import Calibration, calibrate, epipolar_errors, fit_alone
+from calib.boards.collect import collect_folder
+from calib.boards.target import parse_board
 from tests.calib.boards_seen import errors_of, pose_errors
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import (

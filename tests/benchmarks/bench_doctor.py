@@ -23,14 +23,10 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Distortion, Pose, Rig, pixel_grid, sample
-from arraygeom.io.whole import write_text
-from calib.doctor import Diagnosis, diagnose_matches
-from calib.matches import match_cameras, seen_depths
-from calib.mistakes import (
-    TRANSPOSE,
-    TURNS,
-    on_cameras,
-)
+from arraygeom.atomic import write_text
+from calib.images.doctor import Diagnosis, diagnose_matches
+from calib.images.matches import match_cameras, seen_depths
+from calib.images.mistakes import TRANSPOSE, TURNS, on_cameras
 from tests.calib.real import RealPair, every_pair
 
 Images = dict[str, Tensor]

@@ -18,18 +18,19 @@ import time
 from pathlib import Path
 from statistics import median
 
+import pat.fusion.fuse
 import torch
 from torch.nn.functional import interpolate
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-import pat.fuse
 from arraygeom import Rig
-from pat.fuse import fuse
-from pat.images import read_image, write_text
+from arraygeom.atomic import write_text
+from pat.fusion.fuse import fuse
+from pat.fusion.tiles import survey_tiles, surveyed
+from pat.media.images import read_image
+from pat.networks.weights import load_weights
 from pat.systems import load_system, run_system
-from pat.tiles import survey_tiles, surveyed
-from pat.weights import load_weights
 
 SIDE = 2048
 CAPS = ("4GiB", "8GiB", "2GiB")
@@ -67,22 +68,22 @@ def measure(scale: float) -> dict[str, str]:
     hw = array["narrow"].hw
     images = {"narrow": picture(1, hw, 0), "wide": picture(3, array["wide"].hw, 1)}
     own = images["narrow"][None]
-    beta = pat.fuse._prepare(network, array.pair("narrow", "wide"), images["wide"][None], None, None, "wide")
+    beta = pat.fusion.fuse._prepare(network, array.pair("narrow", "wide"), images["wide"][None], None, None, "wide")
     small = rig(0.1)
     fuse(network, small, {n: picture(i.shape[0], small[n].hw, 2) for n, i in images.items()}, alpha="narrow")
     begin = time.perf_counter()
     beta = surveyed(network, own, beta, survey_tiles(network, hw))
     surveying = time.perf_counter() - begin
-    whole = pat.fuse.Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
+    whole = pat.fusion.fuse.Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
     begin = time.perf_counter()
-    pat.fuse._fuse_tile(network, own, [beta], whole)
+    pat.fusion.fuse._fuse_tile(network, own, [beta], whole)
     fusing = time.perf_counter() - begin
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
-        pat.fuse._fuse_tile(network, own, [beta], whole)
+        pat.fusion.fuse._fuse_tile(network, own, [beta], whole)
     own_times = {event.key: event.self_cpu_time_total / 1e6 for event in profiled.key_averages()}
     convolving = sum(t for name, t in own_times.items() if "conv" in name)
     with FlopCounterMode(display=False) as counter:
-        pat.fuse._fuse_tile(network, own, [beta], whole)
+        pat.fusion.fuse._fuse_tile(network, own, [beta], whole)
     flops = sum(n for operation, n in counter.get_flop_counts()["Global"].items() if "conv" in str(operation))
     rate = matmul_rate()
     return {

@@ -25,8 +25,8 @@ import psutil
 from torch.nn.functional import interpolate
 
 from arraygeom import Rig
-from pat.demo import SAMPLE
-from pat.images import read_image, write_image
+from pat.data.sample_array import SAMPLE
+from pat.media.images import read_image, write_image
 
 ROOT = Path(__file__).parents[2]
 

@@ -23,13 +23,13 @@ from unittest.mock import patch
 import torch
 import tyro
 
-from pat.images import write_text
+from arraygeom.atomic import write_text
+from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
 from pat.training.samples import FIELDS, Sample, Source, photographs
-from pat.weights import load_weights
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 

@@ -21,19 +21,19 @@ import torch
 from torch import Tensor
 
 from arraygeom import Link, Rig, View
-from arraygeom.io.whole import write_text
+from arraygeom.atomic import write_text
 from arraygeom.pixels import coarse_grid
-from calib.matches import Matches, fit_fundamental, line_distance, match_cameras
-from calib.refine import FREE, Agreement, Fit, agreement, line_distances, polish, refine, refine_matches, split
-from calib.start import start
-from pat.ablate import Case, rendered_cases
+from calib.images.from_images import start
+from calib.images.matches import Matches, fit_fundamental, line_distance, match_cameras
+from calib.images.refine import FREE, Agreement, Fit, agreement, line_distances, polish, refine, refine_matches, split
 from pat.attention import attend_with_statistics
-from pat.demo import load_sample
-from pat.fuse import fuse
-from pat.images import read_image
-from pat.metrics import score
-from pat.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
-from pat.weights import load_weights
+from pat.data.sample_array import load_sample
+from pat.evaluation.ablation import Case, rendered_cases
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.media.images import read_image
+from pat.networks.weights import load_weights
+from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from tests.calib.real import bumblebee, syntim
 
 TURN, MOVE = math.radians(0.3), 5.0

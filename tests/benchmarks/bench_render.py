@@ -22,11 +22,11 @@ import torch
 import yaml
 
 from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom.atomic import write_text
 from pat.farm.folders import JobFolder
 from pat.farm.job import RenderConfig
 from pat.farm.run import render
 from pat.farm.worker import FACTS
-from pat.images import write_text
 from pat.synthesis.blender import RenderSettings
 from pat.synthesis.blender import render as render_scene
 from pat.synthesis.generators import abstract

@@ -16,15 +16,15 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from pat.ablate import ALPHA, BETA, Case, layered_cases
-from pat.demo import classical
-from pat.fuse import fuse
-from pat.images import write_text
-from pat.metrics import bootstrap_interval, score
-from pat.model import FusionNetwork
+from arraygeom.atomic import write_text
+from pat.evaluation.ablation import ALPHA, BETA, Case, layered_cases
+from pat.evaluation.baseline import classical
+from pat.evaluation.metrics import bootstrap_interval, score
+from pat.fusion.fuse import fuse
+from pat.networks.protocol import FusionNetwork
+from pat.networks.weights import load_weights
 from pat.synthesis.rigs import RigDistribution
 from pat.training.config import load_config
-from pat.weights import load_weights
 
 SINGLE = load_config("mono-colour-single-rig").rectified_rigs
 GENERAL = replace(SINGLE, mode="general", focal_ratio=(1.0, 1.0), rotation=0.0, toe_in=(0.0, 0.0), decentring=0.0)

@@ -18,11 +18,12 @@ import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig
-from pat.demo import classical
-from pat.fuse import fuse
-from pat.images import luminance
-from pat.metrics import score
-from pat.model import FusionNetwork
+from pat.evaluation.baseline import classical
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.media.colour import luminance
+from pat.networks.protocol import FusionNetwork
+from pat.networks.weights import load_weights
 from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.rigs import RigDistribution
@@ -30,7 +31,6 @@ from pat.systems.system import classical_baseline
 from pat.training.config import TrainConfig
 from pat.training.samples import photographs
 from pat.training.spectra import Spectra
-from pat.weights import load_weights
 
 HW = (240, 320)
 RIGS = RigDistribution(mode="rectified", parallax=(10.0, 60.0), resolutions=(0.5,))

@@ -11,8 +11,8 @@ import time
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from pat.evaluate import rectified_fusion
-from pat.weights import SHIPPED, load_weights
+from pat.evaluation.stereo import rectified_fusion
+from pat.networks.weights import SHIPPED, load_weights
 
 HW = (384, 448)
 REPEATS = 5

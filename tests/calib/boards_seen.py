@@ -4,10 +4,10 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards import Board, parse_board
-from calib.bundle import BoardPoses, Observations, Scene, parameter_names
-from calib.detect import Detection
-from calib.intrinsics import Views
+from calib.boards.bundle import BoardPoses, Observations, Scene, parameter_names
+from calib.boards.detect import Detection
+from calib.boards.intrinsics import Views
+from calib.boards.target import Board, parse_board
 
 BOARD = parse_board("charuco:9x7:60mm")
 

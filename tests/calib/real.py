@@ -13,7 +13,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.io import read_rig
-from pat.images import read_image
+from pat.media.images import read_image
 
 SYNTIM = ("Color", "Serfaty", "Poly", "BatInria", "BatSynt", "Billet", "Cube", "Jallut", "LaMire", "Money", "Sigraph")
 SYNTIM += ("TableSTV", "Tordu", "Aout", "BalMouss", "SmRub", "CubeR", "Lego")

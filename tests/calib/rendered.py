@@ -79,7 +79,7 @@ def photograph(out: Path, *, count: int = POSES, samples: int = 8) -> None:
     from pat.synthesis.blender import RenderSettings
     from pat.synthesis.blender.client import render
     from pat.synthesis.generators import board
-    from pat.synthesis.pictures import light, write_light
+    from pat.synthesis.image_files import light, write_light
 
     cameras = rig()
     slow = {name: c.replace(sensor=Sensor(frame_rate=1.0)) for name, c in cameras.cameras.items()}

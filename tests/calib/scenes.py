@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.matches import Matches
+from calib.images.matches import Matches
 
 HW = (240, 320)
 

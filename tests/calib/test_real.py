@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from calib.boards import parse_board
-from calib.calibrate import calibrate
-from calib.collect import collect_folder
-from calib.doctor import diagnose, diagnose_matches
-from calib.matches import match_cameras
-from calib.refine import refine_matches
+from calib.boards.calibrate import calibrate
+from calib.boards.collect import collect_folder
+from calib.boards.target import parse_board
+from calib.images.doctor import diagnose, diagnose_matches
+from calib.images.matches import match_cameras
+from calib.images.refine import refine_matches
 from tests.benchmarks.bench_doctor import MISTAKES
 from tests.benchmarks.bench_refine import worse
 from tests.calib.boards_seen import errors_of, pose_errors

@@ -13,9 +13,9 @@ import torch
 
 from arraygeom import Rig, triangulate
 from arraygeom.io import read_rig
-from calib.bundle import FreePoints, Observations, Scene, parameter_names
-from calib.detect import Detection
-from calib.intrinsics import Views
+from calib.boards.bundle import FreePoints, Observations, Scene, parameter_names
+from calib.boards.detect import Detection
+from calib.boards.intrinsics import Views
 
 CALISCOPE_BOARD = "charuco:4x5:54mm"
 CALISCOPE_RMS, FIFTEEN_RMS = 1.6625, 0.8070

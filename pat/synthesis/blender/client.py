@@ -14,7 +14,7 @@ from types import TracebackType
 from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
-from ..document import to_document
+from ...support.schema import to_document
 from ..rendered import Rendered
 from ..scene import Scene
 from .lens import lens_for

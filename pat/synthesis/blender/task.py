@@ -23,8 +23,8 @@ from torch import Tensor
 from arraygeom.camera import Camera, View
 from arraygeom.rig import Rig
 
+from ...support.schema import to_document
 from ..check import check_views
-from ..document import to_document
 from ..flow import flow
 from ..rendered import RENDER_FILE, Frame, Rendered, frame_file, save_frame
 from ..scene import Scene

@@ -16,7 +16,7 @@ import torch
 
 from arraygeom.rig import Rig
 
-from ..document import from_document
+from ...support.schema import from_document
 from ..scene import Scene
 from .settings import RenderSettings
 from .task import render_here

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from arraygeom import Band
-from pat.develop import light_of
-from pat.images import luminance
+from pat.media.colour import luminance
+from pat.media.raw import light_of
 from pat.sensors import Clip, Linear, Noise, Spectral, record
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded

@@ -1,6 +1,6 @@
 """High frame rate - low frame rate: a fast mono alpha, three slow cameras behind filters, and an object that moves.
 
-No two clocks agree. Every frame of alpha gets colour from the slow frames nearest in time (`pat.sequence`).
+No two clocks agree. Every frame of alpha gets colour from the slow frames nearest in time (`pat.fusion.sequence`).
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pat.images import luminance
+from pat.media.colour import luminance
 from pat.sensors import Clip, Linear, Noise, record
 from pat.systems.exposures import banded
 from pat.systems.stage import Stage

@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, Sensor
-from pat.demo import luminance_of
-from pat.fuse import FusedFrame
-from pat.images import read_image, write_text
-from pat.results import save_frame, save_panels
+from arraygeom.atomic import write_text
+from pat.fusion.results import FusedFrame, save_frame, save_panels
+from pat.fusion.sequence import SequenceFusion, flicker
+from pat.media.colour import luminance_of
+from pat.media.images import read_image
+from pat.media.video import write_video
+from pat.networks.weights import load_weights
 from pat.sensors import Clip, Coded, Exposure, record
-from pat.sequence import SequenceFusion, flicker
-from pat.showcase import FAST, SCENE, SLOW, Array, fast_and_slow_array
+from pat.systems.showcase import FAST, SCENE, SLOW, Array, fast_and_slow_array
 from pat.systems.system import Result
-from pat.video import write_video
-from pat.weights import load_weights
 
 FAST_FRAMES, SLOW_FRAMES = range(141, 148), (4, 5)
 RATES = {FAST: 227.0, **dict.fromkeys(SLOW, 30.0)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import torch
 
-from pat.images import from_luma_chroma, to_luma_chroma
+from pat.media.colour import from_luma_chroma, to_luma_chroma
 from pat.sensors import Clip, Linear, Noise, record
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded

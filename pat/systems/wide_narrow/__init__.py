@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from arraygeom import Rig
-from pat.images import luminance
+from pat.media.colour import luminance
 from pat.sensors import Clip, GaussianBlur, Linear, Noise, record
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded, mosaic

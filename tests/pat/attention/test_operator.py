@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import operator
+from pat.attention import torch_op as operator
 
 Q, K, V = torch.zeros(1, 4, 2, 3), torch.zeros(1, 4, 5, 6), torch.zeros(1, 2, 5, 6)
 

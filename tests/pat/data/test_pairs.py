@@ -3,7 +3,7 @@ import pytest
 import torch
 
 from pat.data import flickr_pairs, folder_pairs, kitti_pairs, middlebury_pairs, syntim_pairs
-from pat.images import write_image
+from pat.media.images import write_image
 
 READERS = [middlebury_pairs, kitti_pairs, flickr_pairs, folder_pairs, syntim_pairs]
 

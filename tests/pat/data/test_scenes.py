@@ -10,7 +10,7 @@ from torch.utils.data import DataLoader
 from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
 from arraygeom.distortion import Distortion
 from arraygeom.fields import look
-from pat.cli import main
+from pat.cli.main import main
 from pat.data import (
     Patches,
     RenderedScenes,
@@ -26,7 +26,7 @@ from pat.data import (
 from pat.data.patches import cut, reduced_depth, select
 from pat.data.scenes import _bounds
 from pat.farm.backends import LayeredSettings
-from pat.images import read_image
+from pat.media.images import read_image
 from pat.sensors import BoxBlur, Case, Clip, Resample
 from pat.synthesis.check import Limits, look_across
 

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from arraygeom import Epipolar
-from pat.demo import SAMPLE, load_sample
+from pat.data.sample_array import SAMPLE, load_sample
 
 pytest.importorskip("panel", reason="the extra 'explore' is not installed")
 webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
@@ -30,7 +30,7 @@ const titled = (title) => { for (const m of doc._all_models.values()) if (m.titl
 
 @pytest.fixture(scope="module")
 def page():
-    command = [sys.executable, "-c", "from pat.cli import main; main()", "explore", str(SAMPLE / "rig.yaml")]
+    command = [sys.executable, "-c", "from pat.cli.main import main; main()", "explore", str(SAMPLE / "rig.yaml")]
     pictures = [a for n in ("mono", "colour") for a in ("--image", f"{n}={SAMPLE / n}.png")]
     server = subprocess.Popen(
         [*command, *pictures, "--no-browser"], cwd=Path(__file__).parents[3], stdout=subprocess.PIPE, text=True

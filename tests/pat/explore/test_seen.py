@@ -9,7 +9,7 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Curved, Distortion, Epipolar, HomographyDisplacement, Link, Rig, View, depth_of
 from pat.attention import attend_with_statistics
-from pat.demo import load_sample
+from pat.data.sample_array import load_sample
 from pat.explore import FAMILIES, Scene, State, look_at
 from pat.explore import seen as core
 

@@ -82,7 +82,7 @@ def killed_again_and_again(config: Path, out: Path, *, scenes: int, kills: int, 
 
 
 def _command(config: Path, out: Path, scenes: int) -> list[str]:
-    run = [sys.executable, "-c", "from pat.cli import main; main()", "render", str(config), "--out", str(out)]
+    run = [sys.executable, "-c", "from pat.cli.main import main; main()", "render", str(config), "--out", str(out)]
     return [*run, "--scenes", str(scenes), "--workers", "2"]
 
 

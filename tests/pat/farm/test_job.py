@@ -14,7 +14,7 @@ import yaml
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.distortion import Distortion
-from pat.cli import main
+from pat.cli.main import main
 from pat.farm.backends import rig_from_alpha
 from pat.farm.folders import JobFolder, Shard
 from pat.farm.job import Job, RenderConfig
@@ -52,7 +52,7 @@ def write(path: Path, **changes) -> None:
 def test_a_job_is_rendered_killed_and_resumed(config, tmp_path, capfd):
     """The first run loses a worker and then its parent; the second makes the rest."""
     out = tmp_path / "data"
-    command = [sys.executable, "-c", "from pat.cli import main; main()", "render", str(config), "--out", str(out)]
+    command = [sys.executable, "-c", "from pat.cli.main import main; main()", "render", str(config), "--out", str(out)]
     with kills.killed_in_the_end([*command, "--scenes", "40"]) as parent:
         kills.wait_until(lambda: len(JobFolder(out).done()) >= 2)
         os.kill(children(parent.pid)[0], signal.SIGKILL)

@@ -5,16 +5,7 @@ import torch
 
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pose import Pose
-from pat.sensors import (
-    Defocus,
-    DiscBlur,
-    GaussianBlur,
-    MotionBlur,
-    Resample,
-    Vignetting,
-    circle_of_confusion,
-    record,
-)
+from pat.sensors import Defocus, DiscBlur, GaussianBlur, MotionBlur, Resample, Vignetting, circle_of_confusion, record
 
 HW = (61, 81)
 LENS, F_NUMBER = 50.0, 2.0

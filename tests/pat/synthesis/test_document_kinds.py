@@ -5,7 +5,7 @@ from typing import Literal
 
 import pytest
 
-from pat.synthesis.document import from_document, read_yaml, to_document
+from pat.support.schema import from_document, read_yaml, to_document
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ import torch
 
 from arraygeom.camera import Camera, View, intrinsics
 from arraygeom.rig import Rig
-from pat.images import write_image
+from pat.media.images import write_image
 from pat.synthesis.boards import PIXELS, draw_board, inner_corners, opencv_board
 from pat.synthesis.furnish import Setting
 from pat.synthesis.generators import GENERATORS, abstract, board, photographs, random_board_poses

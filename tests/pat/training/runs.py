@@ -6,9 +6,9 @@ from pathlib import Path
 import torch
 from torch import Generator
 
-from pat.guided import GuidedPATConfig
-from pat.images import write_image
-from pat.train import TrainConfig
+from pat.media.images import write_image
+from pat.networks.guided import GuidedPATConfig
+from pat.training.train import TrainConfig
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
 

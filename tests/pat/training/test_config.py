@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pat.guided import GuidedPATConfig
-from pat.model import PATConfig
+from pat.networks.guided import GuidedPATConfig
+from pat.networks.paper import PATConfig
 from pat.training.config import (
     TrainConfig,
     command_line,

@@ -14,15 +14,15 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from pat.model import PATConfig
-from pat.train import save_config, train
+from pat.networks.paper import PATConfig
+from pat.networks.weights import load_weights, save_weights
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
 from pat.training.loop import new_network, shape
 from pat.training.losses import validation
 from pat.training.processes import Process
 from pat.training.samples import scenes
-from pat.weights import load_weights, save_weights
+from pat.training.train import save_config, train
 
 from .runs import SMALL, losses, short_run
 

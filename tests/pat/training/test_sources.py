@@ -18,15 +18,15 @@ from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
 from arraygeom.undistortion import retaken
 from pat.farm.backends import LayeredSettings
-from pat.images import luminance, write_image
-from pat.model import PATConfig
+from pat.media.colour import luminance
+from pat.media.images import write_image
+from pat.networks.paper import PATConfig
 from pat.synthesis.check import Limits
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
 from pat.synthesis.rigs import RigDistribution
-from pat.train import save_config, train
 from pat.training.config import Recording, TrainConfig, parse_config
 from pat.training.lenses import lens_over, one_camera, through_lenses
 from pat.training.loop import new_network
@@ -34,6 +34,7 @@ from pat.training.losses import explained, match_loss, validation
 from pat.training.samples import degraded, pair_of, plan, scenes, truth_in
 from pat.training.scenes import HELD, SKY, TURN, RenderedCrops, View, batched, in_hand, read_view, window
 from pat.training.stereo import PairCrops
+from pat.training.train import save_config, train
 
 from .runs import losses, short_run
 from .test_loop import command, one_thread, stopped  # noqa: F401

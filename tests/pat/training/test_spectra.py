@@ -6,8 +6,8 @@ import torch
 from torch import Generator
 
 from arraygeom import sample
-from pat.bandwise import BandwisePATConfig
-from pat.images import luminance
+from pat.media.colour import luminance
+from pat.networks.bandwise import BandwisePATConfig
 from pat.training.loop import new_network
 from pat.training.losses import Objective
 from pat.training.samples import scenes

@@ -15,11 +15,11 @@ from arraygeom.pixels import pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.sensor import Sensor
-from pat.images import read_image
+from pat.media.images import read_image
 from pat.synthesis.blender import Optics, RenderSettings
 from pat.synthesis.boards import inner_corners
 from pat.synthesis.generators import abstract, board, photographs
-from pat.synthesis.pictures import export
+from pat.synthesis.image_files import export
 from pat.synthesis.rendered import is_rendered
 from pat.synthesis.scene import Board, Key, Light, Material, Motion, Object, Paint, Scene, Texture
 from pat.synthesis.shapes import inside

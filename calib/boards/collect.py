@@ -1,0 +1,113 @@
+"""Looking for the board in all pictures, and saying where it was not found and why it may be."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from .detect import Detection, Grey, detect, explain, other_size
+from .intrinsics import Views
+from .photos import FrameKey, Photo, Photos
+from .target import Board
+
+TO_EXPLAIN = 4
+"""So many pictures without a board are looked at again to find out why."""
+NAMED = 6
+"""So many pictures are named in a sentence."""
+
+Progress = Callable[[Iterable[Any], int], Iterable[Any]]
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What each camera saw; the names of its pictures; what was found wrong with some, in sentences."""
+
+    views: dict[str, Views]
+    labels: dict[str, dict[FrameKey, str]]
+    notes: tuple[str, ...]
+
+
+def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -> Collected:
+    """The board's points in all pictures of all cameras.
+
+    Raises ValueError, naming pictures and cause, if a camera's pictures differ in size, if the board is found in
+    none of them, or if they show a board of another size.
+    """
+    jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
+    with ThreadPoolExecutor(2) as pool:
+        results = pool.map(lambda job: _look(job[2], board), jobs)
+        looked = list(progress(results, len(jobs)) if progress else results)
+    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, looked) if n == name] for name in photos}
+    views, notes = {}, []
+    for name, moments in photos.items():
+        sizes = {key: hw for key, (hw, _) in by_camera[name]}
+        _check_sizes(name, moments, sizes)
+        seen = {key: found for key, (_, found) in by_camera[name] if found is not None}
+        _check_board(name, moments, seen, board)
+        views[name] = Views(next(iter(sizes.values())), seen)
+        notes += _missing(name, moments, seen, board)
+    return Collected(views, {n: {k: p.label for k, p in m.items()} for n, m in photos.items()}, tuple(notes))
+
+
+def collect_folder(
+    folder: str | Path, board: Board, *, patterns: Mapping[str, str] | None = None, progress: Progress | None = None
+) -> Collected:
+    """`collect` for the pictures that `find_photos` finds."""
+    from .photos import find_photos
+
+    return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
+
+
+def _look(photo: Photo, board: Board) -> tuple[tuple[int, int], Detection | None]:
+    grey = photo.read()
+    return (grey.shape[0], grey.shape[1]), detect(grey, board)
+
+
+def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]) -> None:
+    counts = Counter(sizes.values())
+    if len(counts) == 1:
+        return
+    shown = [f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts]
+    raise ValueError(
+        f"{name}: its pictures differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
+    )
+
+
+def _check_board(
+    name: str, moments: Mapping[FrameKey, Photo], seen: Mapping[FrameKey, Detection], board: Board
+) -> None:
+    """Raises ValueError if no picture shows the board, or if most of some show a larger one."""
+    if not seen:
+        why = explain(_greys(list(moments.values())), board)
+        labels = _named([p.label for p in moments.values()], NAMED)
+        raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} pictures ({labels}): {why}")
+    if other := other_size(_greys([moments[key] for key in seen]), board):
+        raise ValueError(
+            f"{name}: the pictures show a chessboard with {other} inner corners and the board given is {board}: "
+            "count the corners between squares, not the squares"
+        )
+
+
+def _missing(
+    name: str, moments: Mapping[FrameKey, Photo], seen: Mapping[FrameKey, Detection], board: Board
+) -> list[str]:
+    missing = [photo for key, photo in moments.items() if key not in seen]
+    if not missing:
+        return []
+    labels = _named([p.label for p in missing], NAMED)
+    return [
+        f"{name}: no board in {len(missing)} of {len(moments)} pictures ({labels}): {explain(_greys(missing), board)}"
+    ]
+
+
+def _greys(photos: list[Photo]) -> Iterable[Grey]:
+    step = max(1, len(photos) // TO_EXPLAIN)
+    return (photo.read() for photo in photos[::step][:TO_EXPLAIN])
+
+
+def _named(labels: list[str], most: int) -> str:
+    return ", ".join(labels[:most]) + (f" and {len(labels) - most} more" if len(labels) > most else "")

@@ -1,0 +1,104 @@
+"""How well the numbers of a rig are known: their covariance, in a file beside the rig's, and what follows from it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from arraygeom import Camera, Rig
+from arraygeom.atomic import write_text
+
+from .bundle import camera_jacobian, parameter_names
+
+FORMAT = "arraygeom-covariance 1"
+
+
+@dataclass(frozen=True)
+class RigCovariance:
+    """The covariance of some numbers of a rig; all others are exactly as they are (fixed, or the world's own).
+
+    names: parameters as `Rig.parameters` names them and which of their numbers, "left.rotation.0", "left.focal.1":
+    rotation vectors in radians about the camera's axes, metres, pixels, coefficients of lenses.
+    """
+
+    names: tuple[str, ...]
+    matrix: Float[np.ndarray, "c c"]
+
+    def deviation(self, name: str) -> float:
+        """The standard deviation of one number; 0 for one that is not among them."""
+        if name not in self.names:
+            return 0.0
+        i = self.names.index(name)
+        return float(np.sqrt(self.matrix[i, i]))
+
+    def of(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
+        """Which of these numbers each of a camera's is: a selection, in the order of `parameter_names`."""
+        selection = np.zeros((len(parameter_names(camera)), len(self.names)))
+        index = {known: i for i, known in enumerate(self.names)}
+        for row, entry in enumerate(parameter_names(camera)):
+            if (column := index.get(f"{name}.{entry}")) is not None:
+                selection[row, column] = 1.0
+        return selection
+
+    def save(self, path: str | Path) -> None:
+        """Write it as JSON, whole or not at all."""
+        document = {"format": FORMAT, "names": list(self.names), "covariance": self.matrix.tolist()}
+        write_text(path, json.dumps(document))
+
+    @classmethod
+    def load(cls, path: str | Path) -> RigCovariance:
+        """Read what `save` wrote. Raises FileNotFoundError, or ValueError for another file."""
+        path = Path(path)
+        if not path.is_file():
+            raise FileNotFoundError(f"{path}: no such covariance file")
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+            names, matrix = tuple(document["names"]), np.array(document["covariance"], dtype=np.float64)
+        except (ValueError, KeyError, TypeError):
+            raise ValueError(f"{path}: is not a covariance file of this program") from None
+        if matrix.shape != (len(names), len(names)):
+            raise ValueError(f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file whole?")
+        return cls(names, matrix)
+
+
+def beta_covariance(
+    rig: Rig, covariance: RigCovariance, alpha: str, beta: str, x: Float[np.ndarray, "n 2"], depth: float
+) -> Float[np.ndarray, "n 2 2"]:
+    """The covariance, in pixels^2 of beta, of where the rig says that alpha's pixels at a depth (metres) are seen.
+
+    To first order: the point moves in alpha's plane of that depth so that alpha's pixel stays what it is.
+    NaN where alpha's lens has no ray or beta does not see the point.
+    """
+    a, b = rig.pair(alpha, beta).cameras
+    X = a.unproject(torch.from_numpy(x), torch.full((len(x),), depth, dtype=torch.float64))
+    usable = (X.isfinite().all(-1) & b.project(X.nan_to_num(1.0)).valid).numpy()
+    found = np.full((len(x), 2, 2), np.nan)
+    if usable.any():
+        J_a, J_b = (camera_jacobian(camera, X.numpy()[usable]) for camera in (a, b))
+        across = J_b[..., 3:6] @ (b.R @ a.R.T).numpy()[:, :2]
+        change = J_b @ covariance.of(beta, b) - across @ np.linalg.solve(J_a[..., 3:5], J_a @ covariance.of(alpha, a))
+        found[usable] = change @ covariance.matrix @ change.swapaxes(-1, -2)
+    return found
+
+
+def centre_covariance(camera: Camera, name: str, covariance: RigCovariance) -> Float[np.ndarray, "3 3"]:
+    """Of a camera's optical centre in the world, m^2."""
+    t = camera.t.numpy()
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    by_pose = -camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1)
+    change = by_pose @ covariance.of(name, camera)[:6]
+    return change @ covariance.matrix @ change.T
+
+
+def baseline_deviation(rig: Mapping[str, Camera], name: str, covariance: RigCovariance) -> float:
+    """The standard deviation of the distance between a camera and the world's origin, metres."""
+    camera = rig[name]
+    centre = camera.centre.numpy()
+    direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
+    return float(np.sqrt(direction @ centre_covariance(camera, name, covariance) @ direction))

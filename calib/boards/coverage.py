@@ -1,0 +1,82 @@
+"""Which part of each picture, which depths and which tilts the boards covered, and what is missing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int
+
+from arraygeom import Pose
+
+from .intrinsics import Views
+from .photos import FrameKey
+from .target import Board
+
+CELLS = 6, 8
+"""The picture is divided into so many rows and columns."""
+WIDE_ENOUGH = 0.6
+DEEP_ENOUGH = 1.5
+TILTED_ENOUGH = 20.0
+PLACES = ("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right")
+
+
+class Coverage(NamedTuple):
+    """What one camera's boards covered.
+
+    cells: points in each cell of the picture. depths: (nearest, furthest) point, metres. tilts: (least, most)
+    angle between the board's normal and the optical axis, degrees. missing: sentences on what is lacking.
+    """
+
+    cells: Int[np.ndarray, "r c"]
+    depths: tuple[float, float]
+    tilts: tuple[float, float]
+    missing: tuple[str, ...]
+
+    @property
+    def share(self) -> float:
+        """The share of cells with a point."""
+        return float((self.cells > 0).mean())
+
+
+def coverage(views: Views, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
+    """What a camera's boards covered, from their poses in it."""
+    h, w = views.hw
+    x = np.concatenate([d.x for d in views.seen.values()])
+    rows, columns = CELLS
+    cells, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=(rows, columns), range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
+    depths = np.concatenate(
+        [
+            (board.points[d.ids] @ p.R[2].numpy()) + float(p.t[2])
+            for d, p in ((d, cam_from_board[k]) for k, d in views.seen.items())
+        ]
+    )
+    tilts = np.degrees([np.arccos(min(1.0, abs(float(cam_from_board[k].R[2, 2])))) for k in views.seen])
+    found = Coverage(
+        cells.astype(np.int64), (float(depths.min()), float(depths.max())), (float(tilts.min()), float(tilts.max())), ()
+    )
+    return found._replace(missing=tuple(_missing(found)))
+
+
+def _missing(found: Coverage) -> list[str]:
+    missing = []
+    thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
+    empty = [
+        PLACES[i][j]
+        for i, band in enumerate(thirds)
+        for j, part in enumerate(np.array_split(band, 3, axis=1))
+        if not part.any()
+    ]
+    if empty:
+        missing.append(f"no points at the {', '.join(empty)} of the picture: the lens is a guess there")
+    elif found.share < WIDE_ENOUGH:
+        missing.append(f"points in only {found.share:.0%} of the picture: fill it, corners too")
+    if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
+        near, far = found.depths
+        missing.append(
+            f"boards at one depth only ({near:.3g} to {far:.3g} m): bring it closer in some, further in others"
+        )
+    if found.tilts[1] < TILTED_ENOUGH:
+        missing.append(f"boards tilted by {found.tilts[1]:.0f} degrees at most: tilt it by 20 to 40")
+    return missing

@@ -1,0 +1,231 @@
+"""Finding a board's points in a picture, to a fraction of a pixel.
+
+OpenCV 4.10 and newer, and 5. Pictures that are dim, flat or inverted (near infrared, narrow bands) are stretched,
+equalised and inverted in turn until the board is found.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Int, UInt8
+
+from .corners import refine_corners
+from .target import Board, Charuco, Chessboard, Circles, marker_dictionary
+
+Grey = UInt8[np.ndarray, "h w"]
+
+FEWEST = 8
+"""Fewer points of a board than this in a picture are not used: a pose needs 4, a check of it more."""
+ENOUGH = 0.6
+"""If less than this share of a board's corners look like corners, the picture is not fit for fitting them."""
+CROOKED = 0.35
+"""A board is refused if its points are this far (of their spacing) from a smoothly bent grid: a false detection."""
+SMALL = 640
+"""Pictures are reduced to this width when they are only asked which board they show."""
+OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
+
+
+class Detection(NamedTuple):
+    """The points of a board seen in one picture: their numbers on the board and their pixels."""
+
+    ids: Int[np.ndarray, " n"]
+    x: Float[np.ndarray, "n 2"]
+
+
+def detect(grey: Grey, board: Board) -> Detection | None:
+    """The board's points in a grey picture (uint8), or None if it is not found."""
+    for candidate in _versions(grey):
+        found = _FINDERS[type(board)](candidate, board)
+        if found is not None and _believable(found, board):
+            refined = _refined(grey, found, board)
+            return refined if _believable(refined, board) else found
+    return None
+
+
+def to_grey(picture: np.ndarray) -> Grey:
+    """A picture (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
+    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
+    low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
+    if grey.dtype == np.uint8 and high - low > 100:
+        return grey
+    scaled = (grey.astype(np.float32) - low) * (255 / max(high - low, 1.0))
+    return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
+
+
+def explain(pictures: Iterable[Grey], board: Board) -> str:
+    """Why a board may not have been found in pictures: the likeliest cause, in words."""
+    reasons = Counter(_reason(grey, board) for grey in pictures)
+    return reasons.most_common(1)[0][0] if reasons else "there are no pictures"
+
+
+def other_size(pictures: Iterable[Grey], board: Board) -> str | None:
+    """The size of the chessboard that pictures show if most of them show another one than `board`, in its words."""
+    if not isinstance(board, Chessboard):
+        return None
+    sizes = Counter(size for grey in pictures if (size := _grid_size(grey)) is not None)
+    if not sizes:
+        return None
+    size, votes = sizes.most_common(1)[0]
+    same = set(size) == {board.columns, board.rows}
+    return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
+
+
+def _versions(grey: Grey) -> Iterator[Grey]:
+    yield grey
+    equalised = cv2.createCLAHE(3.0, (8, 8)).apply(grey)
+    yield equalised
+    yield 255 - grey
+    yield 255 - equalised
+
+
+def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
+    size = board.columns, board.rows
+    flags = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE | cv2.CALIB_CB_FAST_CHECK
+    done, corners = cv2.findChessboardCorners(grey, size, flags=flags)
+    if not done:
+        done, corners = cv2.findChessboardCornersSB(grey, size, flags=cv2.CALIB_CB_NORMALIZE_IMAGE)
+    if not done or len(corners) != len(board.points):
+        return None
+    x = _right_handed(corners.reshape(board.rows, board.columns, 2))
+    return Detection(np.arange(len(x)), x.astype(np.float64))
+
+
+def _right_handed(grid: np.ndarray) -> np.ndarray:
+    """The corners numbered so that x, y and the view into the board are a right-handed frame."""
+    (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
+    return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
+
+
+def _charuco(grey: Grey, board: Charuco) -> Detection | None:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    detector = cv2.aruco.CharucoDetector(board.opencv, cv2.aruco.CharucoParameters(), parameters)
+    corners, ids, _, _ = detector.detectBoard(grey)
+    if ids is None or len(ids) < FEWEST:
+        return None
+    return Detection(ids.reshape(-1).astype(np.int64), corners.reshape(-1, 2).astype(np.float64))
+
+
+def _circles(grey: Grey, board: Circles) -> Detection | None:
+    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
+        done, centres = cv2.findCirclesGrid(grey, (board.columns, board.rows), flags=flags)
+        if done and len(centres) == len(board.points):
+            x = centres.reshape(-1, 2).astype(np.float64)
+            return Detection(np.arange(len(x)), x)
+    return None
+
+
+_FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
+    Chessboard: _chessboard,
+    Charuco: _charuco,
+    Circles: _circles,
+}
+
+
+def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
+    """Corners where they are to a hundredth of a pixel; of boards that may be seen in part, without those that hide.
+
+    Where few look as corners should, as in pictures too small for it, all are taken where gradients say.
+    """
+    if isinstance(board, Circles):
+        return found
+    clear = (1 - board.marker / board.spacing) / 2 if isinstance(board, Charuco) else 0.5
+    x, good = refine_corners(grey, found.x, board.points[found.ids, :2] / board.spacing, clear=clear)
+    if good.mean() < ENOUGH:
+        return Detection(found.ids, _by_gradients(grey, found.x, 0.9 * clear))
+    if isinstance(board, Charuco):
+        return Detection(found.ids[good], x[good])
+    return Detection(found.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
+
+
+def _by_gradients(grey: Grey, x: np.ndarray, reach: float) -> np.ndarray:
+    """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
+    apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
+    half = int(np.clip(reach * np.quantile(apart, 0.1), 2, 11))
+    criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
+    refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
+    return refined.reshape(-1, 2).astype(np.float64)
+
+
+def _believable(found: Detection, board: Board) -> bool:
+    """Whether there are enough points, not on one line, and on a smoothly bent grid."""
+    return len(found.ids) >= FEWEST and _spans_a_plane(found, board) and _smooth(found, board)
+
+
+def _spans_a_plane(found: Detection, board: Board) -> bool:
+    """Whether the points do not all lie on one line of the board."""
+    p = board.points[found.ids, :2]
+    return bool(np.linalg.svd(p - p.mean(0), compute_uv=False)[1] > 0.5 * board.spacing)
+
+
+def _smooth(found: Detection, board: Board) -> bool:
+    """Whether a polynomial of degree 3 of the points on the board, on top of a homography, gives the pixels."""
+    p = board.points[found.ids, :2]
+    H, _ = cv2.findHomography(p, found.x)
+    if H is None:
+        return False
+    flat = cv2.perspectiveTransform(p[:, None], H)[:, 0]
+    apart = np.sort(np.linalg.norm(flat[:, None] - flat[None], axis=-1), axis=1)[:, 1]
+    u, v = ((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0)).T
+    terms = [u**i * v**j for i in range(4) for j in range(4 - i)] if len(p) >= 30 else [u**0, u, v]
+    basis = np.stack(terms, 1)
+    bend = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
+    left = np.linalg.norm(found.x - flat - basis @ bend, axis=-1)
+    return bool(np.median(left) < CROOKED * np.median(apart) and np.isfinite(left).all())
+
+
+def _reason(grey: Grey, board: Board) -> str:
+    low, high = np.percentile(grey, (2, 98))
+    if high - low < 40:
+        return "the pictures have hardly any contrast: expose them longer, or light the board"
+    if isinstance(board, Charuco) and (reason := _charuco_reason(grey, board)):
+        return reason
+    if other := other_size([grey], board):
+        return f"a chessboard with {other} inner corners is seen: is the board's size right?"
+    if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
+        return "it is found once the picture is mirrored: save the pictures as the camera sees, not mirrored"
+    if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
+        return "the pictures are blurred: focus, and hold the board still"
+    whole = "" if isinstance(board, Charuco) else ", whole and with its white margin"
+    return f"no such board is seen{whole}: check the board's name, and that it is in the picture, large and lit"
+
+
+def _charuco_reason(grey: Grey, board: Charuco) -> str | None:
+    needed = (board.columns + 1) * (board.rows + 1) // 2
+    ids = _markers(grey, board.dictionary)
+    if len(ids) >= 4 and max(ids) >= needed:
+        return f"markers up to number {max(ids)} are seen and the board has 0 to {needed - 1}: is its size right?"
+    if len(ids) >= 4:
+        return (
+            f"{len(ids)} of its markers are seen, but not where they should be: is the size right (squares across x "
+            "down)? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
+        )
+    for name in OTHER_DICTIONARIES:
+        if len(seen := _markers(grey, name)) >= 6:
+            return f"{len(seen)} markers of the dictionary {name} are seen, not of {board.dictionary}: name that one"
+    if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)) >= 4:
+        return "its markers are found once the picture is mirrored: save the pictures as the camera sees, not mirrored"
+    return None
+
+
+def _markers(grey: Grey, dictionary: str) -> list[int]:
+    if not hasattr(cv2.aruco, f"DICT_{dictionary.upper()}"):
+        return []
+    _, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary)).detectMarkers(grey)
+    return [] if ids is None else [int(i) for i in ids.reshape(-1)]
+
+
+def _grid_size(grey: Grey) -> tuple[int, int] | None:
+    """The (columns, rows) of inner corners of the largest chessboard in a picture."""
+    scale = min(1.0, SMALL / grey.shape[1])
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    done, _, meta = cv2.findChessboardCornersSBWithMeta(
+        small, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+    )
+    return (meta.shape[1], meta.shape[0]) if done else None

@@ -1,0 +1,122 @@
+"""One camera from its pictures of a board, to start from: Zhang's method, by OpenCV."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+
+from arraygeom import Camera, Distortion, Pose
+from arraygeom.pixels import HW
+
+from .detect import Detection
+from .photos import FrameKey
+from .target import Board
+
+Lens = Literal["brown-conrady", "kannala-brandt", "none"]
+FEWEST_PICTURES = 3
+FEWEST_TILT = 8.0
+"""Boards whose normals are all within this many degrees of each other count as parallel."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """What one camera saw of the board: its pictures' size and, by moment, the points found."""
+
+    hw: HW
+    seen: Mapping[FrameKey, Detection]
+
+
+Solved = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
+
+
+class Start(NamedTuple):
+    """A camera at the origin, the board's pose in it by moment, and each picture's reprojection error in pixels."""
+
+    camera: Camera
+    cam_from_board: dict[FrameKey, Pose]
+    rms: dict[FrameKey, float]
+
+
+def calibrate_camera(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady") -> Start:
+    """A camera's intrinsics, lens and board poses from its own pictures.
+
+    Raises ValueError if there are fewer than three pictures with a board, or if the board was never tilted.
+    """
+    if len(views.seen) < FEWEST_PICTURES:
+        raise ValueError(
+            f"{name}: the board is found in {len(views.seen)} of its pictures and {FEWEST_PICTURES} is the least: "
+            "take ten or more, at several distances and tilts"
+        )
+    fisheye = lens == "kannala-brandt"
+    try:
+        K, coefficients, rotations, translations = _fisheye(views, board) if fisheye else _pinhole(views, board, lens)
+    except cv2.error as error:
+        raise ValueError(
+            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): are they all alike?"
+        ) from None
+    distortion = None if lens == "none" else Distortion(lens, torch.tensor(coefficients))
+    camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
+    poses = {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
+    check_tilts(name, poses)
+    rms = {key: _rms(camera, pose, views.seen[key], board) for key, pose in poses.items()}
+    return Start(camera, poses, rms)
+
+
+def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
+    """Raises ValueError if all boards are parallel: the focal length cannot be told from the distance then."""
+    normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
+    widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
+    if widest < FEWEST_TILT:
+        raise ValueError(
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be "
+            "told apart: tilt the board by 20 to 40 degrees, to different sides, in most of the pictures"
+        )
+
+
+def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
+    """`cam_from_board` of one picture, for a camera whose intrinsics are known."""
+    directions, valid = camera.rays(torch.from_numpy(found.x))
+    rays = directions.numpy()
+    usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
+    flat = rays[usable, :2] / rays[usable, 2:]
+    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
+    _, r, t = cv2.solvePnP(
+        board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), r, t, True, cv2.SOLVEPNP_ITERATIVE
+    )
+    return _pose(r, t)
+
+
+def _pinhole(views: Views, board: Board, lens: Lens) -> Solved:
+    """Two radial terms are enough to start from: (K, k1 k2 p1 p2 k3, rotations, translations)."""
+    points = [board.points[d.ids].astype(np.float32) for d in views.seen.values()]
+    pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
+    h, w = views.hw
+    flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
+    if lens == "none":
+        flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
+    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), np.eye(3), np.zeros(5), flags=flags)
+    return K, c.reshape(-1)[:5], list(rotations), list(translations)
+
+
+def _fisheye(views: Views, board: Board) -> Solved:
+    points = [board.points[d.ids][:, None] for d in views.seen.values()]
+    pixels = [d.x[:, None] for d in views.seen.values()]
+    h, w = views.hw
+    K = np.array([[w / np.pi, 0, (w - 1) / 2], [0, w / np.pi, (h - 1) / 2], [0, 0, 1]])
+    flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW | cv2.fisheye.CALIB_USE_INTRINSIC_GUESS
+    _, K, c, rotations, translations = cv2.fisheye.calibrate(points, pixels, (w, h), K, np.zeros((4, 1)), flags=flags)
+    return K, c.reshape(-1), list(rotations), list(translations)
+
+
+def _rms(camera: Camera, pose: Pose, found: Detection, board: Board) -> float:
+    projected = camera.project(pose.apply(torch.from_numpy(board.points[found.ids]))).x.numpy()
+    return float(np.sqrt(((projected - found.x) ** 2).sum(-1).mean()))
+
+
+def _pose(r: np.ndarray, t: np.ndarray) -> Pose:
+    return Pose(torch.from_numpy(cv2.Rodrigues(r)[0]), torch.from_numpy(t.reshape(3).astype(np.float64)))

@@ -1,0 +1,129 @@
+"""A calibration rehearsed: what the cameras of a rig would photograph of a board, before one is printed.
+
+`rehearse` writes a folder such as `pat calibrate` reads. So one sees which board, how many pictures and which depths a
+planned array needs, and how well it would be known then.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from torch import Tensor
+
+from arraygeom import Camera, Pose, Rig, pixel_grid, rotation_from_vector
+from arraygeom.atomic import write_atomically
+from arraygeom.viz import calibrated
+
+from .target import Board, Circles, draw_board
+
+FILLS = (0.35, 0.9)
+"""How much of the narrowest view a board is wide."""
+TRIES = 2000
+WALL = 90
+"""Grey value of what is behind the board."""
+
+
+def rehearse(rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: float = 1.5, seed: int = 0) -> Pose:
+    """Photograph a board at `count` random places: `folder`/CAMERA/000.png and so on.
+
+    `noise` is in grey values of 255. Returns the true `world_from_board`, a batch (count).
+    Raises ValueError for a rig without calibrated cameras, or whose cameras nowhere see a board together.
+    """
+    boards = board_poses(rig, board, count, seed=seed)
+    random = np.random.default_rng(seed)
+    for name, camera in calibrated(rig).items():
+        (folder / name).mkdir(parents=True, exist_ok=True)
+        rays = fine_rays(camera)
+        for i in range(count):
+            pose = camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
+            picture = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
+            with write_atomically(folder / name / f"{i:03d}.png") as temporary:
+                temporary.write_bytes(
+                    cv2.imencode(".png", np.clip(picture.round(), 0, 255).astype(np.uint8))[1].tobytes()
+                )
+    return boards
+
+
+def board_poses(rig: Rig, board: Board, count: int, *, tilt: float = 35.0, seed: int = 0) -> Pose:
+    """`world_from_board` (a batch) where every camera sees the board's middle: near and far, to all sides, tilted.
+
+    `tilt` is the most about x and about y, degrees. Raises ValueError if there is no such place.
+    """
+    cameras, random = list(calibrated(rig).values()), np.random.default_rng(seed)
+    narrow = max(float(c.K[0, 0]) / c.hw[1] for c in cameras)
+    middle = torch.from_numpy((board.points.max(0) + board.points.min(0)) / 2)
+    found: list[Pose] = []
+    for _ in range(TRIES):
+        camera = cameras[random.integers(len(cameras))]
+        depth = max(board.extent) * narrow / random.uniform(*FILLS)
+        x = torch.from_numpy(random.uniform(0.15, 0.85, 2) * (np.array(camera.hw[::-1]) - 1))
+        there = camera.unproject(x, torch.tensor(depth))
+        if all(bool(p.valid) and bool(c.contains(p.x)) for c in cameras for p in [c.project(there)]):
+            turn = np.radians([*random.uniform(-tilt, tilt, 2), random.uniform(-20, 20)])
+            R = camera.R.T.double() @ rotation_from_vector(torch.from_numpy(turn))
+            found.append(Pose(R, there - R @ middle))
+        if len(found) == count:
+            return Pose(torch.stack([p.R for p in found]), torch.stack([p.t for p in found]))
+    raise ValueError(f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one")
+
+
+Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
+
+
+def photograph(
+    camera: Camera, cam_from_board: Pose, board: Board, *, dpi: float | None = None, rays: Rays | None = None
+) -> UInt8[np.ndarray, "h w"]:
+    """The picture that a camera takes of a printed board, through its lens: the mean of four points a pixel.
+
+    The print is drawn at `dpi`; by default so that its pixels are about as large as the distance of those points, for
+    then none is skipped. `rays` are `fine_rays(camera)`, if they are there already.
+    """
+    directions, valid = rays or fine_rays(camera)
+    R, t = cam_from_board.R, cam_from_board.t
+    distance = (R[:, 2] @ t) / (directions @ R[:, 2])
+    on_board = (directions * distance[:, None] - t) @ R
+    resolution = dpi or _resolution(camera, cam_from_board, board)
+    print_, per_metre, origin = printed(board, resolution)
+    hw = 2 * camera.hw[0], 2 * camera.hw[1]
+    on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*hw, 2)
+    on_print[~(valid & (distance > 0)).reshape(hw).numpy()] = -1
+    u, v = cv2.split(on_print)
+    picture = cv2.remap(print_, u, v, cv2.INTER_LINEAR, borderValue=(WALL,))
+    return np.asarray(cv2.resize(picture, camera.hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def fine_rays(camera: Camera) -> Rays:
+    """The rays of a camera's pixels at twice its size, row by row, and which are valid."""
+    fine = camera.to(torch.float64).resize((2 * camera.hw[0], 2 * camera.hw[1]))
+    return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
+
+
+def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
+    """Dots per inch of which one is half a pixel at the board's middle, in steps of a tenth."""
+    middle = torch.from_numpy((board.points.max(0) + board.points.min(0)) / 2)
+    depth = max(float(cam_from_board.apply(middle[None])[0, 2]), 1e-3)
+    exact = 2 * float(camera.K[0, 0]) / depth * 0.0254
+    return float(min(max(1.1 ** round(math.log(exact, 1.1)), 20.0), 300.0))
+
+
+@lru_cache(maxsize=32)
+def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, Float[np.ndarray, "2"]]:
+    """The board as it comes out of a printer: grey values, pixels a metre, and the pixel of its first point."""
+    margin = 0.012
+    figure = draw_board(board, margin=margin)
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(dpi)
+    canvas.draw()
+    grey = np.ascontiguousarray(np.asarray(canvas.buffer_rgba())[..., 0])
+    per_metre = dpi / 0.0254
+    first = board.radius if isinstance(board, Circles) else board.spacing
+    origin = np.full(2, (margin + first) * per_metre - 0.5)
+    origin[1] += len(grey) - figure.get_size_inches()[1] * dpi  # the canvas is cut to whole pixels at its top
+    return grey, per_metre, origin

@@ -1,0 +1,143 @@
+"""Which numbers of a rig may change, how well they are known, and the rig after changes."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
+from arraygeom.pixels import HW
+
+from ..boards.observability import NATURAL
+
+SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
+"""Standard deviations where none are stated: radians, a part of the longest baseline, a part of the focal length,
+pixels of the principal point, and a part of what coefficients of lenses usually are at most (`NATURAL`)."""
+ALIASES = {"principal_point": "centre", "focal_length": "focal"}
+AXES = {"rotation": "xyz", "translation": "xyz", "focal": "xy", "centre": "xy"}
+UNITS = {
+    "rotation": ("degrees", 180 / math.pi),
+    "translation": ("mm", 1e3),
+    "focal": ("px", 1.0),
+    "centre": ("px", 1.0),
+}
+LENS_SIGMA = 0.2
+"""The same part where a lens is not calibrated: it counts in halves of the picture's longer side."""
+LINK_SIGMA = 0.1
+"""Of the seven numbers of an F in coordinates that span about -1 to 1: next to nothing is known of them."""
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """Numbers that belong together: "camera.rotation" and so on, or "alpha > beta" for an F.
+
+    sigma: how well each is known before, one standard deviation. unit, factor: what people use, and how many of it.
+    """
+
+    name: str
+    sigma: Float[Tensor, " k"]
+    unit: str
+    factor: float
+
+    def spoken(self, index: int) -> str:
+        """One of the numbers, in words."""
+        axes = AXES.get(self.name.rpartition(".")[2])
+        return f"{self.name} {axes[index]}" if axes else f"{self.name} {index + 1}"
+
+
+def unknowns(
+    rig: Rig, names: Sequence[str], *, free: Iterable[str], sigma: Mapping[str, float] | None = None
+) -> list[Unknown]:
+    """What may change in the cameras `names`, the first of which keeps its pose: only relative poses can be seen.
+
+    `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or patterns
+    over "camera.kind". `sigma` states standard deviations by kind, instead of `SIGMA`'s. A link between two of the
+    cameras has its F free, and uncalibrated lenses are free. Raises ValueError for a pattern that matches nothing.
+    """
+    stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
+    if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
+        raise ValueError(f"--sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
+    sigma = {**SIGMA, **stated}
+    known = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
+    calibrated = {name: like for name, like in known.items() if isinstance(rig.cameras.get(_camera_of(name)), Camera)}
+    wanted = _matching(calibrated, free)
+    wanted += [name for name in known if name not in calibrated and not name.startswith("depth.")]
+    fixed = {f"{names[0]}.rotation", f"{names[0]}.translation"}
+    found = [
+        _unknown(rig, name, known[name], sigma) for name in wanted if _camera_of(name) in names and name not in fixed
+    ]
+    links = [f"{a} > {b}" for a, b in rig.links if a in names and b in names]
+    return found + [Unknown(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
+
+
+def changed(rig: Rig, given: Sequence[Unknown], z: Float[Tensor, " n"]) -> Rig:
+    """The rig after a change of z standard deviations of each number in turn; differentiable in z."""
+    parts = z.split([len(u.sigma) for u in given])
+    values = {u.name: part * u.sigma.to(part) for u, part in zip(given, parts)}
+    links = {names: _turned_link(link, values.get(" > ".join(names)), rig, names) for names, link in rig.links.items()}
+    cameras = {name: value for name, value in values.items() if " > " not in name}
+    return rig.perturbed(cameras).replace(links=links)
+
+
+def _camera_of(parameter: str) -> str:
+    return parameter.rpartition(".")[0]
+
+
+def _matching(known: Mapping[str, Tensor], free: Iterable[str]) -> list[str]:
+    if not known:
+        return []
+    wanted: list[str] = []
+    for pattern in free:
+        kind = ALIASES.get(pattern, pattern)
+        names = fnmatch.filter(known, kind if "." in kind else f"*.{kind}")
+        names = [n for n in names if not n.startswith("depth.")]
+        if not names:
+            kinds = ", ".join(dict.fromkeys(n.rpartition(".")[2] for n in known if not n.startswith("depth.")))
+            raise ValueError(f"--free: the rig has no '{pattern}' (it has: {kinds})")
+        wanted += [n for n in names if n not in wanted]
+    return wanted
+
+
+def _unknown(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> Unknown:
+    camera, _, kind = name.rpartition(".")
+    size = torch.full((like.shape[-1],), sigma[kind], dtype=torch.float64)
+    view = rig[camera]
+    if kind == "focal" and isinstance(view, Camera):
+        size = size * view.K[:2, :2].det().abs().sqrt()
+    if kind == "distortion" and isinstance(view, LensView) and view.distortion is not None:
+        natural = torch.tensor(NATURAL[view.distortion.model][: len(size)], dtype=torch.float64)
+        size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
+    if kind == "translation":
+        size = size * _longest_baseline(rig)
+    unit, factor = UNITS.get(kind, ("", 1.0))
+    return Unknown(name, size, unit, factor)
+
+
+def _longest_baseline(rig: Rig) -> float:
+    centres = torch.stack([c.centre for c in rig.cameras.values() if isinstance(c, Camera)])
+    return max(float(torch.pdist(centres).max()), 1e-6) if len(centres) > 1 else 1.0
+
+
+def _turned_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
+    """F after seven small numbers: turns of its two sets of singular vectors, and a change of its second value."""
+    if value is None:
+        return link
+    A, B = (_to_unit(rig[name].hw).to(link.F) for name in names)
+    U, S, Vh = torch.linalg.svd(torch.linalg.inv(B).T @ link.F @ torch.linalg.inv(A))
+    second = (S[1] / S[0]) * (1 + value[6])
+    U, Vh = U @ rotation_from_vector(value[:3]), rotation_from_vector(value[3:6]) @ Vh
+    F = U @ torch.diag(torch.stack([torch.ones_like(second), second, torch.zeros_like(second)])) @ Vh
+    return Link(B.T @ F @ A, link.H)
+
+
+def _to_unit(hw: HW) -> Tensor:
+    """Pixels to coordinates between about -1 and 1."""
+    s = 2 / max(hw)
+    rows = [[s, 0, -s * (hw[1] - 1) / 2], [0, s, -s * (hw[0] - 1) / 2], [0, 0, 1]]
+    return torch.tensor(rows, dtype=torch.float64)

@@ -1,0 +1,52 @@
+"""Keeps the figures in README.md those that the commands print: `make readme`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+from torch.nn.functional import interpolate
+from tyro.conf import UseAppendAction
+
+from arraygeom.atomic import write_text
+from pat.media.images import read_image, write_image
+
+
+@dataclass
+class Readme:
+    """Put what commands wrote between `<!-- NAME:begin -->` and `<!-- NAME:end -->` of a document."""
+
+    document: Path = Path("README.md")
+    """The document to bring up to date."""
+    block: UseAppendAction[tuple[str, ...]] = ()
+    """NAME=FILE, once for each block."""
+    picture: tuple[Path, Path] | None = None
+    """A picture to take over at 3/4 of its size, and the name to give it."""
+
+    def run(self) -> None:
+        """Do it."""
+        text = self.document.read_text()
+        for name, _, file in (argument.partition("=") for argument in self.block):
+            text = with_block(text, name, without_pictures(Path(file).read_text()))
+        if self.picture:
+            picture = read_image(self.picture[0])[None]
+            write_image(self.picture[1], interpolate(picture, scale_factor=0.75, mode="bicubic", antialias=True)[0])
+        write_text(self.document, text)
+
+
+def with_block(text: str, name: str, content: str) -> str:
+    """The text with the block of that name replaced. Raises ValueError if its marks are not there once, in order."""
+    begin, end = (f"<!-- {name}:{which} -->" for which in ("begin", "end"))
+    if text.count(begin) != 1 or text.count(end) != 1 or text.index(begin) > text.index(end):
+        raise ValueError(f"the document needs one {begin} and, after it, one {end}")
+    return f"{text[: text.index(begin)]}{begin}\n\n{content.strip()}\n\n{text[text.index(end) :]}"
+
+
+def without_pictures(text: str) -> str:
+    """Markdown without the lines that are only a picture."""
+    return "".join(line for line in text.splitlines(keepends=True) if not line.startswith("!["))
+
+
+if __name__ == "__main__":
+    tyro.cli(Readme).run()

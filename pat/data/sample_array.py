@@ -1,0 +1,34 @@
+"""The sample array that ships with the package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Rig
+from pat.media.colour import luminance_of
+
+from ..media.images import read_image
+
+SAMPLE = Path(__file__).parent / "sample"
+
+
+ALPHA, BETA = "mono", "colour"
+
+
+class SampleArray(NamedTuple):
+    """A mono alpha and a colour beta of different focal lengths and poses, and alpha's view in true colour."""
+
+    rig: Rig
+    images: dict[str, Tensor]
+    truth: Float[Tensor, "3 h w"]
+
+
+def load_sample() -> SampleArray:
+    """The sample array."""
+    rig = Rig.load(SAMPLE / "rig.yaml")
+    images = {name: read_image(SAMPLE / f"{name}.png") for name in rig.names}
+    return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(SAMPLE / "truth.png"))

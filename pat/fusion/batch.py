@@ -1,0 +1,238 @@
+"""Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one picture a camera.
+
+Every frame is a task of its own that leaves its picture last; `settings.yaml` beside the pictures says what they were
+made with, and a job is resumed with the same settings only. The colours of a sequence's key frames wait in `.keys`
+until all frames are there.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import pickle
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from arraygeom import ReceptiveField, Rig
+from arraygeom.atomic import sweep, write_atomically, write_text
+from arraygeom.io.native import write as rig_text
+
+from ..media.images import read_image
+from ..media.raw import developed_rig
+from ..media.video import write_video
+from ..networks.weights import Network, find_weights, load_weights
+from ..support.jobs import HERE, OnError, Report, Task, Workers, run_tasks
+from .fuse import fuse
+from .results import PictureKind, save_frame, view_of
+from .sequence import KeyColour, KeyFrame, PictureFiles, SequenceFusion
+from .views import ViewFiles
+
+PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.pickle"
+
+
+@dataclass(frozen=True)
+class Batch:
+    """What is to be fused and how: `files` by camera, the frames in order; `out`, the folder of the results.
+
+    Options are as of `fuse` and `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first frame with
+    the first of every other camera, the second with the second and so on.
+    """
+
+    rig: Rig
+    files: Mapping[str, Sequence[Path]]
+    alpha: str
+    out: Path
+    weights: str = "mono-colour"
+    sequence: bool = False
+    speed: float | None = None
+    field: ReceptiveField | None = None
+    match_levels: bool = False
+    max_memory: str | None = None
+    bits: int = 8
+    kind: PictureKind = "png"
+    alone: bool = False
+    """Of a sequence: fuse each frame by itself, without carrying colour; for comparison."""
+
+    def __post_init__(self) -> None:
+        for name in self.files:
+            self.rig.known(name)
+        if self.alpha not in self.files:
+            raise ValueError(f"no picture of alpha, '{self.alpha}'")
+        if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
+            counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
+            raise ValueError(f"frames need as many pictures of each camera, got {counts}; or is it a --sequence?")
+
+    @cached_property
+    def names(self) -> list[str]:
+        """What alpha's files are called, without suffix; numbers if two are called the same."""
+        names = [file.stem for file in self.files[self.alpha]]
+        return names if len(set(names)) == len(names) else [f"{i:06d}" for i in range(len(names))]
+
+    @property
+    def settings(self) -> str:
+        """What the results depend on, as text."""
+        digest = hashlib.sha256(find_weights(self.weights).read_bytes()).hexdigest()
+        facts: dict[str, Any] = {
+            "alpha": self.alpha,
+            "weights": f"{self.weights} (SHA-256 {digest[:16]})",
+            "sequence": self.sequence,
+            "speed": self.speed,
+            "field": repr(self.field),
+            "match_levels": self.match_levels,
+            "alone": self.alone,
+            "bits": self.bits,
+            "kind": self.kind,
+            "frames": {name: len(files) for name, files in self.files.items()},
+            "first": {name: str(files[0]) for name, files in self.files.items()},
+            "rig": rig_text(self.rig),
+        }
+        return yaml.safe_dump(facts, sort_keys=False)
+
+    def picture(self, i: int) -> Path:
+        """The file of a fused frame."""
+        return self.out / f"{self.names[i]}_fused.{self.kind}"
+
+    def run(
+        self,
+        *,
+        workers: Workers = HERE,
+        resume: bool = False,
+        on_error: OnError = "stop",
+        video: float | None = None,
+        console: Console | None = None,
+    ) -> Report:
+        """Fuse all frames. With `video`, its frames a second, fused.mp4 is written when all are there.
+
+        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings.
+        """
+        self._begin(resume)
+        plan, many = self.out / KEYS / PLAN, range(len(self.names))
+        options: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
+        if self.sequence and not self.alone:
+            missing = [i for i in many if not (resume and self.picture(i).exists())]
+            keys = self._fusion().keys_of(missing)
+            run_tasks([Task(self._key_file(k), fuse_key, (plan, k)) for k in keys], title="key frames", **options)
+        tasks = [Task(self.picture(i), fuse_one, (plan, i)) for i in many]
+        report = run_tasks(tasks, title="frames", **options)
+        if video is not None and (report.made or report.kept):
+            made = [p for i in many if (p := self.picture(i)).exists()]
+            write_video(self.out / "fused.mp4", (read_image(p) for p in made), rate=video)
+        if not report.failed:
+            shutil.rmtree(self.out / KEYS)
+        return report
+
+    def _begin(self, resume: bool) -> None:
+        """Write down the settings; or, to resume, see that they are those of before."""
+        text, file = self.settings, self.out / SETTINGS
+        if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
+            raise ValueError(f"{file}: the frames there were made with other settings: give those, or another folder")
+        if not resume:
+            shutil.rmtree(self.out / KEYS, ignore_errors=True)
+            for i in range(len(self.names)):
+                self.picture(i).unlink(missing_ok=True)
+        for folder in (self.out, self.out / KEYS):
+            sweep(folder)
+        write_text(file, text)
+        with write_atomically(self.out / KEYS / PLAN) as temporary:
+            temporary.write_bytes(pickle.dumps(self))
+
+    def _fusion(self) -> SequenceFusion:
+        frames = {n: PictureFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
+        options = {"max_memory": self.max_memory}
+        return SequenceFusion(
+            _network(self.weights),
+            developed_rig(self.rig, self.files),
+            frames,
+            self.alpha,
+            self.speed,
+            self.field,
+            self.match_levels,
+            options,
+        )
+
+    def _key_file(self, key: KeyFrame) -> Path:
+        return self.out / KEYS / f"{key.alpha:08d}.safetensors"
+
+    def _fetch(self, key: KeyFrame) -> KeyColour | None:
+        file = self._key_file(key)
+        try:
+            return KeyColour(**load_file(file)) if file.exists() else None
+        except SafetensorError as error:
+            raise ValueError(f"{file}: {error}") from None
+
+    def fuse_key(self, key: KeyFrame) -> None:
+        """Write the colour of a key frame."""
+        colour = self._fusion().colour(key)
+        with write_atomically(self._key_file(key)) as temporary:
+            save_file({name: part.contiguous() for name, part in colour._asdict().items()}, temporary)
+
+    def fuse_one(self, i: int) -> None:
+        """Write a frame."""
+        if not self.sequence:
+            images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
+            frame = fuse(
+                _network(self.weights),
+                images.developed,
+                images,
+                alpha=self.alpha,
+                field=self.field,
+                max_memory=self.max_memory,
+                match_levels=self.match_levels,
+            )
+        else:
+            fusion = self._fusion()
+            frame = fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
+        view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
+        save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])
+
+
+def fuse_key(plan: Path, key: KeyFrame) -> None:
+    """The task of a key frame."""
+    _planned(plan, plan.stat().st_mtime_ns).fuse_key(key)
+
+
+def fuse_one(plan: Path, i: int) -> None:
+    """The task of a frame."""
+    _planned(plan, plan.stat().st_mtime_ns).fuse_one(i)
+
+
+@lru_cache(maxsize=2)
+def _planned(plan: Path, time: int) -> Batch:
+    return pickle.loads(plan.read_bytes())
+
+
+@lru_cache(maxsize=2)
+def _network(weights: str) -> Network:
+    return load_weights(weights)
+
+
+def find_pictures(text: str | Path, *, name: str = "") -> list[Path]:
+    """The pictures of a folder, of a pattern such as "a/mono_*.png", or one file; numbers in names count as numbers.
+
+    Raises FileNotFoundError if there is none.
+    """
+    path = Path(text)
+    label = f"{name}: " if name else ""
+    if path.is_dir():
+        found = [p for p in path.iterdir() if p.suffix.lower() in PICTURES and not p.name.startswith(".")]
+    elif any(c in path.name for c in "*?["):
+        found = list(path.parent.glob(path.name))
+    else:
+        found = [path]
+    if not found:
+        raise FileNotFoundError(f"{label}{path}: no pictures there: check the path")
+    return sorted(found, key=_natural)
+
+
+def _natural(path: Path) -> list[tuple[int, str]]:
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", path.name)]

@@ -1,0 +1,364 @@
+"""Sequences: every frame of alpha in the colours of betas with clocks of their own.
+
+Colour is fused at key frames, those of alpha nearest in time to what a beta recorded, where each beta is looked at
+where the points of alpha were at its own time (`Moved`), with room for what is not known of that (`Widened`). From
+the key frames before and after, it is carried to each frame along the motion between alpha's own frames, and mixed
+by time, confidence, and trust in the motion. So colour does not flicker from frame to frame as single fusions do,
+and a frame depends on nothing but pictures: any one can be made alone, in any order, with the same result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Moved, ReceptiveField, Rig, Widened
+from arraygeom.fields.default import default_field
+
+from ..media.colour import luminance, to_luma_chroma
+from ..media.images import check_size, read_image
+from ..media.raw import develop
+from ..networks.protocol import FusionNetwork
+from .fuse import fuse
+from .optical_flow import carried, flow_between, still
+from .results import FusedFrame
+
+
+@runtime_checkable
+class Frames(Protocol):
+    """Pictures (C, H, W) of one camera in the order of time: a list, or read when asked for (`PictureFiles`)."""
+
+    def __len__(self) -> int:
+        """How many."""
+        ...
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        """One of them."""
+        ...
+
+
+SYNCHRONOUS = 0.05
+"""Gaps shorter than this part of alpha's frame time count as none."""
+UNKNOWN_MOTION = 0.25
+"""The part of the motion in a gap that fields leave room for if no speed is given."""
+REACH = 2.0
+"""Colour is carried from key frames up to this many intervals of theirs away."""
+NEIGHBOURS = 4
+"""Levels are matched over this many key frames before and after."""
+
+
+class PictureFiles:
+    """Picture files of one camera, read and developed (`pat.media.raw`) when asked for.
+
+    `like` is the sensor of alpha, whose scale of light the pictures are brought to.
+    """
+
+    def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
+        self.paths, self.name = list(paths), name
+        self.view, self.like = rig[name], rig[alpha].sensor
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        """Raises FileNotFoundError or ValueError naming camera and file."""
+        path = self.paths[i]
+        picture = read_image(path, name=self.name, bits=self.view.sensor.bits)
+        check_size(picture, self.view.hw, f"{self.name}: {path}")
+        return develop(picture, self.view.sensor, like=self.like)
+
+
+class KeyFrame(NamedTuple):
+    """A frame of alpha that gets colour from betas: its number, and for each beta that of the frame nearest in time."""
+
+    alpha: int
+    betas: dict[str, int]
+
+
+class KeyColour(NamedTuple):
+    """What fusion adds to alpha at a key frame (C, H, W), with confidence and inverse depth (0: unknown), (H, W)."""
+
+    added: Float[Tensor, "c h w"]
+    confidence: Float[Tensor, "h w"]
+    inverse_depth: Float[Tensor, "h w"]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """When the frames of a sequence were recorded: camera `name`'s frame i at time_offset + i / frame_rate, seconds.
+
+    Raises ValueError for a camera without a frame rate, or without frames.
+    """
+
+    rig: Rig
+    counts: Mapping[str, int]
+    alpha: str
+
+    def __post_init__(self) -> None:
+        for name, count in self.counts.items():
+            if self.rig[name].sensor.frame_rate is None:
+                raise ValueError(f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig")
+            if count < 1:
+                raise ValueError(f"no frames of '{name}'")
+        if self.alpha not in self.counts:
+            raise ValueError(f"no frames of alpha, '{self.alpha}'")
+        if not self.betas:
+            raise ValueError("no frames of any other camera than alpha: fusion needs at least one beta")
+
+    @property
+    def betas(self) -> list[str]:
+        """The betas that have frames."""
+        return [name for name in self.rig.betas(self.alpha) if name in self.counts]
+
+    def rate(self, name: str) -> float:
+        """Frames a second."""
+        return self.rig[name].sensor.frame_rate or 1.0
+
+    def time(self, name: str, i: int) -> float:
+        """When frame i was recorded, seconds of the rig's clock."""
+        return self.rig[name].sensor.time_offset + i / self.rate(name)
+
+    def nearest(self, name: str, time: float) -> int:
+        """The frame recorded nearest to a time."""
+        i = round((time - self.rig[name].sensor.time_offset) * self.rate(name))
+        return min(max(i, 0), self.counts[name] - 1)
+
+    @property
+    def interval(self) -> float:
+        """The time between key frames, seconds."""
+        return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
+
+    def key_frames(self) -> list[KeyFrame]:
+        """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an interval.
+
+        Raises ValueError if there is none: then the recordings do not overlap.
+        """
+        fastest = max(self.betas, key=self.rate)
+        found: dict[int, float] = {}
+        for i in range(self.counts[fastest]):
+            time = self.time(fastest, i)
+            index = self.nearest(self.alpha, time)
+            gap = abs(self.time(self.alpha, index) - time)
+            if gap <= 0.5 * self.interval + 1e-9:
+                found[index] = min(gap, found.get(index, gap))
+        if not found:
+            raise ValueError("no frame of a beta is near one of alpha in time: check 'frame_rate' and 'time_offset'")
+        return [KeyFrame(i, self.at(i)) for i in sorted(found)]
+
+    def at(self, index: int) -> dict[str, int]:
+        """For each beta its frame nearest in time to alpha's frame `index`."""
+        return {name: self.nearest(name, self.time(self.alpha, index)) for name in self.betas}
+
+
+@dataclass(frozen=True)
+class SequenceFusion:
+    """A sequence to fuse: `colour` of its key frames, and any `frame`.
+
+    What it is made of is as `fuse_sequence` has it; `looks` is the field, `options` go to `fuse`.
+    """
+
+    network: FusionNetwork
+    rig: Rig
+    frames: Mapping[str, Frames]
+    alpha: str
+    speed: float | None = None
+    looks: ReceptiveField | None = None
+    match_levels: bool = False
+    options: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def timeline(self) -> Timeline:
+        """When the frames were recorded."""
+        return Timeline(self.rig, {name: len(frames) for name, frames in self.frames.items()}, self.alpha)
+
+    def grey(self, i: int) -> Float[Tensor, "1 h w"]:
+        """Alpha's frame."""
+        picture = self.frames[self.alpha][i]
+        return luminance(picture) if picture.shape[0] == 3 else picture
+
+    def alone(self, i: int) -> FusedFrame:
+        """The frame fused by itself with the betas nearest in time, motion or not: what carrying is compared with."""
+        return self._fused(i, self.timeline.at(i), {}, self.match_levels)
+
+    def colour(self, key: KeyFrame) -> KeyColour:
+        """Fuse a key frame, each beta looked at where alpha's points are at its time."""
+        fields, trust = {}, torch.ones(self.rig[self.alpha].hw)
+        for name, i in key.betas.items():
+            fields[name], sure = self._field(name, key.alpha, self.timeline.time(name, i))
+            trust = torch.minimum(trust, sure)
+        frame = self._fused(key.alpha, key.betas, fields, False)
+        inverse = (1 / frame.depth).nan_to_num(0.0)
+        return KeyColour(frame.image - self.grey(key.alpha), frame.confidence * trust, inverse)
+
+    def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> FusedFrame:
+        """Any frame, its colour carried from the key frames around it.
+
+        `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none could.
+        """
+        own = self.grey(i)
+        sources = [self._carried(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))]
+        if not sources:
+            raise ValueError(f"frame {i}: none of the key frames around it could be fused")
+        return mixed(own, sources)
+
+    def keys_of(self, frames: Iterable[int]) -> list[KeyFrame]:
+        """The key frames that some frames get their colour from."""
+        keys = self.timeline.key_frames()
+        found = {key.alpha: key for i in frames for key in self._around(i, keys)}
+        return [found[i] for i in sorted(found)]
+
+    def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
+        """The key frames within reach, or the nearest one."""
+        gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
+        reach = max(REACH * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
+        return [k for k in keys if gaps[k.alpha] <= reach]
+
+    def _carried(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> Source:
+        gap = abs(self._time(key.alpha) - self._time(i))
+        nearness = max(1 - gap / (REACH * self.timeline.interval), 1e-3)
+        if key.alpha == i:
+            return Source(nearness, *colour)
+        flow = flow_between(own, self.grey(key.alpha))
+        moved = carried(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth[None]]), flow.step)
+        return Source(nearness, moved[:-2], moved[-2] * flow.trust, moved[-1])
+
+    def _time(self, i: int) -> float:
+        return self.timeline.time(self.alpha, i)
+
+    def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
+        """Where to look in a beta that records at `time`, and how far the motion until then can be trusted."""
+        looks = self.looks or default_field(self.rig.pair(self.alpha, name))
+        sure = torch.ones(self.rig[self.alpha].hw)
+        steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
+        count = len(self.frames[self.alpha])
+        if abs(steps) < SYNCHRONOUS or count < 2:
+            return looks, sure
+        other = min(max(index + (round(steps) or (1 if steps > 0 else -1)), 0), count - 1)
+        other = other if other != index else index - (1 if steps > 0 else -1)
+        flow = flow_between(self.grey(index), self.grey(other))
+        step = flow.step * (steps / (other - index))
+        return Moved(Widened(looks, along=self._room(step, time - self._time(index))), step), flow.trust
+
+    def _room(self, step: Tensor, gap: float) -> float:
+        if self.speed is not None:
+            return self.speed * abs(gap)
+        return UNKNOWN_MOTION * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
+
+    def _fused(self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], alone: bool) -> FusedFrame:
+        images = {name: self.frames[name][j] for name, j in betas.items()}
+        if self.match_levels and not alone:
+            images = {name: self._levelled(name, image, i) for name, image in images.items()}
+        looks = dict.fromkeys(betas, self.looks) if self.looks else {}
+        return fuse(
+            self.network,
+            self.rig,
+            {self.alpha: self.grey(i), **images},
+            alpha=self.alpha,
+            field={**looks, **fields},
+            match_levels=alone,
+            **self.options,
+        )
+
+    def _levelled(self, name: str, image: Tensor, i: int) -> Tensor:
+        """Beta's picture with alpha's mean and spread, both over several key frames so that they do not flicker."""
+        keys = self.timeline.key_frames()
+        nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
+        around = keys[max(nearest - NEIGHBOURS, 0) : nearest + NEIGHBOURS + 1]
+        wanted = torch.tensor([_levels(self.grey(k.alpha)) for k in around]).mean(0)
+        mean, spread = torch.tensor([_levels(self.frames[name][k.betas[name]]) for k in around]).mean(0)
+        return (image - mean) / spread.clamp(min=1e-6) * wanted[1] + wanted[0]
+
+
+class Source(NamedTuple):
+    """What one key frame says of a frame: how near it is in time (0 to 1), and its colour carried there."""
+
+    nearness: float
+    added: Tensor
+    confidence: Tensor
+    inverse_depth: Tensor
+
+
+FLOOR = 1e-3
+"""The confidence that every source has at least when colours are mixed."""
+DISAGREEMENT = 0.1
+"""Where sources' colours are this far apart, confidence falls to 1 / e."""
+
+
+def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[Source]) -> FusedFrame:
+    """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
+
+    Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same disagree.
+    """
+    weights = torch.stack([s.nearness * (s.confidence + FLOOR) for s in sources])
+    share = (weights / weights.sum(0))[:, None]
+    added = torch.stack([s.added for s in sources])
+    colour = (share * added).sum(0)
+    apart = (share * (added - colour).square()).sum((0, 1))
+    confidence = (share[:, 0] * torch.stack([s.confidence for s in sources])).sum(0)
+    known = torch.stack([s.inverse_depth > 0 for s in sources])
+    weights = torch.where(known, weights, 0.0)
+    inverse = (weights * torch.stack([s.inverse_depth for s in sources])).sum(0) / weights.sum(0).clamp(min=1e-12)
+    depth = torch.where(known.any(0), 1 / torch.where(known.any(0), inverse, 1.0), torch.nan)
+    return FusedFrame(own + colour, depth, confidence * torch.exp(-apart / DISAGREEMENT**2))
+
+
+def fuse_sequence(
+    network: FusionNetwork,
+    rig: Rig,
+    frames: Mapping[str, Frames],
+    *,
+    alpha: str,
+    speed: float | None = None,
+    field: ReceptiveField | None = None,
+    match_levels: bool = False,
+    **options: Any,
+) -> Iterator[FusedFrame]:
+    """Fuse every frame of alpha, in order, as they are asked for.
+
+    Args:
+        network: as of `fuse`, and so are `field`, `match_levels` and other options (`depth`, `max_memory`).
+        rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
+        frames: by camera name, in the order of time. Cameras without are left out.
+        alpha: the camera whose frames are wanted.
+        speed: how fast things move at most, pixels of alpha a second, for the room that fields leave where a beta did
+            not record at a key frame's time. By default a quarter of the motion seen between alpha's frames.
+
+    Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
+    """
+    job = SequenceFusion(network, rig, frames, alpha, speed, field, match_levels, options)
+    keys = job.timeline.key_frames()
+
+    @lru_cache(maxsize=2 * int(REACH) + 1)
+    def colour(number: int) -> KeyColour:
+        return job.colour(keys[number])
+
+    numbers = {key.alpha: number for number, key in enumerate(keys)}
+    for i in range(len(frames[alpha])):
+        yield job.frame(i, keys, lambda key: colour(numbers[key.alpha]))
+
+
+def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tensor, "1 h w"]]) -> float:
+    """Mean change of chroma (R - Y, B - Y) from frame to frame where nothing moves, 0..1.
+
+    `greys` are alpha's frames, which tell what moves. Raises ValueError for fewer than two frames.
+    """
+    if len(images) < 2:
+        raise ValueError("flicker is of two frames or more")
+    changes = []
+    for (a, b), (grey_a, grey_b) in zip(pairwise(images), pairwise(greys)):
+        change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)
+        changes.append(float(change[still(grey_a, grey_b)].mean()))
+    return sum(changes) / len(changes)
+
+
+def _levels(picture: Tensor) -> tuple[float, float]:
+    """Mean and standard deviation."""
+    return float(picture.mean()), float(picture.std())

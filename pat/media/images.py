@@ -1,0 +1,216 @@
+"""Pictures on disk and their colours.
+
+A picture in memory is a float tensor (C, H, W), 0..1, in the coding the file has (sRGB for ordinary
+pictures), colours in the order red, green, blue. Files appear whole or not at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import ItemsView, Iterator, KeysView
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from tifffile import TiffFile
+from torch import Tensor
+
+from arraygeom.atomic import write_atomically
+
+_ROWS = 256
+"""Worked off at once, where copies of a whole picture would take much memory."""
+
+_LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
+
+
+@runtime_checkable
+class Pictures(Protocol):
+    """Pictures (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`)."""
+
+    def __getitem__(self, name: str, /) -> Tensor:
+        """One of them."""
+        ...
+
+    def __contains__(self, name: object, /) -> bool:
+        """Whether there is one."""
+        ...
+
+    def __iter__(self) -> Iterator[str]:
+        """The cameras."""
+        ...
+
+    def keys(self) -> KeysView[str]:
+        """The same."""
+        ...
+
+    def items(self) -> ItemsView[str, Tensor]:
+        """Cameras with their pictures."""
+        ...
+
+
+def read_image(path: str | Path, *, name: str | None = None, bits: int | None = None) -> Float[Tensor, "c h w"]:
+    """The picture in a PNG, TIFF, JPEG or PNM file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+
+    8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
+    0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
+    must hold 0..1. A wholly opaque alpha channel is dropped. Rotation tags (EXIF) are ignored: pixels are where the
+    sensor, hence its calibration, has them. `name` (such as a camera's) goes in front of error messages.
+
+    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable picture.
+    """
+    path = Path(path)
+    label = f"{name}: {path}" if name else f"{path}"
+    coded, packed = _decode(path, label)
+    coded = _opaque(coded, label)
+    planes = coded[None] if coded.ndim == 2 else coded[..., ::-1].transpose(2, 0, 1)
+    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
+
+
+def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
+    """Write a grey or RGB picture, whole or not at all, in the format its name ends in (.png, .tif, .jpg, .exr).
+
+    8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif and .exr only) keep
+    floats as they are. An .exr file needs the extra `synthesis`. Raises ValueError for a picture with NaN or another
+    number of channels, and for a format that cannot hold it.
+    """
+    path = Path(path)
+    planes = image.detach().cpu().numpy()
+    if planes.shape[0] not in (1, 3):
+        raise ValueError(f"{path}: a picture has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
+    if not np.isfinite(planes).all():
+        raise ValueError(f"{path}: the picture to write has NaN or infinite values")
+    if path.suffix.lower() == ".exr":
+        return _write_exr(path, planes, bits)
+    content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
+    with write_atomically(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def _decode(path: Path, label: str) -> tuple[NDArray, int]:
+    """The values, and how many bits a value has in a TIFF file that packs them into less than 16; 0 if none does."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{label}: no such picture: check the path")
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    coded = _decode_bytes(content)
+    if coded is None:
+        raise ValueError(f"{label}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
+    return coded, _packed_bits(path) if coded.dtype == np.uint16 and path.suffix.lower() in (".tif", ".tiff") else 0
+
+
+def _packed_bits(path: Path) -> int:
+    """OpenCV shifts packed values up to 16 bits; the number of bits that they had, or 0 for 16."""
+    with TiffFile(path) as file:
+        bits = file.pages.first.tags.valueof("BitsPerSample", default=16)
+    bits = bits[0] if isinstance(bits, tuple) else bits
+    return 0 if bits == 16 else int(bits)
+
+
+def _log_level(level: int) -> int:
+    """Set how much OpenCV says; what it was before. OpenCV 5 has the function in another place."""
+    logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
+    return int(logging.setLogLevel(level))
+
+
+def _decode_bytes(content: NDArray) -> NDArray | None:
+    level = _log_level(0)
+    try:
+        return cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
+    finally:
+        _log_level(level)
+
+
+def _opaque(coded: NDArray, label: str) -> NDArray:
+    if coded.ndim == 2 or coded.shape[2] == 3:
+        return coded
+    if coded.shape[2] != 4:
+        raise ValueError(f"{label}: has {coded.shape[2]} channels: give a grey (1) or RGB (3) picture")
+    full = np.iinfo(coded.dtype).max if np.issubdtype(coded.dtype, np.integer) else 1.0
+    if (coded[..., 3] != full).any():
+        raise ValueError(f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha")
+    return coded[..., :3]
+
+
+def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
+    if planes.dtype in (np.uint8, np.uint16):
+        return _counts(planes, label, bits, packed)
+    if not np.issubdtype(planes.dtype, np.floating):
+        raise ValueError(
+            f"{label}: has {planes.dtype} values: save it with 8 or 16 bits without sign, or as float 0..1"
+        )
+    if not np.isfinite(planes).all():
+        raise ValueError(f"{label}: has NaN or infinite values: replace them before fusing")
+    low, high = float(planes.min()), float(planes.max())
+    if low < 0 or high > 1:
+        raise ValueError(f"{label}: has float values from {low:g} to {high:g}: scale them to 0..1")
+    return planes.astype(np.float32)
+
+
+def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
+    own = packed or 8 * planes.itemsize
+    white = 2 ** (bits or own) - 1
+    if bits and bits > own:
+        raise ValueError(f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file")
+    planes = planes >> (16 - packed) if packed else planes
+    if planes.max() > white:
+        raise ValueError(
+            f"{label}: has values up to {planes.max()}, the rig says {bits} bits (up to {white}): correct 'bits' "
+            "(16 if the camera shifts its values up)"
+        )
+    return planes.astype(np.float32) / np.float32(white)
+
+
+def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
+    if bits != 32:
+        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+    try:
+        import OpenEXR
+    except ImportError:
+        raise ValueError(
+            f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
+        ) from None
+    names = "Y" if planes.shape[0] == 1 else "RGB"
+    channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with write_atomically(path) as temporary:
+        OpenEXR.File(header, channels).write(str(temporary))
+
+
+def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
+    suffix = path.suffix.lower()
+    if suffix in (".jpg", ".jpeg") and bits != 8:
+        raise ValueError(f"{path}: JPEG holds 8 bits, not {bits}: write .png or .tif")
+    if bits == 32 and suffix not in (".tif", ".tiff"):
+        raise ValueError(f"{path}: 32-bit floats need a name that ends in .tif")
+    try:
+        # Without the option OpenCV writes float colours as LogLuv, which has 3 digits.
+        done, content = cv2.imencode(suffix, _quantised(colours, bits), _LZW if bits == 32 else [])
+    except cv2.error:
+        done = False
+    if not done:
+        raise ValueError(f"{path}: cannot write a picture named so: end the name in .png, .tif or .jpg")
+    return content.tobytes()
+
+
+def _quantised(colours: NDArray, bits: int) -> NDArray:
+    if bits == 32:
+        return colours.astype(np.float32)
+    if bits not in (8, 16):
+        raise ValueError(f"bits must be 8, 16 or 32 (float), got {bits}")
+    kind = np.uint8 if bits == 8 else np.uint16
+    counts = np.empty(colours.shape, kind)
+    for top in range(0, len(colours), _ROWS):
+        rows = np.clip(colours[top : top + _ROWS], 0, 1).astype(np.float64)
+        counts[top : top + _ROWS] = np.rint(rows * np.iinfo(kind).max)
+    return counts
+
+
+def check_size(picture: Float[Tensor, "c h w"], hw: tuple[int, int], label: str) -> None:
+    """Raises ValueError unless the picture has this height and width."""
+    if tuple(picture.shape[1:]) != hw:
+        got, wanted = (f"{w}x{h}" for h, w in (picture.shape[1:], hw))
+        raise ValueError(f"{label}: is {got}, the rig says {wanted}: resize the rig, or give the right picture")

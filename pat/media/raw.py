@@ -1,0 +1,118 @@
+"""Pictures as cameras record them -> pictures to fuse: what the rig says of counts, filters, exposure and coding.
+
+Pictures to fuse are coded as sRGB, on alpha's scale of light: where exposures and gains are known, a surface has one
+value in all of them. Ordinary pictures, of which the rig says nothing, pass as they are.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Rig, Sensor
+
+from .colour import linear_from_srgb, luminance, srgb_from_linear
+
+_ROWS = 256
+"""Worked off at once, where copies of a whole picture would take much memory."""
+
+
+def develop(picture: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None) -> Float[Tensor, "c2 h w"]:
+    """The picture coded as sRGB: black level off, colours from the filter pattern, light on `like`'s scale.
+
+    `picture` holds counts over 2^bits - 1. Values stay above 0, and exceed 1 where `sensor` saw more light than white
+    is on `like`'s scale. The exposure counts only where both are known.
+    """
+    factor = _light(sensor, like or sensor)
+    if sensor.black_level:
+        black = sensor.black_level / (2.0 ** (sensor.bits or 16) - 1)
+        picture = ((picture - black) / (1 - black)).clamp(min=0)
+    if sensor.bayer:
+        picture = demosaiced(picture, sensor.bayer)
+    if factor == (1.0, 1.0, 1.0):
+        return srgb_from_linear(picture) if sensor.coding == "linear" else picture
+    linear = picture if sensor.coding == "linear" else linear_from_srgb(picture)
+    scale = linear.new_tensor(factor if len(linear) == 3 else factor[1:2])
+    return srgb_from_linear(linear * scale[:, None, None])
+
+
+LIGHT = "luminance of light"
+"""The response of developed pictures of which it is known that they are the luminance of linear light, coded as sRGB.
+
+Of ordinary grey pictures it is not known: many are the luminance of coded values, which is another where colours are
+strong."""
+
+
+def developed(sensor: Sensor) -> Sensor:
+    """What is true of a camera's pictures once they are developed: values are sRGB, counts and filters are gone."""
+    measured = sensor.response == "mono" and sensor.coding == "linear"
+    plain = dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
+    return dataclasses.replace(plain, response=LIGHT) if measured else plain
+
+
+def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
+    """The rig that says of the developed pictures of these cameras what they are."""
+    for name in names:
+        rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
+    return rig
+
+
+def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
+    """The fused picture as bright as alpha's camera saw it, if that measured the luminance of light (`LIGHT`).
+
+    Fusion gives a picture whose coded values have alpha's as their luminance. Here all three are moved by the same
+    amount until the luminance of their light is that of alpha's: by 0.045 for saturated purple of middle brightness.
+    """
+    if sensor.response != LIGHT:
+        return image
+    parts = zip(image.split(_ROWS, 1), alpha.split(_ROWS, 1))
+    return torch.cat([part + _missing(part, linear_from_srgb(own)) for part, own in parts], 1)
+
+
+def _missing(image: Tensor, light: Tensor) -> Tensor:
+    """What to add to coded values for that luminance of light; Newton's method on a convex function, from above."""
+    shift = torch.zeros_like(light)
+    for _ in range(4):
+        value = image + shift
+        slope = torch.where(value <= 0.04045, 1 / 12.92, 2.4 / 1.055 * ((value.clamp(min=0) + 0.055) / 1.055) ** 1.4)
+        shift = shift - (luminance(linear_from_srgb(value)) - light) / luminance(slope)
+    return shift
+
+
+def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h w"]:
+    """Colours of a raw picture behind a colour filter mosaic, interpolated along edges (OpenCV, in 16 bits).
+
+    Red and blue are green plus the median of their differences from it over 3x3 pixels (Freeman, US patent 4,724,395):
+    fringes of false colour at fine detail would be carried to where alpha sees it sharp.
+    """
+    code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
+    counts = np.rint(raw[0].clamp(0, 1).numpy().astype(np.float64) * 65535).astype(np.uint16)
+    colours = cv2.demosaicing(counts, code).astype(np.float32) / np.float32(65535)
+    green = colours[..., 1]
+    for i in (0, 2):
+        colours[..., i] = green + cv2.medianBlur(np.ascontiguousarray(colours[..., i] - green), 3)
+    return torch.from_numpy(colours.clip(0, 1)).movedim(-1, 0).contiguous().to(raw)
+
+
+def light_of(sensor: Sensor, like: Sensor) -> float:
+    """The value (0..1 is up to white) that `sensor` gives to light that is 1 on `like`'s scale, in grey or green."""
+    return 1 / _light(sensor, like)[1]
+
+
+def _light(sensor: Sensor, like: Sensor) -> tuple[float, float, float]:
+    """What to multiply linear red, green and blue with; a grey picture takes the middle one."""
+    both = sensor.exposure is not None and like.exposure is not None
+    exposure = like.exposure / sensor.exposure if both and like.exposure and sensor.exposure else 1.0
+    wanted = _gains(like)[1]
+    r, g, b = (exposure * wanted / gain for gain in _gains(sensor))
+    return r, g, b
+
+
+def _gains(sensor: Sensor) -> tuple[float, float, float]:
+    return sensor.gain if isinstance(sensor.gain, tuple) else (sensor.gain,) * 3

@@ -1,0 +1,327 @@
+"""GuidedPAT: C3 attention from coarse to fine, colour guided by alpha.
+
+Our own network, for one alpha whose detail is to be kept and betas that know the colours. Neighbouring pixels
+first agree on where along their segments they look (`pat.networks.semi_global`); attention looks there at full size in a
+short window. The network judges whether what it found is the point that alpha sees, carries colour from pixels
+that are certain to those that are not, and adds it to alpha.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, pixel_shuffle, pixel_unshuffle
+
+from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
+
+from ..attention import Attended, attend, attend_with_statistics
+from ..media.colour import luminance
+from .blocks import ResidualBlock, conv, enlarge
+from .protocol import Fused, Look, Looks
+from .semi_global import FILLS, FINE, Balances, Consensus, along, consensus, matches
+
+COARSE = 4
+"""Context is worked out at a quarter of the size."""
+UNSURE = 1e-3
+"""The certainty that every pixel has at least."""
+NOWHERE = -10.0
+"""The logit of the confidence where there is nowhere to look."""
+
+
+@dataclass(frozen=True)
+class GuidedPATConfig:
+    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
+
+    Attention reaches `window` pixels to either side of the consensus, with `taps` samples. Colour is carried
+    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
+    nothing is added to what was found and carried. `keep_luminance` lets
+    the network add colour to alpha, and never luminance.
+    """
+
+    widths: tuple[int, int, int, int] = (16, 32, 40, 48)
+    fine_dim: int = 8
+    window: float = 3.0
+    taps: int = 13
+    judge_dim: int = 16
+    trust_dim: int = 24
+    carry_dim: int = 8
+    carry_steps: tuple[int, ...] = (1, 3, 8)
+    head_dim: int = 32
+    bands: int = 3
+    keep_luminance: bool = True
+
+
+class Seen(NamedTuple):
+    """What one beta tells of alpha's view.
+
+    colour: (B, C, H, W), its bands minus alpha, where attention and the consensus found them, mixed.
+    spread: (B, fills, C, H, W), the same spread by the consensus from pixels with trust.
+    logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
+    choice: (B, 1 + fills, H, W), logits of taking, where it is not, what is carried within alpha or each `spread`.
+    """
+
+    attended: Attended
+    colour: Tensor
+    spread: Tensor
+    logit: Tensor
+    choice: Tensor
+
+    def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> Seen:
+        """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
+        of = slice(band, band + 1)
+        return self._replace(colour=(self.colour - base)[:, of], spread=(self.spread - base[:, None])[:, :, of])
+
+
+class Encoded(NamedTuple):
+    """Features at 1/2 of the size, and at 1/4 with context."""
+
+    half: Tensor
+    quarter: Tensor
+
+
+class GuidedPAT(nn.Module):
+    """Any number of betas whose bands, in order, are the output's: one RGB camera, or three with filters.
+
+    Betas are to be of about alpha's angular resolution (enlarge or reduce them with the rig), and all sizes
+    multiples of 16.
+    """
+
+    multiple = 16
+    equal_pitch = True
+    joins_bands: Literal["no", "neighbours", "all"] = "neighbours"
+    halo = 640
+    """Encoder 85, judge 176, trust 8, carrying 148, propagation 180 and head 16: the sum, rounded up."""
+    beta_halo = 96
+    bytes_per_pixel = 320.0
+
+    def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
+        super().__init__()
+        self.config = c = config
+        w2, w4, _, _ = c.widths
+        self.encoder = Encoder(c.widths)
+        self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
+        self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
+        self.trust = Trust(c.judge_dim + w2 + 4 + 12, c.trust_dim)
+        self.carry = nn.ModuleList(Carry(w4, c.carry_dim, step) for step in c.carry_steps)
+        if c.head_dim:
+            self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
+            self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
+
+    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
+        """The look with how the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
+        return replace(look, balances=Balances.of(alpha, _guide(beta)))
+
+    def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
+        """What can be known before attention looks, of whole pictures; for pieces of them it is cut, not redone."""
+        whole, blocks = (segments_of(look, hw_of(alpha), step, alpha.double()) for step in (1, FINE))
+        return consensus(alpha, _guide(beta), beta, whole, blocks, look.balances)
+
+    def forward(
+        self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
+    ) -> Fused:
+        """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
+
+        Raises ValueError if those do not add up to the configured number.
+        """
+        return self.explain(alpha, betas, looks)[0]
+
+    def explain(
+        self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
+    ) -> tuple[Fused, list[Seen]]:
+        """The same, with what each beta told, which training supervises."""
+        bands = sum(b.shape[1] for b in betas)
+        if bands != self.config.bands:
+            raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
+        own = self.encoder(alpha)
+        seen = [self.seen(own, alpha, beta, look) for beta, look in zip(betas, looks)]
+        residual = self.blended(own, alpha, seen)
+        if self.config.keep_luminance:
+            residual = residual - luminance(residual)
+        return fused_from(alpha + residual, seen), seen
+
+    def blended(self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], seen: Sequence[Seen]) -> Float[Tensor, "b c h w"]:
+        """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
+        certain = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in seen], 1)
+        colour = torch.cat([s.colour for s in seen], 1)
+        rest = torch.cat([self._unseen(own, s) for s in seen], 1)
+        blend = torch.lerp(rest, colour, certain)
+        if not self.config.head_dim:
+            return blend
+        rough = avg_pool2d(torch.cat([colour * certain, certain], 1), COARSE)
+        context = self.propagate(torch.cat([own.quarter, rough], 1))
+        return blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
+
+    def _unseen(self, own: Encoded, seen: Seen) -> Tensor:
+        """Colour for where beta does not see the point: carried at 1/4 of the size from certain pixels to others
+        that look alike in alpha, or as the consensus spread it."""
+        certain = seen.logit.sigmoid()
+        known = avg_pool2d(certain, COARSE)
+        colour = avg_pool2d(seen.colour * certain, COARSE) / (known + UNSURE)
+        for carry in self.carry:
+            colour, known = carry(own.quarter, colour, known)
+        choices = torch.cat([enlarge(colour, COARSE)[:, None], seen.spread], 1)
+        return (seen.choice.softmax(1)[:, :, None] * choices).sum(1)
+
+    def seen(
+        self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look, *, guide: Callable[[Tensor], Tensor] | None = None
+    ) -> Seen:
+        """What one beta of any bands tells; `guide` is what of these is compared with alpha."""
+        of = guide or _guide
+        other = self.encoder(of(beta))
+        segments = segments_of(look, hw_of(alpha), 1, self._exact(alpha))
+        known = look.known if look.known is not None else self.survey(alpha, beta, look)
+        window = window_around(known.reach, segments, self.config.window)
+        query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
+        found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
+        value = found.value.to(alpha)
+        facts = torch.cat([of(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
+        judged = self._judged(own, known, facts, segments.valid[:, None])
+        logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
+        logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
+        colour = torch.lerp(value - alpha, known.matched, exact.sigmoid())
+        return Seen(found, colour, known.colour, logit, choice)
+
+    def _judged(self, own: Encoded, known: Consensus, facts: Tensor, valid: Tensor) -> Tensor:
+        """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the consensus's match."""
+        agreed = torch.cat([known.reach / 64, known.facts], 1)
+        told = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
+        rough = torch.cat([avg_pool2d(agreed, 2), avg_pool2d(told, COARSE)], 1)
+        context = self.judge(torch.cat([own.quarter, rough], 1))
+        return self.trust(torch.cat([enlarge(context), own.half, agreed, pixel_unshuffle(facts, 2)], 1))
+
+    def _exact(self, x: Tensor) -> Tensor:
+        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
+        return x if self.training else x.double()
+
+
+def fused_from(image: Float[Tensor, "b c h w"], seen: Sequence[Seen]) -> Fused:
+    """The image with where each beta was looked at, and with what confidence."""
+    return Fused(
+        image,
+        [s.attended.position for s in seen],
+        [s.attended.spread for s in seen],
+        [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in seen],
+    )
+
+
+def _guide(beta: Tensor) -> Tensor:
+    """What alpha is compared with."""
+    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
+
+
+def hw_of(picture: Tensor) -> tuple[int, int]:
+    """Height and width."""
+    return picture.shape[-2], picture.shape[-1]
+
+
+class Trust(nn.Sequential):
+    """The logits of confidence, choices and the better match at full size, worked out at half of it."""
+
+    def __init__(self, inputs: int, width: int) -> None:
+        super().__init__(
+            conv(inputs, width),
+            ResidualBlock(width),
+            nn.Conv2d(width, 4 * (3 + FILLS), 3, padding=1),
+            nn.PixelShuffle(2),
+        )
+
+
+class Carry(nn.Module):
+    """C3 attention of alpha to itself: each pixel takes colour from 7 x 7 around it that are certain and look alike.
+
+    The logarithm of the certainty is added to the scores as one more channel of the keys. Without training all
+    look alike, and this is a normalised convolution.
+    """
+
+    def __init__(self, width: int, dim: int, step: int) -> None:
+        super().__init__()
+        self.field = Local(7, spacing=step)
+        self.query, self.key = nn.Conv2d(width, dim, 1), nn.Conv2d(width, dim, 1)
+        nn.init.zeros_(self.query.weight)
+
+    def forward(
+        self, features: Float[Tensor, "b d h w"], colour: Float[Tensor, "b c h w"], sure: Float[Tensor, "b 1 h w"]
+    ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+        """Colour and certainty after one round."""
+        view = View(hw=(features.shape[-2], features.shape[-1]))
+        query = torch.cat([self.query(features), torch.ones_like(sure)], 1)
+        key = torch.cat([self.key(features), (sure + UNSURE).log()], 1)
+        look = lazily(self.field, Pair(view, view))
+        found = attend(query, key, torch.cat([colour, sure], 1), look, interpolation="nearest")
+        return found[:, :-1], found[:, -1:]
+
+
+def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
+    """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `reach` from their end."""
+    middle, step = matches(segments, reach), window * along(segments)
+    return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
+
+
+def segments_of(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:
+    """The segments of every `step`-th block of alpha pixels, at its centre: (B or 1, h / step, w / step)."""
+    grid = (hw[0] // step, hw[1] // step)
+    x = (pixel_grid(grid, dtype=like.dtype, device=like.device) + 0.5) * step - 0.5
+    found = look.at(x.reshape(-1, 2))
+    if not isinstance(found, Segments):
+        raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the pictures")
+    start, end = (v.reshape(-1, *grid, 2) for v in (found.start, found.end))
+    return Segments(start, end, found.valid.reshape(-1, *grid))
+
+
+class Encoder(nn.Module):
+    """Features of one grey picture, the same weights for every view."""
+
+    def __init__(self, widths: tuple[int, int, int, int]) -> None:
+        super().__init__()
+        w2, w4, w8, _ = widths
+        self.at_half = nn.Sequential(conv(4, w2), ResidualBlock(w2))
+        self.at_quarter = nn.Sequential(conv(w2, w4, stride=2), ResidualBlock(w4))
+        self.at_eighth = nn.Sequential(conv(w4, w8, stride=2), ResidualBlock(w8), ResidualBlock(w8, dilation=3))
+        self.up = nn.Conv2d(w8, w4, 1)
+        self.merge = ResidualBlock(w4)
+
+    def forward(self, picture: Float[Tensor, "b 1 h w"]) -> Encoded:
+        """Features of a picture whose sides are multiples of 8."""
+        half = self.at_half(pixel_unshuffle(picture - 0.5, 2))
+        quarter = self.at_quarter(half)
+        return Encoded(half, self.merge(quarter + enlarge(self.up(self.at_eighth(quarter)))))
+
+
+class UNet(nn.Module):
+    """Three scales down and up again, residual blocks at each."""
+
+    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int) -> None:
+        super().__init__()
+        a, b, c = widths
+        self.first = nn.Sequential(conv(inputs, a), ResidualBlock(a))
+        self.second = nn.Sequential(conv(a, b, stride=2), ResidualBlock(b))
+        self.third = nn.Sequential(conv(b, c, stride=2), ResidualBlock(c), ResidualBlock(c, dilation=2))
+        self.up_b, self.up_a = nn.Conv2d(c, b, 1), nn.Conv2d(b, a, 1)
+        self.back_b, self.back_a = ResidualBlock(b), ResidualBlock(a)
+        self.last = nn.Conv2d(a, outputs, 3, padding=1)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
+        """The same size; sides are multiples of 4."""
+        first = self.first(x)
+        second = self.second(first)
+        second = self.back_b(second + enlarge(self.up_b(self.third(second))))
+        return self.last(self.back_a(first + enlarge(self.up_a(second))))
+
+
+class Head(nn.Module):
+    """What to add to the blend, at full size, worked out on blocks of 2x2 pixels."""
+
+    def __init__(self, inputs: int, width: int, bands: int) -> None:
+        super().__init__()
+        self.start = nn.Sequential(conv(inputs, width), *(ResidualBlock(width) for _ in range(3)))
+        self.last = nn.Conv2d(width, 4 * bands, 3, padding=1)
+        nn.init.zeros_(self.last.weight)
+
+    def forward(self, fine: Tensor, half: Tensor, context: Tensor) -> Tensor:
+        """(B, bands, H, W), from pictures at full size, features at 1/2 and the context at 1/4."""
+        return pixel_shuffle(self.last(self.start(torch.cat([pixel_unshuffle(fine, 2), half, enlarge(context)], 1))), 2)

@@ -1,0 +1,148 @@
+"""PAT, the physics-aware transformer of the paper, for any number of betas of any sizes.
+
+Huang, Hu and Brady, "Array Camera Image Fusion using Physics-Aware Transformers" (2022). The default
+configuration is the paper's; variants are configuration.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from ..attention import Attended, attend_with_statistics
+from .blocks import ResidualASPP, ResidualBlock
+from .protocol import Fused, Look, Looks
+
+
+@dataclass(frozen=True)
+class PATConfig:
+    """The paper's network by default.
+
+    `betas` is their number, `in_channels` that of each picture (a picture with fewer is repeated), `dim` the
+    width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
+    of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is looked up.
+    """
+
+    betas: int = 1
+    in_channels: int = 3
+    out_channels: int = 3
+    dim: int = 64
+    scale: int = 1
+    residual: bool = False
+    interpolation: Literal["nearest", "bilinear"] = "nearest"
+
+
+class PAT(nn.Module):
+    """Features shared by all views, C3 attention to each beta, fusion by convolutions.
+
+    >>> PAT(PATConfig(betas=2, dim=8)).config.betas
+    2
+    """
+
+    halo = 80
+    """Features reach 59 pixels and post-fusion 10; the sum, rounded up."""
+    beta_halo = 64
+    multiple = 1
+    equal_pitch = False
+    joins_bands: Literal["no", "neighbours", "all"] = "no"
+    bytes_per_pixel = 1600.0
+
+    def __init__(self, config: PATConfig = PATConfig()) -> None:
+        super().__init__()
+        self.config = config
+        c, d = config, config.dim
+        self.features = Features(c.in_channels, d)
+        self.engine = AttentionEngine(c.betas, d, c.interpolation)
+        self.post = PostFusion((c.betas + 1) * d, d, c.out_channels, c.scale)
+
+    def forward(
+        self, alpha: Float[Tensor, "b c h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
+    ) -> Fused:
+        """Fuse alpha with the betas, in the order the network was made for.
+
+        Raises ValueError for another number of betas than configured, or channels that do not fit.
+        """
+        if len(betas) != self.config.betas or len(looks) != len(betas):
+            raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(betas)} and {len(looks)} looks")
+        own = self.features(self._channels(alpha))
+        others = [self.features(self._channels(beta)) for beta in betas]
+        attended = self.engine(own, others, looks)
+        image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
+        if self.config.residual:
+            image = image + self._enlarged(alpha)
+        return Fused(image, *(list(part) for part in list(zip(*attended))[1:]))
+
+    def balance(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
+        """The same look: nothing need be known."""
+        return look
+
+    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
+        """Nothing: each piece of a frame is fused by itself."""
+
+    def _channels(self, picture: Tensor) -> Tensor:
+        wanted = self.config.in_channels
+        if picture.shape[1] not in (1, wanted):
+            raise ValueError(f"pictures must have 1 or {wanted} channels for this network, got {picture.shape[1]}")
+        return picture.expand(-1, wanted, -1, -1)
+
+    def _enlarged(self, alpha: Tensor) -> Tensor:
+        alpha = alpha.expand(-1, self.config.out_channels, -1, -1)
+        if self.config.scale == 1:
+            return alpha
+        return nn.functional.interpolate(alpha, scale_factor=self.config.scale, mode="bicubic", align_corners=False)
+
+
+class Features(nn.Sequential):
+    """Residual-ASPP features, the same weights for every view (paper, section 3.1)."""
+
+    def __init__(self, channels: int, dim: int) -> None:
+        super().__init__(
+            nn.Conv2d(channels, dim, 3, padding=1, bias=False),
+            nn.LeakyReLU(0.1, inplace=True),
+            ResidualBlock(dim),
+            ResidualASPP(dim),
+            ResidualBlock(dim),
+            ResidualASPP(dim),
+            ResidualBlock(dim),
+        )
+
+
+class AttentionEngine(nn.Module):
+    """Queries of alpha, keys and values of each beta, C3 over each field."""
+
+    def __init__(self, betas: int, dim: int, interpolation: Literal["nearest", "bilinear"]) -> None:
+        super().__init__()
+        self.interpolation = interpolation
+        self.before = ResidualBlock(dim)
+        self.query = nn.Conv2d(dim, dim, 1)
+        self.key = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
+        self.value = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
+
+    def forward(self, own: Tensor, others: Sequence[Tensor], looks: Looks) -> list[Attended]:
+        """For each beta, its values seen from alpha, and where they were."""
+        query = self.query(self.before(own))
+        return [
+            attend_with_statistics(
+                query, key(self.before(f)), value(f), look.at, samples=look.samples, interpolation=self.interpolation
+            )
+            for f, key, value, look in zip(others, self.key, self.value, looks)
+        ]
+
+
+class PostFusion(nn.Sequential):
+    """1x1 fusion of alpha's and the attended features, four residual blocks, pixel shuffle."""
+
+    def __init__(self, inputs: int, dim: int, outputs: int, scale: int) -> None:
+        super().__init__(
+            nn.Conv2d(inputs, dim, 1, bias=False),
+            *(ResidualBlock(dim) for _ in range(4)),
+            nn.Conv2d(dim, dim * scale**2, 1, bias=False),
+            nn.PixelShuffle(scale),
+            nn.Conv2d(dim, outputs, 3, padding=1, bias=False),
+            nn.Conv2d(outputs, outputs, 3, padding=1, bias=False),
+        )

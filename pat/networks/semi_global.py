@@ -1,0 +1,405 @@
+"""Consensus: what neighbours along the segments agree on, before attention looks closely.
+
+Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
+semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
+are places along each pixel's own segment, so it works for any rig with straight fields, rectified or not. It is
+worked out on pictures of half the size, as a whole frame and without gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate
+
+from arraygeom import Segments
+from arraygeom.sampling import on_picture, sample
+
+from ..support.threads import in_parallel
+from . import semi_global_kernels as kernels
+
+FINE = 2
+"""The consensus is found on pictures this many times smaller."""
+BLOCK = 320
+"""Side of the squares that are worked off at a time, in pixels of the reduced pictures."""
+MOST_MARGIN = 192
+CONSISTENT = 0.2
+"""The views agree on a match if the look back is less than this (times 8 pixels) from it."""
+LIKENESS = 0.08
+"""Difference of brightness at which the trust in a match falls to 1 / e."""
+DOUBT = 0.25
+"""Trust in a match on which the two views do not agree, before the likeness."""
+REACH_FILL = (50.0, 4.0)
+"""Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
+COLOUR_FILL = (300.0, 3.0)
+"""The same of colour."""
+FLOOR = 1e-3
+"""Regulariser (variance of brightness) of the regression of colour on brightness where colour is spread."""
+FILLS = 2
+"""Ways in which colour is spread: along its regression on brightness, and as it is."""
+DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
+"""Window and regulariser of the regression that gives matched colour the detail that beta lost."""
+MOST_DETAIL = 0.2
+"""Differences of brightness beyond this are no detail that beta lost."""
+BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
+"""Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
+
+
+class Consensus(NamedTuple):
+    """What neighbours agree on, for pictures of H x W.
+
+    reach: (B, 1, H / 2, W / 2), how far from its segment's end the match is, pixels of beta; where the match is
+        not trusted, spread from where it is.
+    facts: (B, 3, H / 2, W / 2), how far a look back from beta disagrees, by how much the match is better than
+        others, and its cost; each 0 to 1.
+    matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
+    colour: (B, fills, C, H, W), the same from pixels with trust spread to those without.
+    """
+
+    reach: Tensor
+    facts: Tensor
+    matched: Tensor
+    colour: Tensor
+
+    def cut(self, box: tuple[int, int, int, int]) -> Consensus:
+        """The part at alpha's (top, bottom, left, right), all even."""
+        top, bottom, left, right = box
+        half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
+        whole = (..., slice(top, bottom), slice(left, right))
+        return Consensus(self.reach[half], self.facts[half], self.matched[whole], self.colour[whole])
+
+
+class Balance(NamedTuple):
+    """How beta's brightness is levelled to alpha's, and with what either is then blurred, for each of a batch.
+
+    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
+    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
+    """
+
+    level: Tensor
+    blurs: tuple[list[float], list[float]]
+
+    @classmethod
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Balance:
+        """What makes the means and standard deviations the same, and then the sharpness."""
+        (spread, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
+        level = torch.stack([mean, (wanted / spread.clamp(min=1e-3)).clamp(max=4), middle])
+        return cls(level, equalising_blurs(alpha, _levelled(beta, level)))
+
+    def levelled(self, beta: Tensor) -> Tensor:
+        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
+        return _levelled(beta, self.level)
+
+    def softened(self, alpha: Tensor) -> Tensor:
+        """Alpha (or a part of it), no sharper than beta."""
+        return _blurred(alpha, self.blurs[0])
+
+    def equally_sharp(self, alpha: Tensor, levelled: Tensor) -> tuple[Tensor, Tensor]:
+        """Both (or parts of them), the sharper one blurred."""
+        own, other = (_blurred(p, blurs) for p, blurs in zip((alpha, levelled), self.blurs))
+        return own, other
+
+
+class Balances(NamedTuple):
+    """Those of pictures, and of the same at half the size."""
+
+    whole: Balance
+    half: Balance
+
+    @classmethod
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Balances:
+        """Of alpha and beta's brightness; all sides are even."""
+        return cls(Balance.of(alpha, beta), Balance.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
+
+
+class _Geometry(NamedTuple):
+    """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32.
+
+    `cut` is 1 where a segment may go on beyond beta's edge.
+    """
+
+    end: NDArray[np.float32]
+    along: NDArray[np.float32]
+    length: NDArray[np.float32]
+    cut: NDArray[np.float32]
+
+
+@torch.no_grad()
+def consensus(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    beta: Float[Tensor, "b c hb wb"],
+    segments: Segments,
+    blocks: Segments,
+    balances: Balances | None = None,
+) -> Consensus:
+    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
+
+    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
+    of its 2x2 pixels, in beta's pixels. All sides are even. `balances` are those of the whole pictures if these are
+    parts. On the CPU, with as many threads as torch may use; the same whatever their number.
+    """
+    balances = balances or Balances.of(alpha, guide)
+    reach, facts = agreement(alpha, guide, blocks, balances.half)
+    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts, balances.whole))
+
+
+def agreement(
+    alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, balance: Balance
+) -> tuple[Float[Tensor, "b 1 h2 w2"], Float[Tensor, "b 3 h2 w2"]]:
+    """`reach` and `facts` of the consensus alone; `balance` is that of half the size."""
+    own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
+    own, other = balance.equally_sharp(own, balance.levelled(other))
+    geometry = _geometry(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
+    found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
+    consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
+    planes = zip(found, consistent, _bytes(avg_pool2d(alpha, FINE)))
+    spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
+    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, spread)])
+    reach = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
+    return reach, torch.from_numpy(told).movedim(-1, 1).to(alpha)
+
+
+def levelled_at_matches(
+    picture: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 h w"]:
+    """The picture with another's mean and standard deviation, where the weight is; both show the same at a place.
+
+    Levels of whole pictures say little where these show different parts of a scene.
+    """
+    weight = (weight + 1e-6) / (weight + 1e-6).sum((2, 3), keepdim=True)
+    means = [(weight * p).sum((2, 3), keepdim=True) for p in (picture, like)]
+    spread, wanted = (
+        (weight * (p - m).square()).sum((2, 3), keepdim=True).sqrt() for p, m in zip((picture, like), means)
+    )
+    return (picture - means[0]) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + means[1]
+
+
+def box_mean(x: Tensor, radius: int) -> Tensor:
+    """Over squares around each pixel, as far as these are on the picture."""
+    side = 2 * radius + 1
+    rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
+    return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
+
+
+def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
+    """An invalid segment is as short as none: its length is negative.
+
+    Segments that start within a pixel of beta's edge may have been cut there.
+    """
+    length = segments.length
+    cut = segments.valid & ~on_picture(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
+    end = (segments.end + 0.5) / FINE - 0.5
+    length = torch.where(segments.valid, length / FINE, -1.0)
+    planes = (_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length, cut))
+    return _Geometry(*planes)
+
+
+def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
+    """Reach (B, h, w) in pixels of the reduced beta, and facts (B, h, w, 3)."""
+    labels = int(max(geometry.length.max(), 0)) + 2
+    reach = np.zeros(own.shape, np.float32)
+    facts = np.ones((*own.shape, 3), np.float32)
+    bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
+    in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
+    tasks = []
+    for i, (a, b) in enumerate(zip(own, other)):
+        views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
+        tasks += [partial(_block, views, box, labels, reach[i], facts[i]) for box in _blocks(a.shape, labels)]
+    in_parallel(tasks)
+    return reach, facts
+
+
+def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+    """Inner and outer squares: what is kept, and what is worked out for it."""
+    margin = min(labels + 32, MOST_MARGIN)
+    for top in range(0, hw[0], BLOCK):
+        for left in range(0, hw[1], BLOCK):
+            inner = slice(top, min(top + BLOCK, hw[0])), slice(left, min(left + BLOCK, hw[1]))
+            outer = (
+                slice(max(top - margin, 0), top + BLOCK + margin),
+                slice(max(left - margin, 0), left + BLOCK + margin),
+            )
+            yield inner, outer
+
+
+def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray) -> None:
+    own, own_bits, other, other_bits, end, along, length, cut = views
+    inner, outer = box
+    planes = (own, own_bits, end, along, length, cut)
+    a, a_bits, e, u, n, o = (np.ascontiguousarray(x[outer]) for x in planes)
+    cost = np.empty((*a.shape, labels), np.uint8)
+    kernels.costs(a, a_bits, other, other_bits, e, u, n, o, cost)
+    total = np.zeros(cost.shape, np.float32)
+    kernels.aggregate(cost, a, total)
+    r, f = np.empty(a.shape, np.float32), np.empty((*a.shape, 3), np.float32)
+    kernels.winners(total, e, u, n, o, *other.shape, r, f)
+    inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
+    reach[inner], facts[inner] = r[inside], f[inside]
+
+
+def _levelled(picture: Tensor, level: Tensor) -> Tensor:
+    mean, factor, middle = level.to(picture)
+    return (picture - mean) * factor + middle
+
+
+def equalising_blurs(
+    picture: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
+) -> tuple[list[float], list[float]]:
+    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
+
+    Sharpness is the mean difference of neighbouring pixels. 0 for a picture that has hardly more than the other.
+    """
+    own, its = ([float(_contrast(p)) for p in pictures] for pictures in (picture, other))
+    return [_least_blur(p, c) for p, c in zip(picture, its)], [_least_blur(p, c) for p, c in zip(other, own)]
+
+
+def _least_blur(picture: Tensor, contrast: float) -> float:
+    """The least of `BLURS` after which there is no more contrast than that."""
+    enough = (b for b in (0.0, *BLURS) if float(_contrast(_blurred(picture[None], [b])[0])) <= 1.05 * contrast)
+    return next(enough, BLURS[-1])
+
+
+def _blurred(pictures: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+    def one(picture: Tensor, blur: float) -> Tensor:
+        return torch.from_numpy(cv2.GaussianBlur(_numpy(picture), (0, 0), blur)).to(picture) if blur else picture
+
+    return torch.stack([one(p[0], blur) for p, blur in zip(pictures, blurs)])[:, None]
+
+
+def _contrast(picture: Float[Tensor, "1 h w"]) -> Tensor:
+    return picture.diff(dim=-1).abs().mean() + picture.diff(dim=-2).abs().mean()
+
+
+def _colours(
+    alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor, balance: Balance
+) -> tuple[Tensor, Tensor]:
+    """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
+    bands = beta.shape[1]
+    seen, valid = at_matches(torch.cat([beta, guide, balance.levelled(guide)], 1), segments, reach)
+    values, own, brightness = seen.split([bands, 1, 1], 1)
+    consistent = agreed_on(facts)
+    brightness = levelled_at_matches(brightness, alpha, valid * consistent)
+    soft = balance.softened(alpha)
+    if bands > 1:
+        matched = _detailed(values - own, brightness, alpha) + own - alpha
+    else:
+        matched = _detailed(values, soft, alpha) - alpha
+    return matched, spread_from(matched, alpha, trusted(brightness - soft, consistent, valid))
+
+
+def at_matches(
+    beta: Float[Tensor, "b c hb wb"], segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]
+) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
+    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, reach).to(beta)
+    position = middle.reshape(len(beta), -1, 2)
+    inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
+    values = sample(beta, inside, interpolation="bicubic").values
+    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_picture(middle, hw)[:, None]
+
+
+def agreed_on(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where the two views agree on the match."""
+    return _enlarged((facts[:, :1] < CONSISTENT).to(facts))
+
+
+def trusted(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
+    """How far a match is to be trusted whose brightness is not alpha's by `unlike`; always more than 0."""
+    unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
+    return (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+
+
+def spread_from(
+    matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], trust: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b fills c h w"]:
+    """Bands spread by trust over what is connected in alpha, in each of the `FILLS` ways."""
+    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
+    spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
+
+    def along_brightness(i: int) -> None:
+        spread[i, 0] = _regressed(*planes[i], COLOUR_FILL)
+
+    def as_it_is(i: int) -> None:
+        colour, _, weight, like = planes[i]
+        spread[i, 1] = _filled(colour, weight, like, COLOUR_FILL)
+
+    in_parallel([partial(how, i) for i in range(len(planes)) for how in (along_brightness, as_it_is)])
+    return torch.from_numpy(spread).to(alpha)
+
+
+def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
+    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it."""
+    return colour + local_slope(colour, brightness) * (alpha - brightness).clamp(-MOST_DETAIL, MOST_DETAIL)
+
+
+def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+    """The slope of the regression of colour on brightness around each pixel.
+
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
+    slope is reduced to the share of colour's variance that the regression explains.
+    """
+    mean = partial(box_mean, radius=DETAIL_RADIUS)
+    middle, centre = mean(brightness), mean(colour)
+    variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
+    spread = (mean(colour.square()) - centre.square()).clamp(min=0)
+    common = mean(colour * brightness) - centre * middle
+    explained = common.square() / ((variance + 1e-6) * (spread + 1e-6))
+    return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
+
+
+def _regressed(
+    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]
+) -> NDArray[np.float32]:
+    """Colour (c, h, w) as its weighted regression on brightness (h, w) says, over what is connected in the guide.
+
+    The moments of the guided filter (He et al. 2013), spread instead of averaged over a window: what no beta sees
+    has colour that varies with brightness as it does nearby.
+    """
+    moments = _filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
+    mean, square, (middle, product) = moments[0], moments[1], np.split(moments[2:], 2)
+    slope = (product - middle * mean) / (np.maximum(square - mean**2, 0) + FLOOR)
+    return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
+
+
+def matches(segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `reach` from the ends, beta's pixels."""
+    length = segments.length
+    far = interpolate(reach, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
+    return segments.end + far.clamp(min=0).minimum(length)[..., None] * along(segments)
+
+
+def along(segments: Segments) -> Float[Tensor, "*n 2"]:
+    """Unit vectors from end to start; zero where a segment is a point."""
+    length = segments.length
+    return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+
+
+def _enlarged(x: Tensor) -> Tensor:
+    return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)
+
+
+def _filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
+    """The weighted mean of planes (c, h, w) over what is connected in the guide. Weights are positive."""
+
+    def smooth(plane: NDArray) -> NDArray:
+        return cv2.ximgproc.fastGlobalSmootherFilter(guide, np.ascontiguousarray(plane, np.float32), *how)
+
+    total = smooth(weight)
+    return np.stack([smooth(plane * weight) / total for plane in planes])
+
+
+def _numpy(x: Tensor) -> NDArray[np.float32]:
+    return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)
+
+
+def _bytes(picture: Tensor) -> NDArray[np.uint8]:
+    return np.rint(np.clip(_numpy(picture[:, 0]), 0, 1) * 255).astype(np.uint8)

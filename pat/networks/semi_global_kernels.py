@@ -1,0 +1,207 @@
+"""The compiled loops of `pat.networks.semi_global`, each on one picture, in one thread and without Python's lock."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pat.attention.cpu_kernels import compiled
+
+NOWHERE = np.uint8(80)
+"""Cost of a label that is not on beta: more than any other can have."""
+UNSEEN = np.uint8(24)
+"""Cost of a label beyond beta's edge, where the point may well be: about as much as what is unlike."""
+MOST = np.float32(1e9)
+LEVELS = np.float32(30.0)
+"""Cost of a difference of 1 in (levelled) brightness, which counts up to `TRUNCATED`."""
+TRUNCATED = np.float32(20.0)
+SMALL, LARGE = np.float32(12.0), np.float32(100.0)
+"""Penalties of neighbours whose labels differ by one, and by more (the latter where alpha shows no edge)."""
+EDGE = np.float32(8 / 255)
+"""Difference of alpha's neighbours that halves the larger penalty."""
+FARTHEST = np.float32(8)
+"""A look back that lands farther off than this, in labels, counts as this far."""
+ONE = np.float32(1.0)
+HALF = np.float32(0.5)
+
+
+@compiled(nogil=True, cache=True)
+def census(picture, out):
+    """One bit for each of the 48 pixels around: whether it is darker (Zabih and Woodfill 1994)."""
+    height, width = picture.shape
+    for y in range(height):
+        for x in range(width):
+            centre, bits = picture[y, x], np.uint64(0)
+            for dy in range(-3, 4):
+                row = min(max(y + dy, 0), height - 1)
+                for dx in range(-3, 4):
+                    if dx != 0 or dy != 0:
+                        column = min(max(x + dx, 0), width - 1)
+                        bits = (bits << np.uint64(1)) | np.uint64(picture[row, column] < centre)
+            out[y, x] = bits
+
+
+@compiled(inline="always")
+def _count(bits):
+    """Ones among 64 bits."""
+    bits = bits - ((bits >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    bits = (bits & np.uint64(0x3333333333333333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (bits * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@compiled(inline="always")
+def _pixel(end, along, label):
+    """Column and row of beta's pixel at a label: so many pixels from `end`."""
+    reach = np.float32(label)
+    return int(np.floor(end[0] + reach * along[0] + HALF)), int(np.floor(end[1] + reach * along[1] + HALF))
+
+
+@compiled(nogil=True, cache=True)
+def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
+    """How unlike alpha's pixel (own) and beta's (other) at each label are: out (h, w, labels).
+
+    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere, or, where
+    it is beta's edge that cuts the segment, not seen.
+    """
+    height, width, labels = out.shape
+    rows, columns = other.shape
+    for y in range(height):
+        for x in range(width):
+            reach = length[y, x] + HALF
+            beyond = UNSEEN if cut[y, x] else NOWHERE
+            for label in range(labels):
+                column, row = _pixel(end[y, x], along[y, x], label)
+                if label > reach:
+                    out[y, x, label] = beyond
+                elif column < 0 or row < 0 or column >= columns or row >= rows:
+                    out[y, x, label] = NOWHERE
+                else:
+                    unlike = min(abs(own[y, x] - other[row, column]) * LEVELS, TRUNCATED)
+                    different = _count(own_bits[y, x] ^ other_bits[row, column])
+                    out[y, x, label] = np.uint8(different) + np.uint8(unlike)
+
+
+@compiled(inline="always")
+def _advance(before, least, cost, total, now, jump):
+    """One step of a path: its costs `now` (from index 1; a wall at both ends), added to `total`; the least."""
+    for i in range(len(cost)):
+        step = min(before[i], before[i + 2]) + SMALL
+        stay = min(before[i + 1], least + jump)
+        now[i + 1] = np.float32(cost[i]) + min(step, stay) - least
+    fewest = MOST
+    for i in range(len(cost)):
+        total[i] += now[i + 1]
+        fewest = min(fewest, now[i + 1])
+    return fewest
+
+
+@compiled(inline="always")
+def _jump(a, b):
+    return max(SMALL + ONE, LARGE / (ONE + abs(a - b) / EDGE))
+
+
+@compiled(nogil=True, cache=True, fastmath=True)
+def aggregate(cost, guide, total):
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008), added to total (h, w, labels)."""
+    for dx in range(-1, 2):
+        for way in range(2):
+            _sweep(cost, guide, total, dx, way)
+    for way in range(2):
+        _sweep_rows(cost, guide, total, way)
+
+
+@compiled(inline="always")
+def _sweep_rows(cost, guide, total, way):
+    """Paths along rows."""
+    height, width, labels = cost.shape
+    before, now = np.full((2, labels + 2), MOST, np.float32)
+    first, step = (0, 1) if way == 0 else (width - 1, -1)
+    for y in range(height):
+        before[1:-1] = 0
+        least = np.float32(0)
+        for i in range(width):
+            x = first + i * step
+            jump = _jump(guide[y, x], guide[y, x - step]) if i > 0 else LARGE
+            least = _advance(before, least, cost[y, x], total[y, x], now, jump)
+            before, now = now, before
+
+
+@compiled(inline="always")
+def _sweep(cost, guide, total, dx, way):
+    """Paths from row to row, that move by `dx` columns on the way."""
+    height, width, labels = cost.shape
+    before, now = np.full((2, width, labels + 2), MOST, np.float32)
+    fewest, fewer = np.zeros((2, width), np.float32)
+    first, step = (0, 1) if way == 0 else (height - 1, -1)
+    for i in range(height):
+        y = first + i * step
+        for x in range(width):
+            origin = x - dx
+            if i == 0 or origin < 0 or origin >= width:
+                now[x, 1:-1] = cost[y, x]
+                total[y, x] += cost[y, x]
+                fewer[x] = cost[y, x].min()
+            else:
+                jump = _jump(guide[y, x], guide[y - step, origin])
+                fewer[x] = _advance(before[origin], fewest[origin], cost[y, x], total[y, x], now[x], jump)
+        before, now = now, before
+        fewest, fewer = fewer, fewest
+
+
+@compiled(nogil=True, cache=True)
+def winners(total, end, along, length, cut, rows, columns, reach, facts):
+    """Each pixel's best label, to a fraction (reach); and facts (h, w, 3): how far the best label of those that
+    look at the same pixel of beta is from it, by how much it is better than the second, and how good it is."""
+    claims = _claims(total, end, along, length, rows, columns)
+    height, width, labels = total.shape
+    for y in range(height):
+        for x in range(width):
+            last = labels - 1 if cut[y, x] else min(labels - 1, int(length[y, x] + HALF))
+            best, second = _two_best(total[y, x], last)
+            lowest = total[y, x, best]
+            reach[y, x] = np.float32(best) + _between(total[y, x], best, last)
+            column, row = _pixel(end[y, x], along[y, x], best)
+            facts[y, x, 0] = ONE
+            if best <= length[y, x] + HALF and 0 <= row < rows and 0 <= column < columns:
+                facts[y, x, 0] = min(np.float32(abs(claims[row, column] - best)) / FARTHEST, ONE)
+            facts[y, x, 1] = min((second - lowest) / (8 * LARGE), ONE)
+            facts[y, x, 2] = lowest / (8 * LARGE)
+
+
+@compiled(inline="always")
+def _claims(total, end, along, length, rows, columns):
+    """For each pixel of beta the label of whichever of alpha's pixels has the best claim to it."""
+    height, width, labels = total.shape
+    lowest = np.full((rows, columns), MOST, np.float32)
+    claims = np.full((rows, columns), -labels, np.int32)
+    for y in range(height):
+        for x in range(width):
+            for label in range(min(labels - 1, int(length[y, x] + HALF)) + 1):
+                column, row = _pixel(end[y, x], along[y, x], label)
+                if 0 <= row < rows and 0 <= column < columns and total[y, x, label] < lowest[row, column]:
+                    lowest[row, column], claims[row, column] = total[y, x, label], label
+    return claims
+
+
+@compiled(inline="always")
+def _two_best(total, last):
+    """The best of the labels to `last`, and what the best does that is not beside it."""
+    best = 0
+    for label in range(1, last + 1):
+        if total[label] < total[best]:
+            best = label
+    second = MOST
+    for label in range(last + 1):
+        if abs(label - best) > 1:
+            second = min(second, total[label])
+    return best, second
+
+
+@compiled(inline="always")
+def _between(total, best, last):
+    """How far the best is from the label, by the two lines of equal slope through it and its neighbours."""
+    if not 0 < best < last:
+        return np.float32(0)
+    before, after = total[best - 1], total[best + 1]
+    deepest = max(before, after) - total[best]
+    return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)

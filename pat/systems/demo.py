@@ -1,0 +1,25 @@
+"""The sample array that ships with the package, and the report on its fusion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from torch import Tensor
+
+from ..data.sample_array import ALPHA, BETA, SampleArray
+from ..fusion.results import FusedFrame, colour_depth, save_panels
+
+
+def report_figure(sample: SampleArray, baseline: Tensor, frame: FusedFrame, path: Path) -> None:
+    """One figure: inputs, the classical baseline, the fusion, ground truth, depth and confidence."""
+    panels = {
+        "alpha: mono": sample.images[ALPHA],
+        "beta: colour": sample.images[BETA],
+        "ground truth": sample.truth,
+        "classical": baseline,
+        "fusion": frame.image,
+        "depth (bright is near)": colour_depth(frame.depth),
+        "confidence": frame.confidence[None],
+        "fusion's error x 5": (frame.image.clamp(0, 1) - sample.truth).abs() * 5,
+    }
+    save_panels(panels, path, columns=4)

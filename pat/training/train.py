@@ -1,0 +1,32 @@
+"""Training on scenes made while training.
+
+Every batch has its own rigs, fields and degradations: layered scenes from photographs, seen by random cameras
+through `arraygeom`. The loss is on the fused picture, and, for networks that say where they looked, on that.
+
+The parts are in `pat.training`: recipes (`config`), samples, losses, checkpoints, the loop.
+"""
+
+from __future__ import annotations
+
+from .config import Recording, TrainConfig, load_config, recipes, save_config
+from .loop import train
+from .losses import match_loss, picture_loss, validation
+from .samples import Sample, degraded, pair_of, photographs, scenes, truth_in
+
+__all__ = [
+    "Recording",
+    "Sample",
+    "TrainConfig",
+    "degraded",
+    "load_config",
+    "match_loss",
+    "pair_of",
+    "photographs",
+    "picture_loss",
+    "recipes",
+    "save_config",
+    "scenes",
+    "train",
+    "truth_in",
+    "validation",
+]

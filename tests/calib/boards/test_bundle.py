@@ -1,0 +1,264 @@
+"""Bundle adjustment: derivatives, the truth recovered, gross errors without a say, a covariance that is true."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+from arraygeom import Pose, Rig
+from calib.boards.bundle import (
+    BoardPoses,
+    Expected,
+    FreePoints,
+    Observations,
+    Scene,
+    _changed,
+    adjust,
+    camera_jacobian,
+    intrinsic_numbers,
+    normal_equations,
+    parameter_names,
+)
+from calib.boards.calibrate import calibrate
+from calib.boards.target import parse_board
+from tests.calib.boards_seen import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
+from tests.calib.tracks import (
+    CALISCOPE_BOARD,
+    CALISCOPE_RMS,
+    FIFTEEN_RMS,
+    caliscope,
+    caliscope_views,
+    fifteen_cameras,
+    free_of,
+    rms_and_mean,
+)
+
+
+def shaken(scene, size, seed=0):
+    """The scene with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a coefficient."""
+    random = np.random.default_rng(seed)
+    cameras = {}
+    for (name, c), mask in zip(scene.cameras.items(), free_of(scene, lens=2).values()):
+        scale = np.array([0.01] * 6 + [5.0] * 4 + [0.02] * (len(mask) - 10))
+        cameras[name] = _changed(c, torch.from_numpy(size * mask * scale * random.normal(size=len(mask))))
+    change = size * 0.01 * random.normal(size=(len(scene.structure), 6))
+    return Scene(cameras, scene.structure.stepped(change), scene.seen)
+
+
+@pytest.fixture(scope="module")
+def small():
+    """Two cameras, eight boards, noise of 0.1 px; the truth."""
+    rig = four_cameras()
+    rig = Rig({name: rig[name] for name in ("mono", "colour")})
+    boards = board_poses(8, spread=0.2)
+    return rig, boards, scene_of(rig, boards, see(rig, boards, noise=0.1))
+
+
+@pytest.mark.parametrize(
+    ("lens", "model"),
+    [
+        ((), ""),
+        ((-0.3, 0.1, 0.001, -0.002, 0.02), "brown-conrady"),
+        ((5.7, 1.6, 6e-5, -7e-5, -0.1, 6.0, 3.1, 0.0), "brown-conrady"),
+        ((0.02, -0.01, 0.003, 0.0), "kannala-brandt"),
+    ],
+)
+def test_derivatives_are_those_of_finite_differences(lens, model):
+    c = camera((520.0, 530.0), (480, 640), (0.1, -0.2, 0.3), (4.0, -9.0, 70.0), lens, model or "brown-conrady")
+    X = np.random.default_rng(0).normal((0.0, 0.1, 2.0), (0.4, 0.3, 0.3), (40, 3))
+    found = camera_jacobian(c, X)
+    for i, name in enumerate(parameter_names(c)):
+        step = torch.zeros(found.shape[-1], dtype=torch.float64)
+        step[i] = 1e-6
+        ends = [_changed(c, s * step).project(torch.from_numpy(X)).x.numpy() for s in (1, -1)]
+        assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (1 + np.abs(found[..., i]).max()), name
+
+
+@pytest.mark.parametrize("kind", ["boards", "points"])
+def test_derivatives_of_blocks(kind):
+    random = np.random.default_rng(0)
+    seen = Observations(np.array([0, 1, 1, 2]), random.normal(size=(4, 3)), np.zeros((4, 2)))
+    structure = BoardPoses(board_poses(3)) if kind == "boards" else FreePoints(random.normal(size=(3, 3)))
+    found = structure.jacobian(seen)
+    for i in range(structure.width):
+        step = np.zeros((3, structure.width))
+        step[:, i] = 1e-6
+        numeric = (structure.stepped(step).world(seen) - structure.stepped(-step).world(seen)) / 2e-6
+        assert np.abs(numeric - found[..., i]).max() < 1e-8
+
+
+def test_perfect_corners_give_back_the_truth():
+    rig, boards = four_cameras(), board_poses(10)
+    truth = scene_of(rig, boards, see(rig, boards))
+    fit = adjust(shaken(truth, 1.0), free_of(truth))
+    assert fit.converged
+    assert fit.scene.rms() < 1e-6
+    for name, c in fit.scene.cameras.items():
+        assert float((c.K - rig[name].K).abs().max()) < 1e-4
+        assert float((c.t - rig[name].t).abs().max()) < 1e-7
+
+
+def test_the_least_squares_are_scipys(small):
+    """The same minimum and the same covariance as a general solver finds without Schur complement or autodiff."""
+    _, _, scene = small
+    free = free_of(scene)
+    fit = adjust(scene, free)
+    counts = [int(mask.sum()) for mask in free.values()]
+
+    def moved(change):
+        cameras = {}
+        for (name, c), mask, part in zip(fit.scene.cameras.items(), free.values(), np.split(change, np.cumsum(counts))):
+            full = np.zeros(len(mask))
+            full[mask] = part
+            cameras[name] = _changed(c, torch.from_numpy(full))
+        return Scene(cameras, fit.scene.structure.stepped(change[sum(counts) :].reshape(-1, 6)), scene.seen)
+
+    def residuals(change):
+        return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved(change).residuals().items()])
+
+    theirs = least_squares(residuals, np.zeros(sum(counts) + 48), x_scale="jac", max_nfev=4)
+    assert 2 * theirs.cost == pytest.approx(float((residuals(np.zeros(sum(counts) + 48)) ** 2).sum()), rel=2e-3)
+    deviations = np.sqrt(np.linalg.inv(theirs.jac.T @ theirs.jac).diagonal()[: sum(counts)])
+    assert np.sqrt(fit.covariance.diagonal()) == pytest.approx(deviations, rel=0.05)
+
+
+def test_what_is_expected_pulls_as_hard_as_it_says(small):
+    """The fit with an expectation is the weighted mean of the fit without and the expectation."""
+    _, _, scene = small
+    free = free_of(scene)
+    alone = adjust(scene, free)
+    at = list(alone.names).index("mono.focal.0")
+    deviation = float(np.sqrt(alone.covariance[at, at]))
+    mean = intrinsic_numbers(alone.scene.cameras["mono"])
+    mean[6] += 2 * deviation
+    information = np.zeros((len(mean), len(mean)))
+    information[6, 6] = deviation**-2
+    held = adjust(replace(alone.scene, expected={"mono": Expected(mean, information)}), free)
+    moved = float(held.scene.cameras["mono"].K[0, 0] - alone.scene.cameras["mono"].K[0, 0])
+    assert moved == pytest.approx(deviation, rel=0.05)
+    assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)
+
+
+def test_gross_errors_have_no_say(small):
+    _, _, scene = small
+    clean = adjust(scene, free_of(scene))
+    x = scene.seen["mono"].x.copy()
+    x[::40] += np.random.default_rng(1).uniform(20, 60, x[::40].shape)
+    spoilt = Scene(scene.cameras, scene.structure, {**scene.seen, "mono": scene.seen["mono"]._replace(x=x)})
+    fit = adjust(spoilt, free_of(scene))
+    deviations = np.sqrt(clean.covariance.diagonal())
+    for i, name in enumerate(clean.names):
+        camera_name, kind, index = name.split(".")
+        if kind == "focal":
+            a, b = (f.scene.cameras[camera_name].K[int(index), int(index)] for f in (fit, clean))
+            assert abs(float(a - b)) < 1.5 * deviations[i]
+    assert fit.sigma["mono"] == pytest.approx(0.1, rel=0.25)
+
+
+def test_a_scale_that_nothing_tells_has_no_covariance(small):
+    _, _, scene = small
+    points = FreePoints(scene.structure.world(scene.seen["mono"])[:60])
+    seen = {}
+    for name, c in scene.cameras.items():
+        x, _, valid = c.project(torch.from_numpy(points.X))
+        index = np.flatnonzero(valid.numpy())
+        seen[name] = Observations(index, np.zeros((len(index), 3)), x.numpy()[index])
+    poses = {name: np.arange(len(parameter_names(c))) < 6 for name, c in scene.cameras.items()}
+    poses["mono"][:] = False
+    assert adjust(Scene(scene.cameras, points, seen), poses, rounds=1).covariance is None
+
+
+def test_fixed_numbers_stay_bit_identical(small):
+    _, _, scene = small
+    free = free_of(scene, lens=0)
+    free["colour"][6:8] = False
+    fit = adjust(shaken(scene, 0.1), free, rounds=1)
+    started = shaken(scene, 0.1).cameras
+    assert torch.equal(fit.scene.cameras["mono"].R, started["mono"].R)
+    assert torch.equal(fit.scene.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
+    assert torch.equal(fit.scene.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients)
+
+
+@pytest.mark.slow
+def test_the_covariance_is_true():
+    """Thirty draws of noise: squared errors in units of the covariance are chi-square, and so is each number's."""
+    rig, boards = four_cameras(), board_poses(24)
+    squares, relative, worst = [], [], []
+    for draw in range(30):
+        truth = scene_of(rig, boards, see(rig, boards, noise=0.15, seed=draw))
+        fit = adjust(truth, free_of(truth))
+        error = errors_of(fit, rig)
+        squares.append(error @ np.linalg.solve(fit.covariance, error))
+        relative.append(error / np.sqrt(fit.covariance.diagonal()))
+        worst.append(pose_errors(fit, rig))
+    count = len(error)
+    low, high = chi2.ppf([0.001, 0.999], 30 * count)
+    print(
+        "chi-square", np.sum(squares), "of", 30 * count, "worst", np.abs(relative).max(), "poses", np.max(worst, axis=0)
+    )
+    assert low < np.sum(squares) < high
+    assert 0.9 < np.sqrt(np.mean(np.square(relative))) < 1.1
+    assert np.abs(np.mean(relative, axis=0)).max() < 4 / np.sqrt(30)
+
+
+@pytest.mark.slow
+def test_fifteen_cameras_fit_better_than_published(shared_data):
+    scene = fifteen_cameras(shared_data).scene
+    rms, mean = rms_and_mean(adjust(scene, free_of(scene)).scene)
+    print("rms", rms, "mean", mean)
+    assert rms < FIFTEEN_RMS
+    assert mean < 0.6
+
+
+@pytest.mark.slow
+def test_caliscopes_tracks_fit_better_than_published(shared_data):
+    """Its own intrinsics, corners as free points, as its calibration has them: at most its own RMS.
+
+    Least squares lower the RMS; the robust fit lowers the mean, and leaves larger residuals to a few frames.
+    """
+    published = caliscope(shared_data).scene
+    free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(published.cameras)}
+    squares, robust = (adjust(published, free, rounds=rounds) for rounds in (0, 4))
+    before, after = rms_and_mean(published), rms_and_mean(squares.scene)
+    print("before", before, "least squares", after, "robust", rms_and_mean(robust.scene))
+    assert before[0] == pytest.approx(CALISCOPE_RMS, abs=1e-3)
+    assert after[0] < before[0]
+    assert rms_and_mean(robust.scene)[1] < before[1]
+
+
+@pytest.mark.slow
+def test_caliscopes_corners_through_all_of_calibrate(shared_data):
+    """Boards that are rigid, cameras that are not quite synchronised, nothing known before: at most its own RMS."""
+    found = calibrate(caliscope_views(shared_data), parse_board(CALISCOPE_BOARD))
+    print("rms", found.rms)
+    assert found.rms < CALISCOPE_RMS
+    assert any("taken at the same moments" in note for note in found.notes)
+
+
+def test_world_points_of_boards_are_their_poses():
+    boards = board_poses(3)
+    seen = Observations(np.array([2]), np.array([[0.1, 0.2, 0.0]]), np.zeros((1, 2)))
+    expected = Pose(boards.R[2], boards.t[2]).apply(tensor(0.1, 0.2, 0.0)[None])
+    assert np.abs(BoardPoses(boards).world(seen) - expected.numpy()).max() < 1e-15
+
+
+def test_the_step_solves_the_whole_system(small):
+    """Schur's complement against the full matrix."""
+    _, _, scene = small
+    equations = normal_equations(scene, free_of(scene), {"mono": 0.1, "colour": 0.1})
+    c, (b, d) = len(equations.g), equations.h.shape
+    full = np.zeros((c + b * d, c + b * d))
+    full[:c, :c] = equations.H
+    for i in range(b):
+        at = slice(c + i * d, c + (i + 1) * d)
+        full[at, at] = equations.B[i] + 1e-12 * np.eye(d)
+        full[:c, at], full[at, :c] = equations.W[i], equations.W[i].T
+    scale = 1 / np.sqrt(full.diagonal())
+    right = np.concatenate([equations.g, equations.h.ravel()])
+    expected = scale * np.linalg.solve(full * scale[:, None] * scale, scale * right)
+    cameras, blocks = equations.solved(0.0)
+    found = np.concatenate([cameras, blocks.ravel()])
+    assert np.abs((found - expected) / scale).max() < 1e-4

@@ -1,0 +1,233 @@
+"""From what cameras saw to a rig: the truth with its uncertainty, and a word for every set that cannot be used."""
+
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, Rig
+from calib.boards.calibrate import calibrate, fit_alone
+from calib.boards.covariance import RigCovariance, beta_covariance
+from calib.boards.coverage import coverage
+from calib.boards.detect import Detection
+from calib.boards.intrinsics import Views
+from calib.boards.poses import symmetry_poses
+from calib.boards.report import report_html, rig_covariance
+from calib.boards.target import parse_board
+from tests.calib.boards_seen import BOARD, board_poses, camera, four_cameras, see, tensor
+
+CHESS = parse_board("chessboard:8x6:60mm")
+"""The corners of `BOARD`, without their names."""
+
+
+def pair_rig():
+    rig = four_cameras()
+    return Rig({name: rig[name] for name in ("mono", "colour")})
+
+
+@pytest.fixture(scope="module")
+def pair():
+    rig, boards = pair_rig(), board_poses(10, spread=0.2)
+    return rig, boards, see(rig, boards, noise=0.1)
+
+
+@pytest.fixture(scope="module")
+def found(pair):
+    return calibrate(pair[2], BOARD)
+
+
+def kept(views, **keys):
+    return {
+        name: Views(v.hw, {k: d for k, d in v.seen.items() if k in keys.get(name, v.seen)}) for name, v in views.items()
+    }
+
+
+def test_a_pair_is_found_within_its_uncertainty(pair, found):
+    rig, deviations = pair[0], found.deviations()
+    assert found.rms == pytest.approx(0.1 * 2**0.5, rel=0.1)
+    for name in rig.names:
+        c, truth = found.rig[name], rig[name]
+        for entry, a, b in (
+            *((f"focal.{i}", c.K[i, i], truth.K[i, i]) for i in range(2)),
+            *((f"centre.{i}", c.K[i, 2], truth.K[i, 2]) for i in range(2)),
+            *((f"translation.{i}", c.t[i], truth.t[i]) for i in range(3)),
+        ):
+            assert abs(float(a - b)) <= 4 * deviations.get(f"{name}.{entry}", 0.0), (name, entry)
+
+
+def test_the_covariance_says_how_far_predictions_are_off(pair, found):
+    """A point of alpha at 2 m, predicted in beta, by truth and by the calibration."""
+    rig, covariance = pair[0], rig_covariance(found)
+    x = np.stack(np.meshgrid(np.linspace(200, 760, 5), np.linspace(150, 570, 4)), -1).reshape(-1, 2)
+    both = []
+    for r in (rig, found.rig):
+        a, b = r.pair("mono", "colour").cameras
+        both.append(
+            b.project(a.unproject(torch.from_numpy(x), torch.full((len(x),), 2.0, dtype=torch.float64))).x.numpy()
+        )
+    difference = both[1] - both[0]
+    spread = beta_covariance(found.rig, covariance, "mono", "colour", x, 2.0)
+    squared = np.einsum("ni,nij,nj->n", difference, np.linalg.inv(spread), difference)
+    assert squared.max() < 20
+    assert 0.01 < np.sqrt(spread[:, 0, 0]).mean() < 1.0
+
+
+def test_held_out_frames_are_no_worse(found):
+    assert found.held_out["mono", "colour"].mean() < 1.6 * found.epipolar["mono", "colour"].mean() < 0.25
+
+
+def test_the_covariance_is_kept_in_a_file(found, tmp_path):
+    covariance = rig_covariance(found)
+    covariance.save(tmp_path / "c.json")
+    again = RigCovariance.load(tmp_path / "c.json")
+    assert again.names == covariance.names
+    assert (again.matrix == covariance.matrix).all()
+    assert again.deviation("colour.translation.0") > 0 == again.deviation("mono.translation.0")
+    (tmp_path / "d.json").write_text("{}")
+    with pytest.raises(ValueError, match=re.escape("d.json: is not a covariance file")):
+        RigCovariance.load(tmp_path / "d.json")
+
+
+def test_the_report_holds_the_figures_and_escapes_names(found):
+    text = report_html(found, title="<b>&", notes=["left: '<script>' $x$.png"])
+    assert "<title>&lt;b&gt;&amp;</title>" in text
+    assert "<script>" not in text
+    assert f"{found.rms:.3f} px (RMS)" in text
+    assert text.count("data:image/png;base64,") == 5
+
+
+def test_chessboards_that_are_numbered_from_either_end(pair):
+    """Half a turn of the numbering in some pictures of one camera is found out."""
+    rig, boards, _ = pair
+    turn = CHESS.symmetries[1]
+    views = see(rig, boards, CHESS, noise=0.1)
+    whole = {
+        n: Views(v.hw, {k: d for k, d in v.seen.items() if len(d.ids) == len(CHESS.points)}) for n, v in views.items()
+    }
+    views = {
+        n: Views(
+            v.hw, {k: Detection(turn[d.ids], d.x) if n == "colour" and k % 3 == 1 else d for k, d in v.seen.items()}
+        )
+        for n, v in whole.items()
+    }
+    result = calibrate(views, CHESS)
+    assert result.rms < 0.2
+    assert float((result.rig["colour"].centre - rig["colour"].centre).norm()) < 2e-3
+
+
+def test_symmetry_poses_move_points_to_their_images():
+    for turn, image in zip(symmetry_poses(CHESS), CHESS.symmetries):
+        assert np.abs(turn.apply(torch.from_numpy(CHESS.points)).numpy() - CHESS.points[image]).max() < 1e-12
+
+
+def test_cameras_joined_only_through_others():
+    """a and c share no frame; b joins them."""
+    rig = four_cameras()
+    rig = Rig({name: rig[name] for name in ("mono", "colour", "nir")})
+    views = kept(see(rig, board_poses(14), noise=0.05), mono=range(7), nir=range(7, 14))
+    result = calibrate(views, BOARD)
+    assert result.rms < 0.12
+    assert float((result.rig["nir"].centre - rig["nir"].centre).norm()) < 5e-3
+
+
+def test_cameras_that_share_no_frame_are_refused(pair):
+    with pytest.raises(ValueError, match="colour never sees the board in the same frame as mono"):
+        calibrate(kept(pair[2], mono=range(5), colour=range(5, 10)), BOARD)
+
+
+def test_sets_a_frame_late_are_refused(pair):
+    late = {name: Views(v.hw, {k + (name == "colour"): d for k, d in v.seen.items()}) for name, v in pair[2].items()}
+    with pytest.raises(
+        ValueError, match=r"mono and colour contradict each other: .*once colour is taken to be 1 frame late"
+    ):
+        calibrate(late, BOARD)
+
+
+def test_mirrored_sets_are_refused(pair):
+    rig, boards, _ = pair
+    views = see(rig, boards, CHESS, noise=0.1)
+    width = rig["colour"].hw[1]
+    mirrored = {}
+    for key, d in views["colour"].seen.items():
+        ids = (d.ids // 8) * 8 + 7 - d.ids % 8
+        mirrored[key] = Detection(ids, np.stack([width - 1 - d.x[:, 0], d.x[:, 1]], -1))
+    with pytest.raises(ValueError, match=r"contradict each other: .*they agree once (colour|mono) is mirrored"):
+        calibrate({**views, "colour": Views(views["colour"].hw, mirrored)}, CHESS)
+
+
+def test_boards_that_move_between_the_exposures_do_not_bend_the_lenses(pair):
+    """Frames a moment apart: intrinsics stay what each camera's own pictures tell, and the note says so."""
+    rig, boards, views = pair
+    moved = Pose(boards.R, boards.t + torch.from_numpy(np.random.default_rng(0).normal(0, 0.004, (10, 3))))
+    views = {"mono": views["mono"], "colour": see(rig, moved, noise=0.1)["colour"]}
+    result = calibrate(views, BOARD)
+    assert any("taken at the same moments" in note for note in result.notes)
+    alone = fit_alone("colour", views["colour"], BOARD)
+    told = dict(zip(alone.fit.names, np.sqrt(alone.fit.covariance.diagonal())))
+    for i in range(2):
+        change = abs(float(result.rig["colour"].K[i, i] - alone.camera.K[i, i]))
+        assert change < told[f"colour.focal.{i}"]
+    assert len(set(result.fit.sigma.values())) == 1
+
+
+def test_one_picture_is_too_few(pair):
+    with pytest.raises(ValueError, match=re.escape("mono: the board is found in 1 of its pictures")):
+        calibrate(kept(pair[2], mono=[0]), BOARD)
+
+
+def test_parallel_boards_are_refused():
+    c = camera(700.0, (480, 640))
+    boards = board_poses(6, tilt=0.5)
+    with pytest.raises(ValueError, match="cam: all boards are parallel"):
+        calibrate(see(Rig({"cam": c}), boards), BOARD)
+
+
+def test_what_pictures_do_not_tell_is_left_alone():
+    """A long lens hardly bends: k2 and k3 stay 0, and the sentence says so; the coverage names what is missing."""
+    c = camera(4000.0, (480, 640), lens=(0.0, 0.0, 0.0, 0.0, 0.0))
+    board = parse_board("charuco:9x7:20mm")
+    boards = board_poses(8, depth=(2.5, 2.8), spread=0.02)
+    shift = boards.R @ torch.from_numpy(BOARD.points.mean(0) - board.points.mean(0))
+    views = see(Rig({"tele": c}), Pose(boards.R, boards.t + shift), board, noise=0.1)
+    result = calibrate(views, board)
+    assert result.rig["tele"].distortion.coefficients[[1, 4]].tolist() == [0, 0]
+    assert any("tele: the lens's k3 is kept at 0: the pictures do not tell it" in note for note in result.notes)
+    assert "tele.distortion.4" not in result.deviations()
+
+
+def test_a_camera_of_which_little_is_told_stays_plausible():
+    """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a middle in the middle."""
+    true = camera(900.0, (480, 640), lens=(-0.1, 0.0, 0.0, 0.0, 0.0))
+    views = see(Rig({"cam": true}), board_poses(4, tilt=18.0, depth=(1.3, 1.6), spread=0.02), noise=0.5)
+    found = fit_alone("cam", views["cam"], BOARD, final=False).camera
+    assert float(found.K[0, 0] / found.K[1, 1]) == pytest.approx(1, abs=0.01)
+    assert np.abs(found.K[:2, 2].numpy() - (319.5, 239.5)).max() < 0.06 * 640
+
+
+def test_fisheyes():
+    rig = Rig(
+        {
+            "a": camera(240.0, (480, 640), lens=(0.02, -0.01, 0.003, -0.001), model="kannala-brandt"),
+            "b": camera(260.0, (480, 640), (0.2, 0, 0), (0, -5, 0), (0.03, -0.01, 0.0, 0.0), "kannala-brandt"),
+        }
+    )
+    boards = board_poses(10, depth=(0.4, 0.9), spread=0.7)
+    result = calibrate(see(rig, boards, noise=0.05), BOARD, lens="kannala-brandt")
+    assert result.rms < 0.09
+    assert float((result.rig["b"].centre - rig["b"].centre).norm()) < 1e-3
+    assert abs(float(result.rig["a"].K[0, 0]) - 240) < 1
+
+
+def test_coverage_names_what_is_missing():
+    pose = Pose(torch.eye(3, dtype=torch.float64), tensor(-0.24, -0.18, 2.0))
+    c = camera(600.0, (480, 640))
+    x = c.project(pose.apply(torch.from_numpy(BOARD.points))).x.numpy()
+    found = coverage(Views(c.hw, {0: Detection(np.arange(len(x)), x)}), {0: pose}, BOARD)
+    assert found.depths == pytest.approx((2.0, 2.0))
+    assert found.tilts[1] == pytest.approx(0, abs=1e-6)
+    assert [m.split(" (")[0].split(":")[0] for m in found.missing] == [
+        "no points at the top left, top, top right, left, right, bottom left, bottom, bottom right of the picture",
+        "boards at one depth only",
+        "boards tilted by 0 degrees at most",
+    ]

@@ -1,0 +1,111 @@
+"""Finding boards: exact under perspective and lens, in dim, inverted and 16-bit pictures; why they are not found."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, rotation_from_vector
+from calib.boards.detect import detect, explain, other_size, to_grey
+from calib.boards.rehearsal import photograph
+from calib.boards.target import parse_board
+from tests.calib.boards_seen import camera, tensor
+
+CAMERA = camera(700.0, (480, 640), lens=(-0.3, 0.1, 0.001, -0.001, 0.0))
+
+
+def pose(board, turn=(18.0, -22.0, 7.0), depth=0.5):
+    R = rotation_from_vector(torch.deg2rad(tensor(*turn)))
+    return Pose(R, tensor(0.01, -0.01, depth) - R @ tensor(*board.points.mean(0)))
+
+
+def picture(text, **changes):
+    board = parse_board(text)
+    return photograph(CAMERA, pose(board, **changes), board), board
+
+
+@pytest.mark.parametrize(
+    ("text", "pixels"),
+    [
+        ("chessboard:9x6:25mm", 0.08),
+        ("charuco:8x6:30mm", 0.12),
+        ("circles:7x5:25mm", 0.15),
+        ("acircles:4x11:16mm", 0.15),
+    ],
+)
+def test_points_are_where_the_lens_puts_them(text, pixels):
+    grey, board = picture(text)
+    found = detect(grey, board)
+    assert found is not None
+    assert len(found.ids) == len(board.points)
+    truth = CAMERA.project(pose(board).apply(torch.from_numpy(board.points))).x.numpy()
+    errors = [np.linalg.norm(found.x - truth[image[found.ids]], axis=1) for image in board.symmetries]
+    assert min(np.sqrt((e**2).mean()) for e in errors) < pixels
+
+
+@pytest.mark.parametrize("text", ["chessboard:9x6:25mm", "charuco:8x6:30mm"])
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("inverted", lambda g: 255 - g),
+        (
+            "dim and noisy",
+            lambda g: (
+                (g * 0.06 + np.random.default_rng(0).normal(8, 0.7, g.shape)).round().clip(0, 255).astype(np.uint8)
+            ),
+        ),
+        ("12 of 16 bits", lambda g: g.astype(np.uint16) * 16),
+        ("colour", lambda g: np.stack([g, g // 2, g // 3], -1)),
+    ],
+)
+def test_pictures_of_odd_cameras(text, name, change):
+    grey, board = picture(text)
+    found = detect(to_grey(change(grey)), board)
+    assert found is not None, name
+    reference = detect(grey, board)
+    assert np.sqrt(((found.x - reference.x[np.searchsorted(reference.ids, found.ids)]) ** 2).sum(1).mean()) < 0.25
+
+
+def test_a_part_of_a_charuco_board_is_enough():
+    grey, board = picture("charuco:8x6:30mm", depth=0.25)
+    found = detect(grey, board)
+    assert 8 <= len(found.ids) < len(board.points)
+
+
+def test_no_board_is_no_board():
+    grey = np.random.default_rng(0).integers(0, 255, (240, 320)).astype(np.uint8)
+    assert detect(cv2.GaussianBlur(grey, (0, 0), 3), parse_board("charuco:8x6:30mm")) is None
+    assert detect(cv2.GaussianBlur(grey, (0, 0), 3), parse_board("chessboard:9x6:25mm")) is None
+
+
+@pytest.mark.parametrize(
+    ("shown", "asked", "words"),
+    [
+        ("charuco:8x6:30mm", "charuco:5x4:30mm", "markers up to number"),
+        ("charuco:8x6:30mm:22mm:5x5", "charuco:8x6:30mm", "markers of the dictionary 5x5"),
+        ("charuco:8x6:30mm:legacy", "charuco:8x6:30mm", "':legacy'"),
+        ("chessboard:9x6:25mm", "chessboard:11x8:25mm", "9x6 inner corners"),
+    ],
+)
+def test_another_board_is_named(shown, asked, words):
+    grey, _ = picture(shown, turn=(8.0, -8.0, 0.0))
+    board = parse_board(asked)
+    assert detect(grey, board) is None
+    assert words in explain([grey], board)
+
+
+def test_causes_in_the_picture_are_named():
+    grey, board = picture("charuco:8x6:30mm")
+    mirrored = np.ascontiguousarray(grey[:, ::-1])
+    assert detect(mirrored, board) is None
+    assert "mirrored" in explain([mirrored], board)
+    assert "contrast" in explain([np.full((240, 320), 90, np.uint8)], board)
+    flat = np.tile(np.linspace(0, 255, 320).astype(np.uint8), (240, 1))
+    assert "blurred" in explain([flat], board)
+
+
+def test_a_larger_chessboard_is_noticed_though_a_part_of_it_is_found():
+    grey, board = picture("chessboard:9x6:25mm", turn=(8.0, -8.0, 0.0))
+    assert other_size([grey, grey], parse_board("chessboard:8x6:25mm")) == "9x6"
+    assert other_size([grey, grey], board) is None
+    assert other_size([grey, grey], parse_board("chessboard:6x9:25mm")) is None

@@ -1,0 +1,106 @@
+"""Which picture belongs to which camera and moment."""
+
+import re
+
+import cv2
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calib.boards.photos import find_photos, frame_keys
+
+
+def write(path, value=0, hw=(48, 64)):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = np.full(hw, value, np.uint8)
+    picture[::8] = 255
+    cv2.imwrite(str(path), picture)
+
+
+@pytest.mark.parametrize(
+    ("stems", "keys"),
+    [
+        (["left01", "left02", "left10"], [1, 2, 10]),
+        (["cam01_08_int", "cam01_09_int", "cam01_10_int"], [8, 9, 10]),
+        (["1", "2", "11"], [1, 2, 11]),
+        (["board near", "board far"], ["board near", "board far"]),
+        (["img_007_left"], [7]),
+        (["a1_x", "a2_y"], ["1_x", "2_y"]),
+    ],
+)
+def test_keys(stems, keys):
+    assert frame_keys(stems) == keys
+
+
+@given(st.lists(st.integers(0, 9999), min_size=2, max_size=12, unique=True), st.sampled_from(["cam2_", "x", "a-1-"]))
+def test_numbers_come_back_whatever_is_around_them(numbers, name):
+    assert frame_keys([f"{name}{n:03d}_raw8" for n in numbers]) == numbers
+
+
+def test_a_folder_for_each_camera(tmp_path):
+    for camera, prefix in (("mono", "m_"), ("nir", "nir2_")):
+        for i in (1, 2, 3):
+            write(tmp_path / camera / f"{prefix}{i:02d}.png")
+    (tmp_path / "notes.txt").write_text("no camera")
+    photos = find_photos(tmp_path)
+    assert {name: list(moments) for name, moments in photos.items()} == {"mono": [1, 2, 3], "nir": [1, 2, 3]}
+    assert photos["mono"][2].label == "m_02.png"
+    assert photos["mono"][2].read().shape == (48, 64)
+
+
+def test_names_that_begin_with_the_camera(tmp_path):
+    for name in ("left1", "left2", "right1", "right3"):
+        write(tmp_path / f"{name}.png")
+    assert {n: list(m) for n, m in find_photos(tmp_path).items()} == {"left": [1, 2], "right": [1, 3]}
+
+
+def test_patterns_say_it_outright(tmp_path):
+    for name in ("1_L", "2_L", "1_R", "2_R"):
+        write(tmp_path / f"{name}.png")
+    photos = find_photos(tmp_path, patterns={"l": "*_L.png", "r": "*_R.png"})
+    assert {n: list(m) for n, m in photos.items()} == {"l": [1, 2], "r": [1, 2]}
+    with pytest.raises(ValueError, match=re.escape("q: no picture or video in")):
+        find_photos(tmp_path, patterns={"q": "*_Q.png"})
+
+
+def test_videos_are_read_frame_by_frame(tmp_path):
+    for name, count in (("a", 165), ("b", 158)):
+        video = cv2.VideoWriter(str(tmp_path / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 30, (64, 48))
+        for i in range(count):
+            video.write(np.full((48, 64, 3), i, np.uint8))
+        video.release()
+    photos = find_photos(tmp_path)
+    assert list(photos) == ["a", "b"]
+    assert len(set(photos["a"]) & set(photos["b"])) >= 39
+    assert max(len(m) for m in photos.values()) <= 80
+    assert photos["a"][64].label == "a.avi frame 64"
+    grey = cv2.cvtColor(photos["a"][64].decode(), cv2.COLOR_BGR2GRAY)
+    assert abs(float(grey.mean()) - 64) < 2
+
+
+@pytest.mark.parametrize(
+    ("files", "message"),
+    [
+        ([], "no pictures or videos here"),
+        (["a/x01.png", "a/x1.png", "a/y.txt"], "a: two pictures have the same number"),
+    ],
+)
+def test_mistakes(files, message, tmp_path):
+    for file in files:
+        write(tmp_path / file) if file.endswith("png") else (tmp_path / file).write_text("")
+    with pytest.raises(ValueError, match=message):
+        find_photos(tmp_path)
+
+
+def test_missing_folders_and_broken_pictures(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such folder of pictures"):
+        find_photos(tmp_path / "none")
+    for i in (1, 2):
+        (tmp_path / f"a{i}.png").write_bytes(b"not a picture")
+    with pytest.raises(ValueError, match=re.escape("a1.png: not a picture that can be read")):
+        find_photos(tmp_path)["a"][1].read()
+    (tmp_path / "v").mkdir()
+    (tmp_path / "v" / "x.mp4").write_bytes(b"not a video")
+    with pytest.raises(ValueError, match="not a video that can be read"):
+        find_photos(tmp_path)

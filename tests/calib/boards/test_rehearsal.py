@@ -1,0 +1,69 @@
+"""Photographs of boards that were never printed: corners where the cameras put them, and a rig back from them."""
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, Rig
+from calib.boards.calibrate import calibrate
+from calib.boards.collect import collect_folder
+from calib.boards.rehearsal import board_poses, photograph, rehearse
+from calib.boards.target import parse_board
+from tests.calib.boards_seen import camera
+
+BOARD = parse_board("charuco:7x5:60mm")
+
+
+@pytest.fixture(scope="module")
+def rig():
+    return Rig(
+        {
+            "a": camera(330.0, (240, 320), lens=(-0.2, 0.05, 0, 0, 0)),
+            "b": camera(260.0, (220, 300), (0.15, 0.02, 0), (0, -6, 1)),
+        }
+    )
+
+
+@pytest.fixture(scope="module")
+def rehearsed(rig, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    return rehearse(rig, BOARD, folder, count=7, seed=3), collect_folder(folder, BOARD).views
+
+
+def test_corners_are_where_the_cameras_put_them(rig, rehearsed):
+    boards, views = rehearsed
+    for name, seen in views.items():
+        off = []
+        for frame, found in seen.seen.items():
+            X = Pose(boards.R[frame], boards.t[frame]).apply(torch.from_numpy(BOARD.points))
+            off.append(found.x - rig[name].project(X).x.numpy()[found.ids])
+        off = np.concatenate(off)
+        assert np.abs(off.mean(0)).max() < 0.03
+        assert off.std() < 0.3
+
+
+def test_the_rig_comes_back_from_the_photographs(rig, rehearsed):
+    found = calibrate(rehearsed[1], BOARD)
+    assert found.rms < 0.3
+    assert float((found.rig["b"].centre - rig["b"].centre).norm()) < 3e-3
+
+
+def test_boards_are_tilted_and_at_several_depths(rig):
+    boards = board_poses(rig, BOARD, 20)
+    depth = boards.apply(torch.zeros(20, 1, 3, dtype=torch.float64))[..., 2].flatten()
+    assert float(depth.max() / depth.min()) > 1.7
+    normals = boards.R[..., 2]
+    assert float((normals @ normals.T).min()) < np.cos(np.radians(30))
+    again = board_poses(rig, BOARD, 20)
+    assert torch.equal(boards.t, again.t)
+
+
+def test_cameras_that_look_apart_are_told(rig):
+    apart = Rig({"a": rig["a"], "b": camera(260.0, (220, 300), (5.0, 0, 0), (0, 170, 0))})
+    with pytest.raises(ValueError, match=r"the cameras see the board charuco:7x5:60mm.* together almost nowhere"):
+        board_poses(apart, BOARD, 3)
+
+
+def test_what_is_behind_a_camera_is_not_seen(rig):
+    behind = Pose(torch.eye(3, dtype=torch.float64), torch.tensor([0.0, 0, -1.0], dtype=torch.float64))
+    assert np.ptp(photograph(rig["b"], behind, BOARD)) == 0

@@ -1,0 +1,178 @@
+"""Every usual mistake made with rigs whose truth is known, and named."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+
+from arraygeom import Link, Pose, Rig, View
+from calib.images.doctor import diagnose, diagnose_matches
+from calib.images.mistakes import TRANSPOSE, on_cameras, swap
+from pat.cli.main import main
+from pat.media.images import write_image
+from tests.calib.scenes import rectified_pair, rectified_pictures, seen_points, texture, unlike_pair, vector
+
+
+def sizes(rig):
+    return {name: camera.hw for name, camera in rig.cameras.items()}
+
+
+def each(change):
+    return lambda rig: on_cameras(rig, rig.names, change)
+
+
+def one(change):
+    return lambda rig: on_cameras(rig, rig.names[1:], change)
+
+
+def posed(change):
+    return lambda c: c.replace(cam_from_world=change(c.cam_from_world))
+
+
+def moved(d):
+    return lambda c: c.replace(K=c.K + torch.nn.functional.pad(vector([d], [d]), (2, 0, 0, 1)))
+
+
+MISTAKES = {
+    "half-pixel shift": one(moved(0.5)),
+    "one-pixel shift": one(moved(-1.0)),
+    "R transposed": each(posed(lambda p: Pose(p.R.T, p.t))),
+    "pose inverted": each(posed(Pose.inverse)),
+    "cameras swapped": lambda rig: swap(rig, *rig.names),
+    "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
+    "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
+    "resized": one(lambda c: c.resize((c.hw[0] // 2, c.hw[1] // 2)).replace(hw=c.hw)),
+    "turned or mirrored": lambda rig: rig.turn("second", 2),
+}
+
+
+def same_size(rig: Rig) -> Rig:
+    """The pair with pictures of one size, so that swapping them does not show in their sizes."""
+    return rig.with_camera("second", rig["second"].replace(hw=rig["first"].hw))
+
+
+@pytest.mark.parametrize("kind", MISTAKES)
+def test_mistake_is_named_and_undone(kind):
+    rig = same_size(unlike_pair())
+    points = seen_points(rig)
+    found = diagnose_matches(MISTAKES[kind](rig), sizes(rig), points)
+    assert found.named.kind == kind, found.verdict
+    assert not found.healthy
+    assert found.after.misfit < 0.1 < found.before.badness
+    again = diagnose_matches(found.repaired, sizes(rig), points)
+    assert again.healthy, again.verdict
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_nothing_is_wrong(lens):
+    rig = unlike_pair(lens=lens)
+    found = diagnose_matches(rig, sizes(rig), seen_points(rig))
+    assert found.named.kind == "nothing"
+    assert found.healthy
+    assert "nothing wrong" in found.verdict
+    assert found.before.front == found.before.inside == 1.0
+
+
+@pytest.mark.parametrize(
+    ("words", "change"),
+    [
+        ("ignored", lambda c: c.replace(distortion=None)),
+        (
+            "wrong sign",
+            lambda c: c.replace(distortion=dataclasses.replace(c.distortion, coefficients=-c.distortion.coefficients)),
+        ),
+    ],
+)
+def test_wrong_distortion_is_named(words, change):
+    rig = unlike_pair(lens=True)
+    found = diagnose_matches(each(change)(rig), sizes(rig), seen_points(rig))
+    assert found.named.kind == "distortion"
+    assert words in found.named.words
+    assert found.after.misfit < 0.3 * found.before.misfit
+
+
+def test_distortion_applied_twice_is_named():
+    straight = unlike_pair()
+    curved = {n: c.replace(distortion=unlike_pair(lens=True)[n].distortion) for n, c in straight.cameras.items()}
+    found = diagnose_matches(straight.replace(cameras=curved), sizes(straight), seen_points(straight))
+    assert "undistorted already" in found.named.words
+    assert found.repaired["first"].distortion is None
+
+
+def test_drift_is_no_mistake():
+    rig = unlike_pair()
+    drifted = rig.perturbed({"second.rotation": vector(0.001, -0.002, 0.012)})
+    found = diagnose_matches(drifted, sizes(rig), seen_points(rig))
+    assert found.named.kind == "nothing"
+    assert not found.healthy
+    assert "refine" in found.verdict
+    assert found.before.misfit > 0.5
+
+
+def test_what_cannot_be_told_apart_is_said():
+    """Equal cameras side by side: an inverted pose is the same as pictures swapped."""
+    rig = rectified_pair()
+    found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
+    kinds = {found.named.kind, *(remedy.kind for remedy in found.equal)}
+    assert {"pose inverted", "cameras swapped"} <= kinds
+    assert found.before.front < 0.1
+    assert found.after.front > 0.9
+
+
+def test_an_f_of_which_one_side_counts_from_one():
+    rig = unlike_pair()
+    F = rig.pair("first", "second").fundamental
+    shift = torch.eye(3).double()
+    shift[:2, 2] = -1
+    views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
+    matlab = Rig(views, links={("first", "second"): Link(F @ shift)})
+    found = diagnose_matches(matlab, sizes(rig), seen_points(rig, noise=0.02))
+    assert found.named.kind == "one-pixel shift", found.verdict
+    assert math.isnan(found.before.front)
+
+
+@pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "turned or mirrored")])
+def test_pictures_of_another_size(hw, kind):
+    rig = unlike_pair()
+    true = rig.resize("first", hw) if kind == "resized" else rig.turn("first", 1)
+    found = diagnose_matches(rig, sizes(true), seen_points(true))
+    assert found.named.kind == kind
+    assert found.repaired["first"].hw == hw
+    assert found.after.misfit < 0.1
+
+
+def test_pictures_tell_a_mirrored_one():
+    rig, images = rectified_pair(), rectified_pictures()
+    assert diagnose(rig, images).healthy
+    found = diagnose(rig, images | {"right": images["right"].flip(-2)})
+    assert "mirrored top to bottom" in found.named.words
+    assert found.before.handed < 0.1
+
+
+def test_bad_input_is_one_clear_line():
+    rig, images = rectified_pair(), rectified_pictures()
+    with pytest.raises(ValueError, match="two cameras or more"):
+        diagnose(rig, {"left": images["left"]})
+    with pytest.raises(ValueError, match="same picture"):
+        diagnose(rig, {"left": images["left"], "right": images["left"]})
+    with pytest.raises(ValueError, match="do the cameras see the same things"):
+        diagnose(rig, images | {"right": texture(seed=5)})
+    with pytest.raises(ValueError, match="did you mean 'right'"):
+        diagnose(rig, {"left": images["left"], "rihgt": images["right"]})
+
+
+def test_command_line(tmp_path, capsys):
+    rig, images = rectified_pair(), rectified_pictures()
+    files = [f"--image={name}={tmp_path / name}.png" for name in images]
+    for name, picture in images.items():
+        write_image(tmp_path / f"{name}.png", picture)
+    each(posed(Pose.inverse))(rig).save(tmp_path / "rig.yaml")
+    main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "fixed.yaml")])
+    assert "likely mistake" in capsys.readouterr().out
+    main(["rig", "doctor", str(tmp_path / "fixed.yaml"), *files, "--json", "--fix", str(tmp_path / "none.yaml")])
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["healthy"]
+    assert "no rig written" in captured.err
+    assert not (tmp_path / "none.yaml").exists()

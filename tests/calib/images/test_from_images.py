@@ -1,0 +1,45 @@
+"""Rigs from pictures alone."""
+
+import pytest
+
+from arraygeom import Rig
+from calib.images.from_images import start
+from calib.images.refine import line_distances
+from pat.cli.main import main
+from pat.media.images import write_image
+from tests.calib.scenes import rectified_pair, rectified_pictures, seen_points, texture
+
+
+def test_lines_and_map_come_from_pictures_alone():
+    images = rectified_pictures()
+    found = start(images)
+    points = seen_points(rectified_pair(), near=3.0, far=5.5, noise=0.0)
+    assert line_distances(found.rig, points).abs().median() < 0.5
+    assert found.off["left", "right"] < 0.3
+    assert found.rig.pair("left", "right").link.H is not None
+    assert 3 < found.displacement["left", "right"] < 12
+
+
+def test_focal_lengths_are_used_where_they_help():
+    found = start(rectified_pictures(), focal={"left": 310.0, "right": 290.0})
+    points = seen_points(rectified_pair(), near=3.0, far=5.5, noise=0.0)
+    assert line_distances(found.rig, points).abs().median() < 0.5
+
+
+def test_bad_input_is_one_clear_line():
+    images = rectified_pictures()
+    with pytest.raises(ValueError, match="two cameras or more"):
+        start({"left": images["left"]})
+    with pytest.raises(ValueError, match="do the cameras see the same things"):
+        start(images | {"right": texture(seed=5)})
+    with pytest.raises(ValueError, match="no camera with a picture"):
+        start(images, focal={"middle": 300.0})
+
+
+def test_command_line(tmp_path, capsys):
+    for name, picture in rectified_pictures().items():
+        write_image(tmp_path / f"{name}.png", picture)
+    files = [f"--image={name}={tmp_path / name}.png" for name in ("left", "right")]
+    main(["rig", "start", *files, "--out", str(tmp_path / "rig.yaml")])
+    assert "left > right" in capsys.readouterr().out
+    assert ("left", "right") in Rig.load(tmp_path / "rig.yaml").links

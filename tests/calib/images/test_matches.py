@@ -1,0 +1,100 @@
+"""Matched points and what they tell, against rigs that are known."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
+from calib.images.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
+
+HW = (240, 320)
+
+
+def texture(hw=HW, seed=0):
+    """Blobs of many sizes, (1, H, W)."""
+    noise = np.random.default_rng(seed).standard_normal(hw).astype(np.float32)
+    picture = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
+    return torch.from_numpy((picture - picture.min()) / np.ptp(picture))[None]
+
+
+def rig_of(depth=(1.0, 9.0)) -> Rig:
+    R = rotation_from_vector(torch.tensor([0.01, -0.03, 0.05], dtype=torch.float64))
+    t = torch.tensor([-0.2, 0.03, 0.02], dtype=torch.float64)
+    cameras = {
+        "left": Camera(K=intrinsics(300.0, HW), cam_from_world=Pose.from_centre(R, R.T @ t + 3), hw=HW),
+        "right": Camera(K=intrinsics(250.0, HW), cam_from_world=Pose(R.T, t), hw=HW),
+    }
+    return Rig(cameras, depth=depth)
+
+
+def seen_points(rig, *, count=300, near=2.0, far=6.0, noise=0.0):
+    """Matches of random points between two depths in front of left, good to `noise` pixels."""
+    g = torch.Generator().manual_seed(0)
+    left, right = rig["left"], rig["right"]
+    x = torch.rand(count, 2, generator=g, dtype=torch.float64) * torch.tensor([319.0, 239.0])
+    depth = near + (far - near) * torch.rand(count, generator=g, dtype=torch.float64)
+    y = right.project(left.unproject(x, depth)).x
+    return Matches(x, y + noise * torch.randn(count, 2, generator=g, dtype=torch.float64))
+
+
+def test_matches_follow_a_known_map():
+    H = np.array([[0.8, 0.05, 20.0], [-0.05, 0.8, 30.0], [0, 0, 1.0]])
+    picture = texture()
+    moved = torch.from_numpy(cv2.warpPerspective(picture[0].numpy(), H, (300, 220), flags=cv2.INTER_AREA))[None]
+    matches = match_points(picture, 0.3 + 0.5 * moved)
+    assert len(matches.alpha) > 50
+    off = apply_homography(torch.from_numpy(H), matches.alpha).x - matches.beta
+    assert off.norm(dim=-1).median() < 0.5
+    assert off.mean(0).abs().max() < 0.15
+
+
+def test_flat_pictures_have_no_matches():
+    assert len(match_points(torch.full((1, 60, 60), 0.5), texture()).alpha) == 0
+
+
+def test_lines_choose_matches():
+    rig = rig_of()
+    F, matches = rig.pair("left", "right").fundamental, seen_points(rig)
+    assert line_distance(matches, F).max() < 1e-6
+    wrong = Matches(matches.alpha, matches.beta.flip(0))
+    both = Matches(torch.cat([matches.alpha, wrong.alpha]), torch.cat([matches.beta, wrong.beta]))
+    assert 300 <= len(near_lines(both, F, within=1).alpha) < 330
+
+
+def test_a_link_is_made_better_and_its_map_reaches_the_points():
+    rig = rig_of()
+    F, matches = rig.pair("left", "right").fundamental, seen_points(rig, noise=0.2)
+    shift = torch.tensor([[1.0, 0, 2.0], [0, 1, -2.0], [0, 0, 1]], dtype=torch.float64)
+    off = torch.linalg.inv(shift).T @ F
+    assert line_distance(matches, off).median() > 1
+    fit = fit_link(matches, off)
+    exact = seen_points(rig)
+    assert line_distance(exact, fit.link.F).median() < 0.2
+    away = exact.beta - apply_homography(fit.link.H, exact.alpha).x
+    assert (away.norm(dim=-1) < fit.displacement + 3).double().mean() > 0.9
+    line = epipolar_lines(fit.link.F, exact.alpha)
+    along = (away * torch.stack([line[:, 1], -line[:, 0]], -1)).sum(-1)
+    assert fit.displacement < 0.55 * (along.max() - along.min())
+
+
+def test_a_link_needs_points_that_agree():
+    rig = rig_of()
+    matches = seen_points(rig)
+    other = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, -500]], dtype=torch.float64)
+    with pytest.raises(ValueError, match="agree with F"):
+        fit_link(matches, other)
+
+
+def test_depths_hold_what_was_matched():
+    rig = rig_of()
+    near, far = seen_depths(rig.pair("left", "right"), seen_points(rig, noise=0.1))
+    assert 1.7 < near < 2.0
+    assert 6.0 < far < 7.6
+
+
+def test_depths_need_points_that_fit():
+    rig = rig_of()
+    few = seen_points(rig, count=ENOUGH - 1)
+    with pytest.raises(ValueError, match=f"only {ENOUGH - 1} points"):
+        seen_depths(rig.pair("left", "right"), few)

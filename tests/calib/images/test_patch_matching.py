@@ -1,0 +1,69 @@
+"""Matched points by patches: to a few hundredths of a pixel, whatever brightness does; and left alone where wrong."""
+
+import cv2
+import numpy as np
+import torch
+
+from calib.images.matches import match_points
+from calib.images.patch_matching import sharpened
+from tests.calib.scenes import texture
+
+A = np.array([[0.93, -0.08], [0.11, 1.04]])
+SHIFT = np.array([6.3, -4.7])
+RANDOM = np.random.default_rng(0)
+
+
+def warped(hw=(240, 320)):
+    """A picture and how a second camera sees it: y = A x + shift, darker and flatter, with noise."""
+    picture = (texture(hw, seed=3)[0].numpy() * 255).astype(np.float32)
+    there = cv2.warpAffine(picture, np.c_[A, SHIFT], hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    pictures = picture, 0.6 * there + 20
+    return [(p + RANDOM.normal(0, 0.7, hw)).round().clip(0, 255).astype(np.uint8) for p in pictures]
+
+
+def points():
+    return RANDOM.uniform(40, (280, 200), (60, 2))
+
+
+def test_points_return_to_where_they_are_seen():
+    alpha, beta = warped()
+    x = points()
+    truth = x @ A.T + SHIFT
+    found = sharpened(alpha, beta, x, truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1))).y
+    off = np.linalg.norm(found - truth, axis=1)
+    assert np.median(off) < 0.05
+    assert (off < 0.15).mean() > 0.95
+
+
+def test_what_is_not_alike_is_left_alone():
+    alpha, _ = warped()
+    other = (texture((240, 320), seed=9)[0].numpy() * 255).astype(np.uint8)
+    x = points()
+    y = x + SHIFT
+    found = sharpened(alpha, other, x, y, np.tile(A, (60, 1, 1))).y
+    assert (found == y).all(1).mean() > 0.9
+    assert sharpened(alpha, other, x[:0], y[:0], np.zeros((0, 2, 2))).y.shape == (0, 2)
+
+
+def test_matches_are_better_for_it():
+    alpha, beta = (torch.from_numpy(p / np.float32(255))[None] for p in warped())
+    matches = match_points(alpha, beta)
+    off = np.linalg.norm(matches.alpha.numpy() @ A.T + SHIFT - matches.beta.numpy(), axis=1)
+    assert len(off) > 60
+    assert np.median(off) < 0.08
+
+
+def test_deviations_tell_good_points_from_bad_ones():
+    """Points without texture have large ones, those that nothing fits infinite ones; others are as off as they say."""
+    alpha, beta = warped()
+    flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]
+    noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]
+    x = points()
+    truth = x @ A.T + SHIFT
+    found = sharpened(*noisy, x, truth + RANDOM.normal(0, 0.3, x.shape), np.tile(A, (60, 1, 1)))
+    left = (x[:, 0] < 140) & (truth[:, 0] < 140) & np.isfinite(found.deviation)
+    right = (x[:, 0] > 180) & (truth[:, 0] > 180)
+    assert np.median(found.deviation[right]) > 4 * np.median(found.deviation[left])
+    assert np.median(np.linalg.norm(found.y - truth, axis=1)[left]) < 3 * np.median(found.deviation[left])
+    alike, *_ = warped()
+    assert np.isinf(sharpened(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean() > 0.9

@@ -1,0 +1,251 @@
+"""Rigs made worse and made better again, against their truth."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Camera, Link, Rig, View
+from calib.images.matches import Matches, match_cameras
+from calib.images.parameters import changed, unknowns
+from calib.images.photometric import Views, photometric_errors
+from calib.images.refine import Fit, jacobian, line_distances, polish, refine, refine_matches, sampson, solve
+from calib.images.residuals import epipolar_residuals
+from pat.attention import attend_with_statistics
+from pat.cli.main import main
+from pat.media.images import write_image
+from tests.calib.scenes import HW, rectified_pair, rectified_pictures, seen_points, texture, unlike_pair, vector
+
+
+def worse(rig: Rig, *, seed=0) -> Rig:
+    """Each camera turned by 0.3 degrees, each principal point moved by 5 pixels, some way or other."""
+    g = torch.Generator().manual_seed(seed)
+    changes = rig.parameters(free=["*.rotation", "*.centre"])
+    drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
+    size = {"rotation": math.radians(0.3), "centre": 5.0}
+    return rig.perturbed({k: v / v.norm() * size[k.rpartition(".")[2]] for k, v in drawn.items()})
+
+
+def median_off(rig: Rig, pairs) -> float:
+    return float(line_distances(rig, pairs).abs().median())
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_a_perturbed_rig_returns(lens):
+    rig = unlike_pair(lens=lens)
+    bad, exact = worse(rig), seen_points(rig, noise=0.0, seed=1)
+    assert median_off(bad, exact) > 1
+    found = refine_matches(bad, [seen_points(rig)])
+    assert found.accepted
+    assert found.held_out[1].median < 0.25 < found.held_out[0].median
+    assert median_off(found.rig, exact) < 0.1
+    assert found.rig["first"].R is bad["first"].R
+    assert "second.rotation" in found.as_text()
+    assert "degrees" in found.as_text()
+
+
+def test_wrong_points_do_not_matter():
+    rig = unlike_pair()
+    (names, points), *_ = seen_points(rig).items()
+    wrong = points.beta.clone()
+    wrong[::8] += torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, wrong[::8].shape))
+    found = refine_matches(worse(rig), [{names: Matches(points.alpha, wrong)}])
+    assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.12
+
+
+def test_several_frames_hold_a_whole_one_out():
+    rig = unlike_pair()
+    frames = [seen_points(rig, count=100, seed=seed) for seed in range(3)]
+    found = refine_matches(worse(rig), frames)
+    assert found.held_out[0].points == 100
+    assert found.fitted[0].points == 200
+    assert found.accepted
+
+
+def test_what_pictures_cannot_tell_is_left_alone_and_named():
+    """Side by side and alike, a shift of both principal points along the rows moves no line."""
+    rig = rectified_pair()
+    bad = rig.perturbed({"right.rotation": vector(0.003, 0, 0.004)})
+    found = refine_matches(bad, [seen_points(rig)], free=["rotation", "centre", "translation"])
+    assert {"left.centre x", "right.centre x", "right.translation x"} <= set(found.left_alone)
+    for name in ("left", "right"):
+        assert found.rig[name].K[0, 2] == bad[name].K[0, 2]
+    assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
+
+
+def test_translations_are_freed_where_points_demand_it():
+    """What no turn and no shift of the principal points explains; where they do, the baseline stays as it is."""
+    rig = unlike_pair()
+    exact = seen_points(rig, noise=0.0, seed=1)
+    moved = rig.perturbed({"second.translation": vector(0, 0.006, 0.012)})
+    found = refine_matches(moved, [seen_points(rig, count=400)])
+    assert any(change.name == "second.translation" for change in found.changes)
+    assert median_off(found.rig, exact) < 0.1
+    turned = refine_matches(worse(rig), [seen_points(rig)])
+    assert not any("translation" in change.name for change in turned.changes)
+    only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
+    assert not any("translation" in change.name for change in only.changes)
+
+
+def test_a_tight_prior_holds():
+    rig = unlike_pair()
+    found = refine_matches(worse(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)})
+    assert any("centre" in name for name in found.left_alone)
+    assert not any("centre" in change.name for change in found.changes)
+
+
+def test_a_good_rig_stays_as_it_is():
+    rig = unlike_pair()
+    found = refine_matches(rig, [seen_points(rig)])
+    assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
+
+
+def test_points_held_out_refuse_what_wrong_points_say():
+    rig = unlike_pair()
+    drifted = rig.perturbed({"second.rotation": vector(0.01, 0.005, 0)})
+    found = refine_matches(rig, [seen_points(drifted), seen_points(rig, seed=2)])
+    assert not found.accepted
+    assert found.rig is rig
+    assert found.changes == ()
+    assert "not accepted" in found.as_text()
+
+
+def test_deviations_are_those_of_repeated_measurement():
+    """The spread of the answers over draws of noise is what the answer says of itself."""
+    rig = rectified_pair().perturbed({"right.rotation": vector(0.02, 0.01, -0.03)})
+    draws = [refine_matches(worse(rig), [seen_points(rig, noise=0.2, seed=s)], free=["rotation"]) for s in range(12)]
+    amounts = torch.tensor([d.changes[0].amount for d in draws])
+    stated = torch.tensor([d.changes[0].deviation for d in draws]).mean(0)
+    ratio = amounts.std(0)[[0, 2]] / stated[[0, 2]]
+    assert (ratio > 0.4).all()
+    assert (ratio < 2.5).all()
+
+
+@pytest.mark.parametrize("lens", [False, True])
+def test_derivatives_are_those_of_finite_differences(lens):
+    rig = unlike_pair(lens=lens)
+    pairs = seen_points(rig, count=20)
+    free = ["rotation", "translation", "focal", "centre"] + (["distortion"] if lens else [])
+    given = unknowns(rig, rig.names, free=free)
+    z = 0.1 * torch.ones(sum(len(u.sigma) for u in given), dtype=torch.float64)
+
+    def algebraic_over_fixed_gradient(z):
+        return sampson(changed(rig, given, z), pairs)
+
+    _, J = jacobian(algebraic_over_fixed_gradient, z)
+    (names, points), *_ = pairs.items()
+    fixed = epipolar_residuals(changed(rig, given, z).pair(*names), points)
+    for k in (0, 4, len(z) - 1):
+        step = torch.zeros_like(z)
+        step[k] = 1e-4
+        ends = [epipolar_residuals(changed(rig, given, z + s * step).pair(*names), points).sampson for s in (1, -1)]
+        difference = (ends[0] - ends[1]) / 2e-4
+        near_zero = fixed.sampson.abs() < 3
+        assert torch.allclose(J[near_zero, k], difference[near_zero], atol=0.05, rtol=0.05)
+
+
+def test_solving_without_data_returns_the_prior():
+    found = solve(lambda z: 0 * z.sum() + torch.zeros(5, dtype=torch.float64), 3)
+    assert not found.active.any()
+    assert found.z.tolist() == [0, 0, 0]
+
+
+def test_a_fundamental_matrix_is_refined():
+    rig = unlike_pair()
+    bad = worse(rig).pair("first", "second").fundamental
+    views = {name: View(hw=camera.hw) for name, camera in rig.cameras.items()}
+    uncalibrated = Rig({**views, "third": View(hw=HW)}, links={("first", "second"): Link(bad)})
+    points = seen_points(rig)
+    found = refine_matches(uncalibrated, [{**points, ("first", "third"): points["first", "second"]}])
+    assert found.accepted
+    assert "changed: F of first > second" in found.as_text()
+    assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
+
+
+def test_photometric_error_is_least_for_the_true_rig():
+    rig, images = rectified_pair(), rectified_pictures()
+    rig = rig.replace(depth=(2.5, 6.5))
+    views = Views.of(images)
+
+    def error(pixels):
+        moved = rig.perturbed({"right.centre": vector(0, pixels)})
+        left, seen = photometric_errors(moved, views, ("left", "right"), attend_with_statistics)
+        return float(left[seen].abs().mean())
+
+    errors = {p: error(p) for p in (-2.0, -1.0, 0.0, 1.0, 2.0)}
+    assert min(errors, key=errors.get) == 0.0
+    change = torch.zeros(2, dtype=torch.float64, requires_grad=True)
+    left, _ = photometric_errors(
+        rig.perturbed({"right.centre": change + vector(0, 0.7)}), views, ("left", "right"), attend_with_statistics
+    )
+    (slope,) = torch.autograd.grad(left.square().sum(), change)
+    assert slope[1] > 0
+
+
+def test_the_fusions_error_brings_a_rig_nearer_its_truth():
+    rig, images = rectified_pair(), rectified_pictures()
+    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
+    found = refine(bad, [images], free=["rotation"], attend=attend_with_statistics)
+    assert found.accepted
+    assert found.photometric is not None
+    assert "fusion's own error" in found.as_text()
+    assert median_off(found.rig, seen_points(rig, noise=0.0)) < 0.1
+
+
+def test_the_fusions_error_alone_does_too():
+    """No point is used: the gradient through attention's segments moves the rig."""
+    rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_pictures()
+    fit = Fit.of(
+        rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}),
+        [match_cameras(images)],
+        free=["right.rotation"],
+        sigma=None,
+    )
+    truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
+    before = median_off(fit.rig, truth)
+    found, errors = polish(fit, fit.prior(), [images], attend_with_statistics)
+    assert before > 1
+    assert median_off(fit.after(found.z), truth) < 0.3 * before
+    assert errors.accepted
+    assert errors.after < errors.before
+
+
+def test_bad_input_is_one_clear_line():
+    rig, images = rectified_pair(), rectified_pictures()
+    with pytest.raises(ValueError, match="two cameras or more"):
+        refine(rig, [{"left": images["left"]}])
+    with pytest.raises(ValueError, match="same picture"):
+        refine(rig, [{"left": images["left"], "right": images["left"]}])
+    with pytest.raises(ValueError, match="do the cameras see the same things"):
+        refine(rig, [images | {"right": texture(seed=5)}])
+    with pytest.raises(ValueError, match=r"is 100x80, the rig says 320x240.*doctor"):
+        refine(rig, [images | {"right": texture((80, 100))}])
+    with pytest.raises(ValueError, match="the rig has no 'rotatoin'"):
+        refine(rig, [images], free=["rotatoin"])
+    with pytest.raises(ValueError, match="nothing is free"):
+        refine(rig, [images], free=["left.rotation"])
+    unknown = Rig({name: View(hw=HW) for name in images})
+    with pytest.raises(ValueError, match="says nothing of how these cameras are related"):
+        refine(unknown, [images])
+    with pytest.raises(ValueError, match="--sigma"):
+        refine(rig, [images], sigma={"center": 3})
+
+
+def test_command_line(tmp_path, capsys):
+    rig, images = rectified_pair(), rectified_pictures()
+    files = [f"--image={name}={tmp_path / name}.png" for name in images]
+    for name, picture in images.items():
+        write_image(tmp_path / f"{name}.png", picture)
+    rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}).save(tmp_path / "rig.yaml")
+    command = ["rig", "refine", str(tmp_path / "rig.yaml"), *files, "--free", "rotation"]
+    main([*command, "--no-photometric", "--out", str(tmp_path / "better.yaml")])
+    assert "changed: right.rotation" in capsys.readouterr().out
+    better = Rig.load(tmp_path / "better.yaml")
+    assert isinstance(better["right"], Camera)
+    assert better["right"].hw == HW
+    assert median_off(better, seen_points(rig, noise=0.0)) < 0.15
+    with pytest.raises(SystemExit):
+        main([*command, f"--image=left={tmp_path / 'left.png'}", "--out", str(tmp_path / "none.yaml")])
+    assert "every camera needs a picture of every frame" in capsys.readouterr().err
+    assert not (tmp_path / "none.yaml").exists()

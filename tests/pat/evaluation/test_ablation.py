@@ -1,0 +1,130 @@
+"""Ablation: the same scenes for every family; calibrated wins; what cannot be served is said."""
+
+import csv
+import json
+import math
+import shutil
+
+import pytest
+import torch
+
+from pat.evaluation.ablation import (
+    ALPHA,
+    BETA,
+    Row,
+    ablate,
+    families,
+    layered_cases,
+    markdown,
+    point_errors,
+    rendered_cases,
+)
+from pat.evaluation.baseline import classical
+from pat.evaluation.metrics import score
+from pat.media.images import read_image
+from pat.networks.paper import PAT, PATConfig
+from pat.networks.weights import load_weights
+from pat.sensors import Linear, record
+from pat.synthesis.rendered import Frame, save_frame
+
+CHOSEN = ("calibrated", "rectified assumption", "turned by 1 deg", "centre off by 10 px", "local 5x5", "dense")
+
+
+@pytest.fixture(scope="module")
+def case():
+    return next(layered_cases(1, hw=(96, 128), seed=3))
+
+
+def test_cases_are_unrectified_rigs_that_see_the_same_scene(case):
+    assert 1 <= case.ratio <= 3
+    alpha, beta = case.rig.pair(ALPHA, BETA).cameras
+    assert alpha.K[0, 0] / beta.K[0, 0] == pytest.approx(case.ratio)
+    baseline = classical(case.rig, case.images, ALPHA, BETA)
+    grey = case.images[ALPHA].expand(3, -1, -1)
+    assert score(baseline, case.truth).psnr > score(grey, case.truth).psnr + 3
+
+
+def test_every_family_is_there():
+    names = list(families())
+    assert names[0] == "calibrated"
+    assert {"rectified assumption", "homography + displacement", "nearest voxels", "local 5x5", "dense"} <= {*names}
+    assert sum(name.startswith(("turned by", "centre off")) for name in names) == 6
+
+
+def test_perturbed_rigs_are_off_by_what_they_say(case):
+    """Seen by the middle ray: degrees between the axes, pixels between the points."""
+    all_families, g = families(), torch.Generator().manual_seed(0)
+    beta = case.rig[BETA]
+    for degrees in (0.1, 0.3, 1.0):
+        moved = all_families[f"turned by {degrees:g} deg"].believed(case.rig, g)[BETA]
+        chord = (moved.R - beta.R).norm() / 8**0.5
+        assert float(2 * chord.asin().rad2deg()) == pytest.approx(degrees, rel=1e-3)
+        torch.testing.assert_close(moved.centre, beta.centre)
+    for pixels in (1.0, 3.0, 10.0):
+        moved = all_families[f"centre off by {pixels:g} px"].believed(case.rig, g)[BETA]
+        assert float((moved.K - beta.K).norm()) == pytest.approx(pixels)
+
+
+def test_what_cannot_be_served_is_said_and_the_rest_is_ordered(case, tmp_path):
+    chosen = {name: family for name, family in families().items() if name in CHOSEN}
+    rows = {row.family: row for row in ablate(load_weights("mono-colour"), [case], out=tmp_path, chosen=chosen)}
+    assert rows["local 5x5"].note == rows["dense"].note == "explicit positions: GuidedPAT looks along segments"
+    calibrated = rows["calibrated"].psnr
+    assert calibrated > rows["rectified assumption"].psnr + 1
+    assert calibrated > rows["turned by 1 deg"].psnr
+    assert calibrated > rows["centre off by 10 px"].psnr
+    assert calibrated > rows["alpha alone"].psnr + 2
+    with (tmp_path / "ablation.csv").open() as file:
+        assert [r["family"] for r in csv.DictReader(file)] == ["alpha alone", "classical", *chosen]
+    assert rows["calibrated"].end_point_error < rows["centre off by 10 px"].end_point_error
+    assert rows["calibrated"].within_one > rows["rectified assumption"].within_one
+    assert "| dense |  |  |  |" in (tmp_path / "ablation.md").read_text()
+    assert read_image(tmp_path / "ablation.png").shape[0] == 3
+
+
+def test_the_papers_network_is_served_every_family(tmp_path):
+    case = next(layered_cases(1, hw=(32, 48), seed=1))
+    chosen = {name: families()[name] for name in ("calibrated", "nearest voxels", "local 5x5", "dense")}
+    rows = ablate(PAT(PATConfig(dim=4)), [case], out=tmp_path, chosen=chosen)
+    assert [row.family for row in rows if row.note] == []
+
+
+def test_rows_are_grouped_by_focal_ratio():
+    rows = [Row("a", 1.2, "calibrated", 30.0, 0.9), Row("b", 2.5, "calibrated", 34.0, 0.9)]
+    rows += [Row("a", 1.2, "other", 29.0, 0.8), Row("b", 2.5, "other", note="cannot")]
+    lines = markdown(rows).splitlines()
+    assert "| calibrated | 32.00 (30.00 to 34.00) | 0.9000 | +0.00 | 30.00 |  | 34.00 |  |  |  |" in lines
+    assert "| other | 29.00 (nan to nan) | 0.8000 | -1.00 | 29.00 |  |  |  |  | 1 scenes left out |" in lines
+
+
+def test_the_true_depth_is_nowhere_off(case):
+    assert point_errors(case, case.depth) == (0, 1)
+    error, within = point_errors(case, torch.full_like(case.depth, torch.nan))
+    assert math.isnan(error)
+    assert math.isnan(within)
+    assert point_errors(case, case.depth * 1.05)[0] > 0.1
+
+
+def test_rendered_folders(tmp_path, case):
+    """What a renderer would leave, with the pictures of a layered scene."""
+    folder = tmp_path / "scenes" / "one"
+    folder.mkdir(parents=True)
+    with pytest.raises(ValueError, match="holds no rendered scene"):
+        rendered_cases(tmp_path)
+    (folder / "scene.yaml").write_text("")
+    with pytest.raises(ValueError, match=r"one is not whole \(render.json is missing\): render it"):
+        rendered_cases(tmp_path)
+    case.rig.save(folder / "rig.yaml")
+    pictures = {ALPHA: case.truth, BETA: case.images[BETA]}
+    for name, picture in pictures.items():
+        linear = record(picture[None], [Linear()], torch.Generator()).image[0]
+        index = torch.ones(picture.shape[1:], dtype=torch.long)
+        save_frame(folder / f"{name}.npz", Frame(time=0.0, rgb=linear, depth=case.depth, index=index))
+    frames = {name: [{"file": f"{name}.npz", "time": 0.0}] for name in pictures}
+    (folder / "render.json").write_text(json.dumps({"frames": frames}))
+    (read,) = rendered_cases(tmp_path)
+    assert (read.truth - case.truth).abs().max() < 2e-3
+    assert read.ratio == pytest.approx(case.ratio)
+    assert torch.equal(read.depth, case.depth)
+    shutil.copytree(folder, tmp_path / "others" / "one")
+    assert [c.name for c in rendered_cases(tmp_path)] == ["others/one", "scenes/one"]

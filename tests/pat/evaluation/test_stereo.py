@@ -1,0 +1,261 @@
+import csv
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from arraygeom import pixel_grid
+from pat.data import Disparity, StereoPair, middlebury_pairs
+from pat.evaluation.metrics import score
+from pat.evaluation.stereo import (
+    BASELINES,
+    Row,
+    controls,
+    depth_markdown,
+    evaluate_pairs,
+    evaluate_sets,
+    falls,
+    markdown,
+    rectified_fusion,
+    sets_markdown,
+    structure_kept,
+    summarise,
+    write_csv,
+    write_markdown,
+)
+from pat.media.images import read_image, write_image
+from pat.networks.protocol import Fused
+from pat.networks.weights import load_weights
+
+
+def pairs(count=2):
+    generator = torch.Generator().manual_seed(0)
+    return [StereoPair(f"set/{k}", *torch.rand(2, 3, 16, 24, generator=generator)) for k in range(count)]
+
+
+def test_rows_are_the_scores_of_what_the_method_returns():
+    first, second = pairs()
+    rows = evaluate_pairs([first, second], {"grey": lambda alpha, beta, d: alpha.expand(3, -1, -1) + 2}, [2])
+    assert [(row.pair, row.rate, row.method) for row in rows] == [("set/0", 2, "grey"), ("set/1", 2, "grey")]
+    white = torch.ones(3, 16, 24)
+    assert rows[0][3:5] == score(white, first.left)
+    assert rows[0][5:] == (None, None)
+
+
+def test_a_method_gets_the_protocols_inputs():
+    def look(alpha, beta, max_disparity):
+        seen.append((tuple(alpha.shape), tuple(beta.shape), max_disparity))
+        return alpha.expand(3, -1, -1)
+
+    seen = []
+    evaluate_pairs(pairs(1), {"look": look}, [2, 4])
+    assert seen == [((1, 16, 24), (3, 8, 12), 120), ((1, 16, 24), (3, 4, 6), 120)]
+
+
+def test_baselines_run_and_pictures_lie_side_by_side(tmp_path):
+    (pair,) = pairs(1)
+    rows = evaluate_pairs([pair], BASELINES, [2], pictures=tmp_path)
+    assert [row.method for row in rows] == ["alpha", "beta", "classical"]
+    strip = read_image(tmp_path / "set-0_x2.png")
+    assert strip.shape == (3, 16, 24 * 5)
+    torch.testing.assert_close(strip[..., -24:], pair.left, atol=0.002, rtol=0)
+    torch.testing.assert_close(strip[..., :24], strip[..., 48:72])
+
+
+@pytest.mark.parametrize(
+    ("result", "complaint"),
+    [(torch.zeros(1, 16, 24), "wanted a picture"), (torch.full((3, 16, 24), math.nan), "NaN")],
+)
+def test_a_result_that_cannot_be_scored_names_method_and_pair(result, complaint):
+    with pytest.raises(ValueError, match=f"ours on set/0: .*{complaint}"):
+        evaluate_pairs(pairs(1), {"ours": lambda *_: result}, [2])
+
+
+ROWS = [Row("a", 2, "ours", 30.0, 0.9), Row("a", 4, "ours", 28.0, 0.8), Row("b", 2, "ours", 34.0, 0.96)]
+
+
+def test_summaries_are_means_by_rate_and_method():
+    two, four = summarise(ROWS)
+    assert (two.rate, two.method, two.pairs, two.psnr) == (2, "ours", 2, 32)
+    assert two.ssim == pytest.approx(0.93)
+    assert two.psnr_interval == (30, 34)
+    assert (four.psnr, four.pairs) == (28, 1)
+
+
+def depth_errors(cells):
+    return [float(cells[name]) if cells[name] else None for name in ("end_point_error", "within_one")]
+
+
+def test_tables_hold_every_row(tmp_path):
+    write_csv(tmp_path / "t.csv", ROWS)
+    with (tmp_path / "t.csv").open() as file:
+        again = [
+            Row(r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]), *depth_errors(r))
+            for r in csv.DictReader(file)
+        ]
+    assert again == ROWS
+    write_markdown(tmp_path / "t.md", ROWS)
+    assert (tmp_path / "t.md").read_text() == markdown(ROWS)
+    assert markdown(ROWS).splitlines() == [
+        "| beta reduced 2x | ours |",
+        "| --- | ---: |",
+        "| a | 30.00 / 0.9000 |",
+        "| b | 34.00 / 0.9600 |",
+        "| **mean** | **32.00** (30.00 to 34.00) / **0.9300** |",
+        "",
+        "| beta reduced 4x | ours |",
+        "| --- | ---: |",
+        "| a | 28.00 / 0.8000 |",
+        "| **mean** | **28.00** / **0.8000** |",
+    ]
+
+
+class Matcher:
+    """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
+
+    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
+
+    def __init__(self, disparity):
+        self.disparity, self.betas = disparity, []
+
+    def balance(self, alpha, beta, look):
+        return look
+
+    def survey(self, alpha, beta, look):
+        return None
+
+    def __call__(self, alpha, betas, looks):
+        self.betas.append([(b.shape[1], float(b.mean())) for b in betas])
+        self.looks = looks
+        grid = (
+            pixel_grid(tuple(alpha.shape[-2:])).movedim(-1, 0)[None]
+            - torch.tensor([self.disparity, 0.0])[:, None, None]
+        )
+        sure = torch.ones_like(alpha[:, 0])
+        return Fused(alpha.expand(-1, 3, -1, -1), [grid] * len(betas), [sure] * len(betas), [sure] * len(betas))
+
+
+def test_depth_is_compared_where_it_is_known():
+    """A constant disparity of 5 against a truth of 5 on the left half, 8 on the right, unknown in the first row."""
+    (pair,) = pairs(1)
+    value = torch.full((16, 24), 5.0)
+    value[:, 12:] = 8
+    valid = torch.ones(16, 24, dtype=torch.bool)
+    valid[0] = False
+    pair = replace(pair, disparity=Disparity(value, valid))
+    (row,) = evaluate_pairs([pair], {"fusion": rectified_fusion(Matcher(5.0))}, [2], max_disparity=9)
+    assert row.end_point_error == pytest.approx(1.5, abs=1e-4)
+    assert row.within_one == pytest.approx(0.5)
+    assert "| set/0 | 1.50 px / 50.0% |" in depth_markdown([row])
+    assert depth_markdown(ROWS) == ""
+
+
+def test_three_bands_are_three_cameras():
+    network, (pair,) = Matcher(3.0), pairs(1)
+    evaluate_pairs([pair], {"fusion": rectified_fusion(network, bands=True)}, [2], max_disparity=9)
+    (given,) = network.betas
+    assert [channels for channels, _ in given] == [1, 1, 1]
+    assert [mean for _, mean in given] == pytest.approx(pair.right.mean((1, 2)).tolist(), abs=0.01)
+
+
+def test_controls_take_the_reference_away():
+    (pair,) = pairs(1)
+    network = Matcher(3.0)
+    evaluate_pairs([pair], {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=9)
+    right, none, foreign, shuffled = (mean for ((_, mean),) in network.betas)
+    assert none == 0
+    assert abs(foreign - right) > 0.02
+    assert shuffled == right
+    x = pixel_grid((16, 24)).reshape(-1, 2)
+    looked = network.looks[0].at(x)
+    assert sorted(looked.end.round().tolist()) == sorted(x.tolist())
+    assert (looked.end - x).norm(dim=-1).mean() > 5
+
+
+def test_falls_are_means_and_the_least():
+    rows = [
+        Row(p, 2, m, v, 0.9) for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
+    ]
+    assert falls(rows, names=["no"]) == "- no: 4.00 dB below fusion, at least 3.00 dB\n"
+
+
+def test_the_papers_figures_stand_beside_the_mean_and_are_marked():
+    text = sets_markdown({"kitti": ROWS}, protocol="table2")
+    assert "| beta reduced 2x | ours | the paper, printed, on its own data |" in text
+    assert "| **mean** | **32.00** (30.00 to 34.00) / **0.9300** | 28.77 / 0.8955 |" in text
+    assert "printed" not in sets_markdown({"middlebury": ROWS}, protocol="table2")
+
+
+def without_reference(pairs):
+    """How much each control costs, by the weights of the package, at the least of some pairs; dB."""
+    network = load_weights("mono-colour")
+    rows = evaluate_pairs(pairs, {"fusion": rectified_fusion(network), **controls(network)}, [2], max_disparity=80)
+    psnr = {(row.pair, row.method): row.psnr for row in rows}
+    return {name: min(psnr[p.name, "fusion"] - psnr[p.name, name] for p in pairs) for name in controls(network)}
+
+
+def test_controls_fall_on_a_real_pair(shared_data):
+    pair = next(p for p in middlebury_pairs(shared_data / "middlebury") if p.name.endswith("Flowerpots"))
+    crop = replace(pair, left=pair.left[:, 80:240, 100:340], right=pair.right[:, 80:240, 100:340], disparity=None)
+    assert min(without_reference([crop]).values()) > 2
+
+
+@pytest.mark.slow
+def test_controls_fall_on_real_pairs(shared_data):
+    wanted = ("Bowling1", "Midd1", "teddy", "Cloth1")
+    pairs = [p for p in middlebury_pairs(shared_data / "middlebury") if p.name.endswith(wanted)]
+    assert min(without_reference(pairs).values()) > 2
+
+
+class Onlooker:
+    """A network that notes where it is told to look, and gives alpha back."""
+
+    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
+
+    def balance(self, alpha, beta, look):
+        return look
+
+    def survey(self, alpha, beta, look):
+        return None
+
+    def __call__(self, alpha, betas, looks):
+        found = looks[0].at(torch.tensor([[20.0, 7.0]]))
+        self.start, self.end = found.start[0].tolist(), found.end[0].tolist()
+        self.beta = tuple(betas[0].shape)
+        none = alpha[:, 0] * 0
+        return Fused(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
+
+
+def test_fusion_looks_along_the_row_in_alphas_pixels():
+    network, (pair,) = Onlooker(), pairs(1)
+    rows = evaluate_pairs(
+        [pair], {"fusion": rectified_fusion(network), "alpha": BASELINES["alpha"]}, [2], max_disparity=9
+    )
+    assert (network.start, network.end, network.beta) == ([11.0, 7.0], [20.0, 7.0], (1, 3, 16, 24))
+    assert rows[0][3:5] == rows[1][3:5]
+
+
+def test_sets_are_read_by_their_own_rules_and_shown_apart(tmp_path):
+    (pair,) = pairs(1)
+    for name in ("left", "right"):
+        write_image(tmp_path / "k" / f"{name}.png", getattr(pair, name))
+    rows = evaluate_sets({"kitti": tmp_path / "k", "folder": tmp_path / "k"}, BASELINES, [2], out=tmp_path / "out")
+    assert list(rows) == ["kitti", "folder"]
+    assert rows["kitti"] == rows["folder"]
+    assert (tmp_path / "out" / "folder").is_dir()
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        evaluate_sets({"kitti": tmp_path / "k", "folder": tmp_path / "nowhere"}, {}, [2], out=tmp_path)
+    assert sets_markdown({"a": ROWS}).startswith(f"#### a\n\n{markdown(ROWS)}\n")
+
+
+def test_lost_structure_is_named():
+    rows = [Row("p", 2, "alpha", 20, 0.9), Row("p", 2, "fusion", 30, 0.9), Row("q", 2, "alpha", 20, 0.9)]
+    rows.append(Row("q", 2, "fusion", 30, 0.91))
+    assert structure_kept(rows) == "SSIM of fusion is at least that of alpha in 2 of 2 cases."
+    rows[1] = rows[1]._replace(ssim=0.8999)
+    assert structure_kept(rows).endswith("1 of 2 cases; **below it**: p 2x.")
+
+
+def test_beta_as_it_is_has_its_own_header():
+    assert markdown([Row("a", 1, "ours", 30.0, 0.9)]).startswith("| beta as it is | ours |")

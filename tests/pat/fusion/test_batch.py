@@ -1,0 +1,161 @@
+"""Many frames and sequences on disk: resumed to the same bits, whole files only, one bad picture costs one frame."""
+
+import errno
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import arraygeom.atomic
+import pytest
+import torch
+
+from arraygeom import Rig
+from pat.cli.main import main
+from pat.fusion.batch import Batch, find_pictures
+from pat.media.images import read_image, write_image
+from pat.media.raw import LIGHT
+from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.weights import save_weights
+from pat.support.jobs import JobError
+from tests.pat.fusion import moving
+
+
+@pytest.fixture(scope="module")
+def material(tmp_path_factory) -> Path:
+    """A folder with weights of a tiny network, a rig, and seven fast and two slow pictures."""
+    folder = tmp_path_factory.mktemp("material")
+    torch.manual_seed(0)
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))
+    save_weights(network, folder / "tiny.safetensors")
+    frames, _ = moving.recording(7, 0.003)
+    for name, pictures in frames.items():
+        for i, picture in enumerate(pictures):
+            write_image(folder / name / f"{name}_{i + 8}.png", picture)
+    moving.rig(0.003).save(folder / "rig.yaml")
+    return folder
+
+
+def batch(material, out, **options) -> Batch:
+    files = {name: find_pictures(material / name) for name in ("fast", "slow")}
+    if not options.get("sequence"):
+        files["slow"] = [files["slow"][0]] * len(files["fast"])
+    options = {"weights": str(material / "tiny.safetensors"), "files": files, **options}
+    return Batch(rig=Rig.load(material / "rig.yaml"), alpha="fast", out=out, **options)
+
+
+def contents(out: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in sorted(out.iterdir()) if p.suffix in (".png", ".tif")}
+
+
+def test_pictures_are_found_in_the_order_of_their_numbers(material, tmp_path):
+    assert [p.name for p in find_pictures(material / "fast")] == [f"fast_{i}.png" for i in range(8, 15)]
+    assert [p.name for p in find_pictures(f"{material}/fast/*_1?.png")] == [f"fast_{i}.png" for i in range(10, 15)]
+    with pytest.raises(FileNotFoundError, match=r"mono: .*no pictures there"):
+        find_pictures(tmp_path, name="mono")
+
+
+def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monkeypatch):
+    whole = batch(material, tmp_path / "whole", sequence=True)
+    assert len(whole.run(video=25.0).made) == 7
+    assert (tmp_path / "whole" / "fused.mp4").is_file()
+    assert not (tmp_path / "whole" / ".keys").exists()
+    part, fuse_one = batch(material, tmp_path / "part", sequence=True), Batch.fuse_one
+
+    def stop_at_4(self, i):
+        if i == 4:
+            raise KeyboardInterrupt
+        fuse_one(self, i)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Batch, "fuse_one", stop_at_4)
+        with pytest.raises(KeyboardInterrupt):
+            part.run()
+    report = part.run(resume=True)
+    assert (len(report.kept), len(report.made)) == (4, 3)
+    assert contents(tmp_path / "part") == contents(tmp_path / "whole")
+    (tmp_path / "part" / "fast_9_fused.png").unlink()
+    assert len(part.run(resume=True).made) == 1
+    assert contents(tmp_path / "part") == contents(tmp_path / "whole")
+
+
+def test_other_settings_are_not_mixed_in(material, tmp_path):
+    batch(material, tmp_path / "out", files={n: find_pictures(material / n)[:1] for n in ("fast", "slow")}).run()
+    with pytest.raises(ValueError, match=r"settings.yaml: the frames there were made with other settings"):
+        batch(material, tmp_path / "out", match_levels=True).run(resume=True)
+
+
+def spoiled(material, tmp_path, i) -> dict[str, list[Path]]:
+    """The files, one of alpha's cut in half."""
+    files = {"fast": find_pictures(material / "fast"), "slow": [find_pictures(material / "slow")[0]] * 7}
+    half = tmp_path / files["fast"][i].name
+    half.write_bytes(files["fast"][i].read_bytes()[:900])
+    return files | {"fast": [half if k == i else f for k, f in enumerate(files["fast"])]}
+
+
+def test_a_corrupt_picture_costs_its_frame_or_stops_the_job(material, tmp_path):
+    bad = batch(material, tmp_path / "bad", files=spoiled(material, tmp_path, 2))
+    with pytest.raises(JobError, match=r"fast_10_fused.png: fast: .*fast_10.png: not a picture"):
+        bad.run()
+    report = bad.run(resume=True, on_error="skip")
+    assert [p.name for p in report.failed] == ["fast_10_fused.png"]
+    good = batch(material, tmp_path / "good")
+    good.run()
+    wanted = {name: content for name, content in contents(tmp_path / "good").items() if "_10_" not in name}
+    assert contents(tmp_path / "bad") == wanted
+
+
+def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp_path):
+    files = {name: find_pictures(material / name) for name in ("fast", "slow")}
+    gone = tmp_path / "gone.png"
+    job = batch(material, tmp_path / "out", sequence=True, files=files | {"slow": [files["slow"][0], gone]})
+    report = job.run(on_error="skip")
+    assert len(report.made) == 7
+    with pytest.raises(JobError, match=r"slow: .*gone.png: no such picture"):
+        job.run()
+
+
+def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
+    """The third file to be flushed does not fit."""
+    flush, count = arraygeom.atomic._flush, iter(range(100))
+
+    def full(path):
+        if "fused" in path.name and next(count) == 2:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        flush(path)
+
+    monkeypatch.setattr(arraygeom.atomic, "_flush", full)
+    job = batch(material, tmp_path / "out")
+    with pytest.raises(JobError, match="No space left"):
+        job.run()
+    pictures = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
+    assert len(pictures) == 2
+    assert not [p for p in os.listdir(tmp_path / "out") if p.startswith(".") and p != ".keys"]
+    assert len(job.run(resume=True).made) == 5
+
+
+def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys):
+    images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={material / name}")]
+    given = ["fuse", "--rig", str(material / "rig.yaml"), "--alpha", "fast", *images, "--out", str(tmp_path / "out")]
+    given += ["--weights", str(material / "tiny.safetensors"), "--sequence", "--bits", "16"]
+    main(given)
+    assert read_image(tmp_path / "out" / "fast_14_fused.png").shape == (3, *moving.HW)
+    assert (tmp_path / "out" / "fused.mp4").stat().st_size > 1000
+    assert Rig.load(tmp_path / "out" / "view.yaml").names == ("fast",)
+    capsys.readouterr()
+    main([*given, "--resume"])
+    assert "0 made, 7 there already" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(SystemExit):
+        main([*given, "--time-offset", "slow=9"])
+    assert "near one of alpha in time" in " ".join(capsys.readouterr().err.split())
+    with pytest.raises(SystemExit):
+        main([a for a in given if a != "--sequence"])
+    assert "as many pictures of each camera" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_path):
+    job = batch(material, tmp_path, sequence=True)
+    sensor = replace(job.rig["fast"].sensor, response="mono", coding="linear")
+    job = replace(job, rig=job.rig.with_camera("fast", job.rig["fast"].replace(sensor=sensor)))
+    known = job._fusion().rig["fast"].sensor
+    assert (known.response, known.coding) == (LIGHT, "srgb")
+    assert known.frame_rate == sensor.frame_rate

@@ -1,0 +1,394 @@
+"""fuse: tiles equal the whole, sizes and pitches are followed, mistakes are named."""
+
+import math
+
+import pat.fusion.fuse
+import pat.fusion.tiles
+import pytest
+import torch
+
+from arraygeom import (
+    Camera,
+    Distortion,
+    Epipolar,
+    LensView,
+    Link,
+    Pose,
+    Rectified,
+    Rig,
+    Sensor,
+    View,
+    intrinsics,
+    retaken,
+    rotation_from_vector,
+)
+from calib.images.matches import match_points, seen_depths
+from pat.data.pairs import flickr_pairs, kitti_pairs
+from pat.data.sample_array import load_sample
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.fusion.steps import pitch_ratio, quarter_turns, without_lenses
+from pat.fusion.tiles import REACH, SLACK, Tile, plan, tiles_of, working_memory
+from pat.media.colour import linear_from_srgb, luminance
+from pat.media.images import read_image
+from pat.media.raw import LIGHT
+from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
+from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.paper import PAT, PATConfig
+from pat.networks.weights import load_weights
+
+
+def rig_of(hw, beta_hw, focal=300.0, beta_focal=200.0) -> Rig:
+    R = rotation_from_vector(torch.tensor([0.004, -0.01, 0.02], dtype=torch.float64))
+    t = torch.tensor([-0.1, 0.01, 0.0], dtype=torch.float64)
+    return Rig(
+        {
+            "mono": Camera(K=intrinsics(focal, hw), cam_from_world=Pose.identity(), hw=hw),
+            "colour": Camera(K=intrinsics(beta_focal, beta_hw), cam_from_world=Pose(R, t), hw=beta_hw),
+        },
+        depth=(2.0, 20.0),
+    )
+
+
+def network_of(kind: str):
+    torch.manual_seed(1)
+    if kind == "PAT":
+        return PAT(PATConfig(dim=8, interpolation="bilinear")).eval()
+    if kind == "BandwisePAT":
+        network = BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8))).eval()
+        torch.nn.init.normal_(network.single.head.last.weight, std=0.2)
+        return network
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8))).eval()
+    torch.nn.init.normal_(network.head.last.weight, std=0.2)
+    return network
+
+
+def texture(channels: int, hw: tuple[int, int]) -> torch.Tensor:
+    """Blobs of some pixels: in float32 positions at 1000 pixels are rounded to 6e-5, and noise would show that."""
+    g = torch.Generator().manual_seed(0)
+    rough = torch.rand(1, channels, hw[0] // 5, hw[1] // 5, generator=g)
+    return torch.nn.functional.interpolate(rough, hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "dtype", "bound"),
+    [
+        ("PAT", torch.float32, 1e-5),
+        ("GuidedPAT", torch.float64, 1e-9),
+        ("GuidedPAT", torch.float32, 1e-5),
+        ("BandwisePAT", torch.float32, 1e-5),
+    ],
+)
+def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
+    """At every pixel, the tiles' borders included. The frame is wider than a tile with its halo."""
+    hw, beta_hw = (34, 1620), (30, 1110)
+    network, rig = network_of(kind).to(dtype), rig_of(hw, beta_hw)
+    images = {"mono": texture(1, hw).to(dtype), "colour": texture(3, beta_hw).to(dtype)}
+    whole = fuse(network, rig, images, alpha="mono")
+    tiles = list(tiles_of(hw, 160, network.halo))
+    assert any(t.outer[3] - t.outer[2] < hw[1] for t in tiles)
+    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: tiles)
+    tiled = fuse(network, rig, images, alpha="mono")
+    assert (tiled.image - whole.image).abs().max() < bound
+    assert torch.equal(tiled.depth.isnan(), whole.depth.isnan())
+    assert (tiled.confidence - whole.confidence).abs().max() < bound
+    assert torch.allclose(1 / tiled.depth, 1 / whole.depth, atol=10 * bound, equal_nan=True)
+    monkeypatch.setattr(type(network), "halo", 16)
+    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: list(tiles_of(hw, 160, 16)))
+    assert (fuse(network, rig, images, alpha="mono").image - whole.image).abs().max() > bound
+
+
+def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
+    sample, network = load_sample(), load_weights("mono-colour")
+    images = {name: sample.images[name] for name in sample.rig.names}
+    whole = fuse(network, sample.rig, images, alpha="mono")
+    monkeypatch.setattr(pat.fusion.tiles, "SURVEYED", 150_000)
+    monkeypatch.setattr(pat.fusion.tiles, "SURVEY_REACH", 128)
+    assert len(pat.fusion.tiles.survey_tiles(network, sample.rig["mono"].hw)) > 1
+    pieces = fuse(network, sample.rig, images, alpha="mono")
+    truth = sample.truth
+    assert score(pieces.image.clamp(0, 1), truth).psnr > score(whole.image.clamp(0, 1), truth).psnr - 0.1
+    off = (pieces.image - whole.image).abs().amax(0)
+    assert (off > 0.005).float().mean() < 1e-3
+    hw = sample.rig["mono"].hw
+    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: list(tiles_of(hw, 192, REACH)))
+    tiled = fuse(network, sample.rig, images, alpha="mono")
+    assert (tiled.image - pieces.image).abs().max() < 1e-5
+    assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("folder", "pairs"), [("kitti", kitti_pairs), ("flickr1024/train", flickr_pairs)])
+def test_halos_are_wide_enough_for_the_weights(folder, pairs, shared_data):
+    """Tiles of real pictures equal the whole with the weights that are shipped."""
+    pair, network = next(pairs(shared_data / folder)), load_weights("mono-colour")
+    images = {"left": luminance(pair.left), "right": pair.right}
+    rig = Rig({name: View(hw=picture.shape[1:]) for name, picture in images.items()})
+    field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
+    whole = fuse(network, rig, images, alpha="left", field=field)
+    h, w = rig["left"].hw
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(
+            pat.fusion.fuse, "plan", lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), REACH))
+        )
+        tiled = fuse(network, rig, images, alpha="left", field=field)
+    assert (tiled.image - whole.image).abs().max() < 1e-5
+    assert (tiled.confidence - whole.confidence).abs().max() < 1e-5
+
+
+def test_pictures_are_asked_for_once_and_only_when_they_are_needed():
+    hw, beta_hw = (64, 96), (60, 80)
+    given = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    asked = []
+
+    class Files(dict):
+        def __getitem__(self, name):
+            asked.append(name)
+            return super().__getitem__(name)
+
+    network, rig = network_of("GuidedPAT"), rig_of(hw, beta_hw)
+    found = fuse(network, rig, Files(given), alpha="mono")
+    assert torch.equal(found.image, fuse(network, rig, given, alpha="mono").image)
+    assert sorted(asked) == ["colour", "mono"]
+
+
+def test_memory_decides_the_tiles():
+    network, hw = network_of("PAT"), (3000, 4000)
+    assert plan(network, hw, [], None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
+    tiles = plan(network, hw, [], 2.0**31)
+    area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
+    assert area * network.bytes_per_pixel <= 2**31
+    assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
+    with pytest.raises(ValueError, match="need at least 83 MiB"):
+        plan(network, hw, [], 2.0**20)
+
+
+def test_tiles_are_those_with_the_least_work():
+    """Square tiles under the same limit make more."""
+    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), 2.0**30
+
+    def work(tiles):
+        return sum((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
+
+    ours = plan(network, hw, [], limit)
+    side = int(math.sqrt(limit / SLACK / network.bytes_per_pixel)) - 2 * REACH
+    assert work(ours) < 0.95 * work(tiles_of(hw, side, REACH))
+    assert all(working_memory(network, t, []) <= limit for t in ours)
+
+
+def test_the_plan_is_told_before_the_work():
+    told, rig = [], rig_of((50, 70), (40, 60))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
+    fuse(network_of("PAT"), rig, images, alpha="mono", announce=told.append)
+    assert str(told[0]).startswith("1 piece, 0.6")
+    assert told[0].seconds is None
+
+
+def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
+    """Beta sees ten times alpha's field: what fusing gives is the same, and what is worked on is small."""
+    hw, wide = (64, 96), (300, 440)
+    rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
+    pair = rig.pair("mono", "colour")
+    beta = pat.fusion.fuse._prepare(network, pair, texture(3, wide)[None], None, None, "colour")
+    assert beta.picture.shape[-1] * beta.picture.shape[-2] < 0.6 * 9 * math.prod(wide)
+    images = {"mono": texture(1, hw), "colour": texture(3, wide)}
+    cut = fuse(network, rig, images, alpha="mono")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(pat.fusion.fuse, "_common_part", lambda pair, picture, field, network: (pair, picture))
+        whole = fuse(network, rig, images, alpha="mono")
+    # What the views have in common sets the levels at which they are compared: that is where the two differ.
+    assert (cut.image - whole.image).abs().mean() < 2e-2
+
+
+def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
+    hw, beta_hw = (34, 300), (30, 210)
+    network, rig = network_of("PAT"), rig_of(hw, beta_hw)
+    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: list(tiles_of(hw, 64, network.halo)))
+    whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fusion.fuse._fuse_tile
+
+    def counted(network, own, betas, tile):
+        if len(made) == 3:
+            raise KeyboardInterrupt
+        made.append(tile)
+        return fuse_tile(network, own, betas, tile)
+
+    monkeypatch.setattr(pat.fusion.fuse, "_fuse_tile", counted)
+    with pytest.raises(KeyboardInterrupt):
+        fuse(network, rig, images, alpha="mono", store=tmp_path)
+    made.clear()
+    resumed = fuse(network, rig, images, alpha="mono", store=tmp_path)
+    assert len(made) == 2
+    assert all(torch.equal(a.nan_to_num(), b.nan_to_num()) for a, b in zip(resumed, whole))
+    made.clear()
+    with pytest.raises(KeyboardInterrupt):
+        fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
+
+
+def test_pitch_is_the_ratio_of_pixels():
+    rig = rig_of((60, 80), (60, 80), focal=100.0, beta_focal=50.0)
+    assert abs(pitch_ratio(rig.pair("mono", "colour")) - 0.5) < 0.01
+    assert abs(pitch_ratio(rig.pair("colour", "mono")) - 2.0) < 0.04
+
+
+def test_colour_comes_from_where_the_field_says():
+    """A red half and a blue half: each alpha pixel gets the colour of its own side, from a turned beta too."""
+    hw = (64, 96)
+    rig = rig_of(hw, hw, focal=100.0, beta_focal=100.0)
+    g = torch.Generator().manual_seed(0)
+    side = (torch.arange(96) < 48).float().expand(1, *hw)
+    truth = torch.cat([side, 0 * side, 1 - side]) * (0.5 + 0.5 * torch.rand(1, *hw, generator=g))
+    network = network_of("GuidedPAT")
+    torch.nn.init.zeros_(network.head.last.weight)
+    torch.nn.init.zeros_(network.head.last.bias)
+    upright = fuse(network, rig, {"mono": truth, "colour": truth}, alpha="mono", depth=(5, 20)).image
+    turned = fuse(
+        network, rig.turn("colour", 1), {"mono": truth, "colour": truth.rot90(1, (-2, -1))}, alpha="mono", depth=(5, 20)
+    ).image
+    for image in (upright, turned):
+        assert image[0, :, 10:40].mean() > image[2, :, 10:40].mean() + 0.1
+        assert image[2, :, 56:86].mean() > image[0, :, 56:86].mean() + 0.1
+
+
+def test_light_that_alpha_measured_stays():
+    """Where the rig says that alpha measured it; else the coded values' luminance is alpha's."""
+    rig = rig_of((48, 64), (48, 64))
+    images = {"mono": texture(1, (48, 64)), "colour": texture(3, (48, 64))}
+    network = load_weights("mono-colour")
+    plain = fuse(network, rig, images, alpha="mono").image
+    rig = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor(response=LIGHT)))
+    light = fuse(network, rig, images, alpha="mono").image
+    assert (luminance(plain) - images["mono"]).abs().max() < 1e-5
+    assert (luminance(linear_from_srgb(light)) - linear_from_srgb(images["mono"])).abs().max() < 1e-4
+    assert (luminance(light) - images["mono"]).abs().max() > 0.01
+
+
+def test_uncalibrated_rigs_fuse_without_depth():
+    hw = (48, 64)
+    F = torch.tensor([[0.0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    views = {name: View(hw=hw) for name in ("mono", "red", "green", "blue")}
+    links = {("mono", name): Link(F) for name in ("red", "green", "blue")}
+    images = {name: torch.rand(1, *hw) for name in views}
+    frame = fuse(network_of("GuidedPAT"), Rig(views, links=links), images, alpha="mono", match_levels=True)
+    assert frame.image.shape == (3, *hw)
+    assert frame.depth.isnan().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"colour": torch.rand(3, 40, 61)}, "'colour' is 61x40, the rig says 60x40"),
+        ({"color": torch.rand(3, 40, 60)}, "no camera 'color'; did you mean 'colour'"),
+        ({"mono": torch.full((1, 50, 70), torch.nan)}, "'mono' has NaN"),
+    ],
+)
+def test_mistakes_are_named(change, message):
+    rig = rig_of((50, 70), (40, 60))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)} | change
+    with pytest.raises(ValueError, match=message):
+        fuse(network_of("PAT"), rig, images, alpha="mono")
+
+
+def test_views_must_overlap():
+    rig = rig_of((50, 70), (40, 60))
+    back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))
+    rig = rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(back, torch.zeros(3).double())))
+    images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
+    with pytest.raises(ValueError, match="'colour's views do not overlap between 2 and 20 m"):
+        fuse(network_of("PAT"), rig, images, alpha="mono", field=Epipolar())
+    with pytest.raises(ValueError, match="0 < near <= far"):
+        fuse(network_of("PAT"), rig, images, alpha="mono", depth=(20, 2))
+    with pytest.raises(ValueError, match="at least one beta"):
+        fuse(network_of("PAT"), rig, {"mono": images["mono"]}, alpha="mono")
+
+
+def bent(lens_of, rig, images):
+    """The rig with lenses, and the pictures those would have taken."""
+    for name, coefficients in lens_of.items():
+        lens = Distortion("brown-conrady", torch.tensor(coefficients, dtype=torch.float64))
+        camera = rig[name].replace(distortion=lens)
+        images = images | {name: retaken(images[name], rig[name], camera).values[0]}
+        rig = rig.with_camera(name, camera)
+    return rig, images
+
+
+LENSES = {"mono": [0.9, 0.0, 0.0, 0.0], "colour": [-0.6, 0.2, 0.005, 0.0]}
+
+
+@pytest.mark.parametrize("with_lens", [("colour",), ("mono", "colour")])
+def test_lenses_are_seen_through(with_lens):
+    """The sample array behind lenses: the same colours at alpha's own, bent pixels, and alpha's detail untouched."""
+    sample = load_sample()
+    rig, images, network = (
+        sample.rig.crop("mono", 80, 160, (240, 320)),
+        dict(sample.images),
+        load_weights("mono-colour"),
+    )
+    images["mono"], truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.truth))
+    lensed, taken = bent({name: LENSES[name] for name in with_lens}, rig, images)
+    clean = (fuse(network, rig, images, alpha="mono").image - truth).square().mean()
+    frame = fuse(network, lensed, taken, alpha="mono")
+    if "mono" in with_lens:
+        truth = retaken(truth, rig["mono"], lensed["mono"]).values[0]
+    seen = truth.sum(0) > 0
+    error = (frame.image - truth)[:, seen].square().mean()
+    assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
+    blind = fuse(network, rig, taken, alpha="mono")
+    assert error < 1.3 * clean
+    assert error < 0.85 * (blind.image - truth)[:, seen].square().mean()
+    assert torch.isfinite(frame.image).all()
+    assert 0.7 < float((frame.depth.isfinite() & seen).float().sum() / seen.float().sum()) <= 1
+
+
+def test_lenses_of_cameras_known_by_f_are_seen_through():
+    """No pose and no focal length: F between straightened pixels, and lenses with a unit of their own."""
+    sample, network = load_sample(), load_weights("mono-colour")
+    rig, images = sample.rig.crop("mono", 80, 160, (240, 320)), dict(sample.images)
+    images["mono"], truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.truth))
+    lensed, taken = bent({"mono": LENSES["mono"], "colour": [-0.1, 0.01, 0.001, 0.0]}, rig, images)
+    pair = rig.pair("mono", "colour")
+    links = {("mono", "colour"): Link(pair.fundamental, pair.homography)}
+    views = {name: LensView(hw=c.hw, K=c.K, distortion=c.distortion) for name, c in lensed.cameras.items()}
+    frame = fuse(network, Rig(views, links=links), taken, alpha="mono")
+    blind = fuse(network, Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links), taken, alpha="mono")
+    clean = fuse(network, Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links), images, alpha="mono")
+    errors = [(clean.image - truth).square().mean()]
+    truth = retaken(truth, rig["mono"], lensed["mono"]).values[0]
+    seen = truth.sum(0) > 0
+    errors += [(f.image - truth)[:, seen].square().mean() for f in (frame, blind)]
+    assert errors[1] < 1.3 * errors[0]
+    assert errors[1] < 0.85 * errors[2]
+    assert frame.depth.isnan().all()
+    assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
+
+
+def test_a_turned_beta_is_turned_upright():
+    rig = rig_of((60, 80), (60, 80))
+    for turns in range(4):
+        assert quarter_turns(rig.turn("colour", turns).pair("mono", "colour")) == -turns % 4
+    images = {"mono": texture(1, (60, 80)), "colour": texture(3, (60, 80))}
+    network = network_of("GuidedPAT")
+    upright = fuse(network, rig, images, alpha="mono")
+    turned = fuse(network, rig.turn("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono")
+    assert (upright.image - turned.image).abs().max() < 1e-4
+
+
+@pytest.mark.slow
+def test_real_lenses(shared_data):
+    """A real pair with barrel distortion of some 30 pixels: colour lands at alpha's own pixels."""
+    folder, network = shared_data / "bumblebee2_scenes", load_weights("mono-colour")
+    rig = Rig.load(folder / "stereo.yaml")
+    left, right = (read_image(folder / f"chair01_{side}.jpg") for side in ("left", "right"))
+    straight_rig, straight = without_lenses(rig, {"left": left, "right": right})
+    depth = seen_depths(straight_rig.pair("left", "right"), match_points(*straight.values()))
+    images = {"left": luminance(left), "right": right}
+    frame = fuse(network, rig, images, alpha="left", depth=depth)
+    no_lens = rig
+    for name in rig.names:
+        no_lens = no_lens.with_camera(name, rig[name].replace(distortion=None))
+    ignored = fuse(network, no_lens, images, alpha="left", depth=depth)
+    grey, seen, blind = (
+        score(p.clamp(0, 1), left).psnr for p in (luminance(left).expand(3, -1, -1), frame.image, ignored.image)
+    )
+    assert seen > grey + 4
+    assert seen > blind + 0.8

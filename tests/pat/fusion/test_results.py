@@ -1,0 +1,32 @@
+"""Files of a fusion: bands that no picture holds together are written one by one."""
+
+import pytest
+import torch
+
+from pat.fusion.results import FusedFrame, save_frame
+from pat.media.images import read_image
+
+
+def frame_of(bands: int) -> FusedFrame:
+    return FusedFrame(torch.rand(bands, 6, 8), torch.full((6, 8), torch.nan), torch.rand(6, 8))
+
+
+@pytest.mark.parametrize("bands", [1, 3])
+def test_one_band_and_three_are_one_picture(bands, tmp_path):
+    frame = frame_of(bands)
+    written = save_frame(frame, tmp_path, bits=16)
+    assert [p.name for p in written] == ["fused.png", "confidence.png"]
+    assert torch.allclose(read_image(written[0]), frame.image, atol=1e-4)
+
+
+@pytest.mark.parametrize("bands", [2, 4])
+def test_other_bands_are_written_one_by_one_and_their_mean(bands, tmp_path):
+    frame = frame_of(bands)
+    written = save_frame(frame, tmp_path, bits=16, name="7")
+    assert [p.name for p in written] == [
+        "7_fused.png",
+        *(f"7_fused_{i + 1}.png" for i in range(bands)),
+        "7_confidence.png",
+    ]
+    assert torch.allclose(torch.cat([read_image(p) for p in written[1 : 1 + bands]]), frame.image, atol=1e-4)
+    assert torch.allclose(read_image(written[0])[0], frame.image.mean(0), atol=1e-4)

@@ -1,0 +1,135 @@
+"""Sequences: clocks, motion, colour that stays on what moves and does not flicker, confidence that knows."""
+
+import pytest
+import torch
+
+from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
+from pat.fusion.optical_flow import carried, flow_between
+from pat.fusion.sequence import SequenceFusion, Source, Timeline, flicker, fuse_sequence, mixed
+from pat.networks.weights import load_weights
+from tests.pat.fusion import moving
+
+
+def clocks(alpha_rate, beta_rate, offset, *counts):
+    views = {
+        "a": View(hw=(4, 4), sensor=Sensor(frame_rate=alpha_rate)),
+        "b": View(hw=(4, 4), sensor=Sensor(frame_rate=beta_rate, time_offset=offset)),
+    }
+    return Timeline(Rig(views), dict(zip("ab", counts)), "a")
+
+
+def test_key_frames_are_alphas_nearest_to_betas():
+    line = clocks(227.0, 30.0, 0.010, 20, 3)
+    assert [k.alpha for k in line.key_frames()] == [round((0.010 + j / 30) * 227) for j in range(3)]
+    assert [k.betas["b"] for k in line.key_frames()] == [0, 1, 2]
+    assert line.interval == pytest.approx(1 / 30)
+    slow_alpha = clocks(10.0, 30.0, 0.0, 4, 12)
+    assert [(k.alpha, k.betas["b"]) for k in slow_alpha.key_frames()] == [(0, 0), (1, 3), (2, 6), (3, 9)]
+    assert slow_alpha.interval == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        (lambda: clocks(None, 30.0, 0.0, 5, 5), "frame rate of 'a' is not known"),
+        (lambda: clocks(30.0, 30.0, 5.0, 5, 5).key_frames(), "near one of alpha in time"),
+        (lambda: clocks(30.0, 30.0, 0.0, 5), "at least one beta"),
+        (lambda: clocks(30.0, 30.0, 0.0, 5, 0), "no frames of 'b'"),
+    ],
+)
+def test_clocks_that_do_not_fit_are_named(line, message):
+    with pytest.raises(ValueError, match=message):
+        line()
+
+
+def test_moved_looks_where_points_will_be():
+    pair = moving.rig().pair("fast", "slow")
+    x = pixel_grid(moving.HW)[10:20, 30:40].reshape(-1, 2)
+    step = torch.stack([torch.full(moving.HW, 7.0), torch.full(moving.HW, -3.0)])
+    there = Moved(Epipolar(), step)(pair, x)
+    wanted = Epipolar()(pair, x + torch.tensor([7.0, -3.0]))
+    torch.testing.assert_close(there.start, wanted.start)
+    torch.testing.assert_close(there.end, wanted.end)
+    wide = Moved(Widened(Epipolar(), along=4.0), step)(pair, x)
+    assert torch.allclose(wide.length[wide.valid], wanted.length[wide.valid] + 8.0, atol=1e-4)
+
+
+def test_flow_finds_a_shift_and_its_trust_the_border():
+    a = moving.WALL[1:2, :96, 20:180]
+    b = moving.WALL[1:2, 2:98, 25:185]
+    flow = flow_between(a, b * 0.97)
+    inside = flow.step[:, 10:-10, 10:-10]
+    assert (inside - torch.tensor([-5.0, -2.0])[:, None, None]).abs().median() < 0.1
+    assert flow.trust[10:-10, 10:-10].median() > 0.9
+    assert flow.trust[:, :4].max() == 0
+    assert (carried(b, flow.step) - a)[:, 10:-10, 10:-10].abs().mean() < 0.01
+
+
+def test_colours_mix_by_confidence_and_disagreement_is_doubt():
+    own = torch.full((1, 1, 2), 0.5)
+    red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
+    sure = torch.tensor([[0.9, 0.9]])
+    sources = [Source(1.0, red, sure, sure), Source(1.0, blue, torch.tensor([[0.9, 0.0]]), torch.zeros(1, 2))]
+    frame = mixed(own, sources)
+    torch.testing.assert_close(frame.image[:, 0, 1], torch.tensor([0.7, 0.5, 0.5]), atol=1e-3, rtol=0)
+    torch.testing.assert_close(frame.image[:, 0, 0], torch.tensor([0.6, 0.5, 0.6]), atol=1e-3, rtol=0)
+    assert frame.confidence[0, 0] < 0.5 * frame.confidence[0, 1]
+    torch.testing.assert_close(frame.depth, 1 / sure)
+
+
+@pytest.fixture(scope="module")
+def fused():
+    """Seven frames, two of them key frames, and four fused alone; beta is 3 ms off alpha's clock."""
+    offset = 0.003
+    frames, truth = moving.recording(7, offset)
+    network = load_weights("mono-colour")
+    rig = moving.rig(offset)
+    job = SequenceFusion(network, rig, frames, "fast")
+    carried_frames = list(fuse_sequence(network, rig, frames, alpha="fast"))
+    return frames, truth, carried_frames, {i: job.alone(i) for i in (1, 2, 3, 4)}
+
+
+def error(frame, truth):
+    return (frame.image - truth).square().mean(0)
+
+
+def square(i):
+    """Where the moving square is, a few pixels inside its border."""
+    x = pixel_grid(moving.HW)
+    left = 25 + moving.SPEED * i / moving.RATE
+    return (x[..., 0] > left + 3) & (x[..., 0] < left + 44) & (x[..., 1] > 27) & (x[..., 1] < 68)
+
+
+def test_what_moves_keeps_its_colour(fused):
+    _, truth, frames, alone = fused
+    ours = torch.stack([error(f, t)[square(i)].mean() for i, (f, t) in enumerate(zip(frames, truth))])
+    single = torch.stack([error(f, truth[i])[square(i)].mean() for i, f in alone.items()])
+    assert ours[1:5].mean() < 0.7 * single.mean()
+    assert ours.max() < 0.4 * single.max()
+
+
+def test_colour_flickers_less_than_frame_by_frame(fused):
+    frames, _, ours, alone = fused
+    calm = flicker([f.image for f in ours[1:5]], frames["fast"][1:5])
+    restless = flicker([f.image for f in alone.values()], frames["fast"][1:5])
+    assert calm < 0.5 * restless
+
+
+def test_confidence_knows_where_colour_is_wrong(fused):
+    """Also about what moves: among the pixels around the square, the sure ones are right and the wrong ones unsure."""
+    _, truth, ours, _ = fused
+    x = pixel_grid(moving.HW)
+    around = [(x[..., 0] > 15 + 2.5 * i) & (x[..., 0] < 85 + 2.5 * i) for i in range(7)]
+    off = torch.cat([error(f, t)[m].sqrt() for f, t, m in zip(ours, truth, around)])
+    sure = torch.cat([f.confidence[m] for f, m in zip(ours, around)])
+    third = len(sure) // 3
+    order = sure.argsort()
+    assert off[order[-third:]].mean() < 0.65 * off[order[:third]].mean()
+    assert sure[off > 0.15].mean() < 0.75 * sure[off < 0.05].mean()
+
+
+def test_alphas_own_detail_stays(fused):
+    frames, _, ours, _ = fused
+    weights = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
+    for frame, grey in zip(ours, frames["fast"]):
+        assert ((frame.image * weights).sum(0) - grey[0]).abs().max() < 1e-5

@@ -1,0 +1,168 @@
+import os
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom.atomic import sweep, write_atomically
+from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
+from pat.media.images import read_image, write_image
+
+RED = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
+
+
+def picture(*, channels=3, seed=0):
+    return torch.rand(channels, 7, 9, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+@pytest.mark.parametrize(
+    ("suffix", "bits"), [("png", 8), ("png", 16), ("tif", 8), ("tif", 16), ("tif", 32), ("ppm", 8)]
+)
+def test_what_is_written_is_read_back(tmp_path, channels, suffix, bits):
+    if suffix == "ppm" and channels == 1:
+        suffix = "pgm"
+    image = picture(channels=channels)
+    write_image(tmp_path / f"a.{suffix}", image, bits=bits)
+    again = read_image(tmp_path / f"a.{suffix}")
+    assert again.dtype == torch.float32
+    assert again.shape == image.shape
+    assert (again - image).abs().max() <= 0.5001 / (2 ** min(bits, 24) - 1)
+
+
+def test_jpeg_is_read_back_nearly(tmp_path):
+    image = RED.expand(3, 16, 16)
+    write_image(tmp_path / "a.jpg", image)
+    assert (read_image(tmp_path / "a.jpg") - image).abs().max() < 0.02
+
+
+def test_colours_are_in_the_order_red_green_blue(tmp_path):
+    cv2.imwrite(str(tmp_path / "red.png"), np.full((4, 5, 3), (0, 0, 255), np.uint8))
+    torch.testing.assert_close(read_image(tmp_path / "red.png"), RED.expand(3, 4, 5).contiguous())
+
+
+def test_sixteen_bits_are_scaled_by_65535(tmp_path):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 257, 65535]], np.uint16))
+    torch.testing.assert_close(read_image(tmp_path / "a.png"), torch.tensor([[[0, 1 / 255, 1]]]))
+
+
+def test_values_outside_the_range_are_cut(tmp_path):
+    write_image(tmp_path / "a.png", torch.tensor([[[-0.5, 1.5]]]))
+    assert read_image(tmp_path / "a.png").tolist() == [[[0.0, 1.0]]]
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_an_opaque_alpha_channel_is_dropped_and_any_other_refused(tmp_path, kind):
+    coded = np.full((4, 5, 4), np.iinfo(kind).max, kind)
+    cv2.imwrite(str(tmp_path / "opaque.png"), coded)
+    assert read_image(tmp_path / "opaque.png").shape == (3, 4, 5)
+    coded[2, 2, 3] -= 1
+    cv2.imwrite(str(tmp_path / "glass.png"), coded)
+    with pytest.raises(ValueError, match=r"glass.png: has an alpha channel"):
+        read_image(tmp_path / "glass.png")
+
+
+def test_a_missing_picture_is_named_with_its_camera(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"^mono: .*nothing.png: no such picture"):
+        read_image(tmp_path / "nothing.png", name="mono")
+
+
+@pytest.mark.parametrize("content", [b"", b"words", b"\x89PNG\r\n\x1a\n"])
+def test_a_file_that_is_no_picture_is_refused(tmp_path, content, capfd):
+    (tmp_path / "a.png").write_bytes(content)
+    with pytest.raises(ValueError, match=r"a.png: not a picture"):
+        read_image(tmp_path / "a.png")
+    assert not capfd.readouterr().err
+
+
+def test_half_a_picture_is_refused(tmp_path):
+    write_image(tmp_path / "a.png", torch.rand(3, 64, 64))
+    content = (tmp_path / "a.png").read_bytes()
+    (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"a.png: not a picture"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize(
+    ("values", "complaint"),
+    [
+        (np.array([[0, np.nan]], np.float32), "NaN"),
+        (np.array([[0, 200]], np.float32), "0 to 200: scale"),
+        (np.array([[0, 5]], np.int16), "int16"),
+    ],
+)
+def test_unusable_values_are_refused(tmp_path, values, complaint):
+    cv2.imwrite(str(tmp_path / "a.tif"), values)
+    with pytest.raises(ValueError, match=f"a.tif: .*{complaint}"):
+        read_image(tmp_path / "a.tif")
+
+
+@pytest.mark.parametrize(
+    ("name", "image", "bits", "complaint"),
+    [
+        ("a.png", torch.full((1, 2, 2), torch.nan), 8, "NaN"),
+        ("a.png", torch.zeros(2, 2, 2), 8, "1 or 3 channels"),
+        ("a.xyz", torch.zeros(1, 2, 2), 8, "end the name in"),
+        ("a", torch.zeros(1, 2, 2), 8, "end the name in"),
+        ("a.jpg", torch.zeros(1, 2, 2), 16, "JPEG"),
+        ("a.png", torch.zeros(1, 2, 2), 32, r"\.tif"),
+        ("a.png", torch.zeros(1, 2, 2), 12, "bits"),
+    ],
+)
+def test_what_cannot_be_written_leaves_nothing_behind(tmp_path, name, image, bits, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        write_image(tmp_path / name, image, bits=bits)
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_error_while_writing_keeps_the_former_file(tmp_path):
+    def write_half(path):
+        with write_atomically(path) as temporary:
+            temporary.write_text("new")
+            raise RuntimeError
+
+    (tmp_path / "a.txt").write_text("old")
+    with pytest.raises(RuntimeError):
+        write_half(tmp_path / "a.txt")
+    assert os.listdir(tmp_path) == ["a.txt"]
+    assert (tmp_path / "a.txt").read_text() == "old"
+
+
+def test_the_written_file_takes_the_place_of_the_former_and_makes_its_folder(tmp_path):
+    for text in ("old", "new"):
+        with write_atomically(tmp_path / "b" / "a.txt") as temporary:
+            assert temporary.suffix == ".txt"
+            temporary.write_text(text)
+    assert os.listdir(tmp_path / "b") == ["a.txt"]
+    assert (tmp_path / "b" / "a.txt").read_text() == "new"
+
+
+def test_luminance_is_opencvs():
+    image = picture()
+    theirs = cv2.cvtColor(image.permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
+    torch.testing.assert_close(luminance(image)[0], torch.from_numpy(theirs), atol=1e-5, rtol=0)
+
+
+def test_luma_and_chroma_come_back():
+    image = torch.rand(2, 3, 5, 6, dtype=torch.float64)
+    luma, chroma = to_luma_chroma(image)
+    torch.testing.assert_close(from_luma_chroma(luma, chroma), image, atol=1e-14, rtol=0)
+    grey = image[:, :1].expand(-1, 3, -1, -1)
+    assert to_luma_chroma(grey)[1].abs().max() < 1e-14
+
+
+def test_the_luminance_of_a_recoloured_picture_is_the_given_one():
+    luma, chroma = torch.rand(1, 5, 6, dtype=torch.float64), torch.randn(2, 5, 6, dtype=torch.float64)
+    torch.testing.assert_close(luminance(from_luma_chroma(luma, chroma)), luma, atol=1e-14, rtol=0)
+
+
+def test_what_a_killed_process_left_is_swept_away_and_nothing_else(tmp_path):
+    with write_atomically(tmp_path / "a-b.png") as temporary:
+        temporary.write_text("half")
+        left = tmp_path / temporary.name.replace("a-b", "c")
+        left.write_text("half")
+    (tmp_path / ".hidden-file.png").write_text("mine")
+    sweep(tmp_path)
+    sweep(tmp_path / "none")
+    assert sorted(os.listdir(tmp_path)) == [".hidden-file.png", "a-b.png"]

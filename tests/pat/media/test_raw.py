@@ -1,0 +1,149 @@
+"""Counts to pictures: black level, bits, filter mosaic, coding and exposure undo what the camera did."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Rig, Sensor, View
+from pat.fusion.views import read_views
+from pat.media.colour import linear_from_srgb, luminance
+from pat.media.images import write_image
+from pat.media.raw import as_bright, demosaiced, develop, developed
+from pat.sensors import Coded
+
+HW = (48, 64)
+
+
+def light(*, channels=3, white=1.0):
+    """Smooth linear light, up to `white`."""
+    rough = torch.rand(1, channels, 6, 8, generator=torch.Generator().manual_seed(0))
+    fine = torch.nn.functional.interpolate(rough, HW, mode="bicubic", align_corners=False)[0]
+    return (0.1 + 0.8 * fine).clamp(0.02, 1) * white
+
+
+def coded(linear):
+    return Coded().apply(linear[None], torch.Generator())[0]
+
+
+def counts(linear, *, bits, black, shift=0):
+    full = 2**bits - 1
+    values = black + linear.numpy().astype(np.float64) * (full - black)
+    return np.rint(values).clip(0, full).astype(np.uint16) << shift
+
+
+def mosaic(rgb, pattern):
+    """One of three channels at each pixel."""
+    raw = torch.empty(1, *rgb.shape[1:])
+    for i, letter in enumerate(pattern):
+        raw[0, i // 2 :: 2, i % 2 :: 2] = rgb["RGB".index(letter), i // 2 :: 2, i % 2 :: 2]
+    return raw
+
+
+def save(path, values):
+    planes = values[0] if len(values) == 1 else values.transpose(1, 2, 0)[..., ::-1]
+    assert cv2.imwrite(str(path), planes)
+
+
+def rig(**sensors):
+    return Rig({name: View(hw=HW, sensor=sensor) for name, sensor in sensors.items()})
+
+
+@pytest.mark.parametrize(("bits", "suffix"), [(10, "png"), (12, "tif"), (14, "tif"), (16, "png")])
+def test_counts_of_any_depth_become_the_light_they_stood_for(tmp_path, bits, suffix):
+    save(tmp_path / f"a.{suffix}", counts(light(), bits=bits, black=64))
+    sensor = Sensor(coding="linear", bits=bits, black_level=64)
+    read = read_views(rig(a=sensor), {"a": tmp_path / f"a.{suffix}"}, alpha="a")
+    assert (linear_from_srgb(read.images["a"]) - light()).abs().max() < 0.6 / (2**bits - 65)
+    assert read.rig["a"].sensor == Sensor()
+
+
+def test_packed_tiffs_need_no_bits_and_follow_them(tmp_path):
+    """A TIFF with 12 bits a value, two values in three bytes, written here by hand."""
+    values = counts(light(channels=1), bits=12, black=0)[0]
+    bits = "".join(f"{v:012b}" for v in values.ravel())
+    data = int(bits, 2).to_bytes(len(bits) // 8, "big")
+    h, w = HW
+    tags = [(256, w), (257, h), (258, 12), (259, 1), (262, 1), (273, 8), (277, 1), (278, h), (279, len(data))]
+    entry = b"".join(np.array([t, 4], "<u2").tobytes() + np.array([1, v], "<u4").tobytes() for t, v in tags)
+    head = b"II*\0" + np.array([8 + len(data)], "<u4").tobytes()
+    (tmp_path / "a.tif").write_bytes(head + data + np.array([len(tags)], "<u2").tobytes() + entry + bytes(4))
+    for given in (None, 12):
+        read = read_views(rig(a=Sensor(coding="linear", bits=given)), {"a": tmp_path / "a.tif"}, alpha="a")
+        assert (linear_from_srgb(read.images["a"]) - light(channels=1)).abs().max() < 0.6 / 4095
+
+
+@pytest.mark.parametrize("pattern", ["RGGB", "BGGR", "GRBG", "GBRG"])
+def test_colours_come_back_from_behind_each_filter_pattern(tmp_path, pattern):
+    save(tmp_path / "a.png", counts(mosaic(light(), pattern), bits=12, black=100))
+    sensor = Sensor(coding="linear", bits=12, black_level=100, bayer=pattern)
+    read = read_views(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a").images["a"]
+    off = (linear_from_srgb(read) - light()).abs()[:, 2:-2, 2:-2]
+    assert off.mean() < 0.006  # the bands vary independently here, for which the median costs a quarter
+    assert off.max() < 0.08
+
+
+def test_exposures_and_gains_are_brought_to_alphas():
+    """The same light through four times the exposure, twice the gain and a white balance."""
+    alpha, scene = Sensor(exposure=0.01), light(channels=3, white=0.2)
+    wide = Sensor(exposure=0.04, gain=(0.5, 1.0, 0.8), coding="linear")
+    recorded = scene * 4 * torch.tensor([0.5, 1.0, 0.8])[:, None, None]
+    torch.testing.assert_close(develop(recorded, wide, like=alpha), coded(scene), atol=1e-5, rtol=0)
+    srgb = Sensor(exposure=0.02, gain=2.0)
+    torch.testing.assert_close(develop(coded(4 * scene), srgb, like=alpha), coded(scene), atol=1e-5, rtol=0)
+    no_exposure = Sensor(gain=2.0, coding="linear")
+    torch.testing.assert_close(develop(2 * scene, no_exposure, like=alpha), coded(scene), atol=1e-5, rtol=0)
+
+
+def test_ordinary_pictures_pass_unchanged():
+    picture = light()
+    assert develop(picture, Sensor()) is picture
+
+
+@pytest.mark.parametrize(
+    ("sensor", "values", "message"),
+    [
+        (Sensor(bits=10), np.full((1, *HW), 1024, np.uint16), r"a: .*values up to 1024, the rig says 10 bits"),
+        (Sensor(bits=12), np.zeros((1, *HW), np.uint8), "has 8 bits a value, the rig says 12"),
+        (Sensor(bayer="RGGB"), np.zeros((3, *HW), np.uint8), "in colour, and the rig says raw RGGB"),
+        (Sensor(), np.zeros((1, 48, 60), np.uint8), "is 60x48, the rig says 64x48"),
+    ],
+)
+def test_what_does_not_fit_the_rig_is_named(tmp_path, sensor, values, message):
+    save(tmp_path / "a.png", values)
+    with pytest.raises(ValueError, match=message):
+        read_views(rig(a=sensor), {"a": tmp_path / "a.png"}, alpha="a")
+
+
+def test_exr_is_written_and_holds_the_floats(tmp_path):
+    OpenEXR = pytest.importorskip("OpenEXR")
+    picture = torch.rand(3, *HW) * 3 - 1
+    write_image(tmp_path / "a.exr", picture, bits=32)
+    planes = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
+    for name, plane in zip("RGB", picture):
+        assert np.array_equal(planes[name].pixels, plane.numpy())
+    with pytest.raises(ValueError, match="32-bit"):
+        write_image(tmp_path / "b.exr", picture, bits=16)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_a_picture_is_as_bright_as_the_light_that_alpha_measured():
+    """The right chroma on alpha's values is too bright where colours are strong; then it is the truth again."""
+    linear = light() ** torch.tensor([1.0, 3.0, 0.5]).view(3, 1, 1)
+    truth, alpha = coded(linear), coded(luminance(linear))
+    fused = truth - luminance(truth) + alpha
+    assert (fused - truth).abs().max() > 0.02
+    measured = developed(Sensor(response="mono", coding="linear"))
+    assert (as_bright(fused, alpha, measured) - truth).abs().max() < 1e-4
+    for unknown in (Sensor(response="mono"), Sensor(response="nir", coding="linear"), Sensor(coding="linear")):
+        assert as_bright(fused, alpha, developed(unknown)) is fused
+
+
+def test_a_mosaic_makes_little_false_colour():
+    """A grey picture with detail of two pixels: 30 % less colour than by interpolation alone."""
+    grey = torch.rand(1, 1, 24, 32, generator=torch.Generator().manual_seed(1))
+    picture = torch.nn.functional.interpolate(grey, HW, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    raw = mosaic(picture.expand(3, -1, -1), "RGGB")
+    plain = cv2.demosaicing((raw[0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB_EA) / 65535
+    plain, ours = (np.abs(rgb - rgb[1:2]).mean() for rgb in (plain.transpose(2, 0, 1), demosaiced(raw, "RGGB").numpy()))
+    assert ours < 0.7 * plain

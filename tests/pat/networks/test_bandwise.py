@@ -1,0 +1,112 @@
+"""BandwisePAT: the order of the bands and betas cannot matter, nor how many there are."""
+
+import pytest
+import torch
+
+from arraygeom import Camera, Pair, Pose, Rectified, Rig, View, intrinsics
+from pat import from_pretrained
+from pat.fusion.fuse import fuse
+from pat.fusion.steps import together
+from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
+from pat.networks.protocol import Look
+from pat.networks.weights import save_weights
+
+from .test_spectral_mix import texture
+
+HW = (32, 48)
+
+
+@pytest.fixture(scope="module")
+def network():
+    torch.manual_seed(0)
+    made = BandwisePAT(BandwisePATConfig(widths=(8, 8, 8, 8)))
+    torch.nn.init.normal_(made.single.head.last.weight, std=0.1)
+    return made.eval()
+
+
+def look(disparity):
+    return Look.along(Rectified(disparity), Pair(View(hw=HW), View(hw=HW)))
+
+
+def test_permuting_betas_of_one_band_permutes_the_output_bands(network):
+    alpha, bands, looks = (
+        torch.rand(2, 1, *HW),
+        list(torch.rand(4, 2, 1, *HW)),
+        [look(d) for d in (6.0, 9.0, 12.0, 4.0)],
+    )
+    order = [2, 0, 1, 3]
+    with torch.no_grad():
+        first = network(alpha, bands, looks)
+        second = network(alpha, [bands[i] for i in order], [looks[i] for i in order])
+    assert first.image.shape == (2, 4, *HW)
+    assert torch.equal(second.image, first.image[:, order])
+    assert all(torch.equal(second.confidence[k], first.confidence[i]) for k, i in enumerate(order))
+    assert (first.image[:, 0] - first.image[:, 1]).abs().max() > 1e-3
+
+
+@pytest.mark.parametrize("count", [2, 3, 5])
+def test_permuting_the_bands_of_a_beta_permutes_the_output_bands(network, count):
+    hw, order = (64, 96), torch.randperm(count, generator=torch.Generator().manual_seed(count)).tolist()
+    scene = torch.cat([texture(count, (64, 104), seed=i) for i in range(2)])
+    alpha, beta = scene[:, :1, :, :-8] * 0.4 + scene[:, 1:2, :, :-8] * 0.6, scene[..., 8:]
+    there = [Look.along(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))]
+    with torch.no_grad():
+        first, second = (network(alpha, [b], there) for b in (beta, beta[:, order]))
+    assert torch.equal(second.image, first.image[:, order])
+    assert torch.equal(second.position[0], first.position[0])
+    assert len(first.confidence) == 1
+
+
+def rig_of(names, places):
+    """Alpha, and betas 10 cm times their place to the right of it."""
+    alpha = Camera(K=intrinsics(100.0, (64, 96)), cam_from_world=Pose.identity(), hw=(64, 96))
+    betas = {
+        name: alpha.replace(cam_from_world=Pose(alpha.R, alpha.t.new_tensor([-0.1 * place, 0.0, 0.0])))
+        for name, place in zip(names, places)
+    }
+    return Rig({"alpha": alpha, **betas}, depth=(1.0, 8.0))
+
+
+def test_cameras_at_one_place_are_one_with_several_bands(network):
+    bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
+    apart = fuse(
+        network,
+        rig_of("rgb", [1, 1, 1]),
+        {"alpha": alpha, "r": bands[:1], "g": bands[1:2], "b": bands[2:]},
+        alpha="alpha",
+    )
+    whole = fuse(network, rig_of("c", [1]), {"alpha": alpha, "c": bands}, alpha="alpha")
+    assert torch.equal(apart.image, whole.image)
+    assert torch.equal(apart.confidence, whole.confidence)
+
+
+def test_bands_come_out_in_the_order_of_their_cameras(network):
+    """The second camera is elsewhere, the first and the third at one place."""
+    bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
+    pictures = dict(zip("rgb", bands.split(1)))
+    mixed = fuse(network, rig_of("rgb", [1, 2, 1]), {"alpha": alpha, **pictures}, alpha="alpha")
+    sorted_ = fuse(network, rig_of("rbg", [1, 1, 2]), {"alpha": alpha, **pictures}, alpha="alpha")
+    assert torch.equal(mixed.image, sorted_.image[[0, 2, 1]])
+    assert mixed.image.shape[0] == 3
+
+
+def test_which_cameras_are_put_together():
+    rig, fields = rig_of("abcd", [1, 2, 1, 1]), dict.fromkeys("abcd")
+    assert together(rig, "abcd", fields, "all") == [["a", "c", "d"], ["b"]]
+    assert together(rig, "abcd", fields, "neighbours") == [["a"], ["b"], ["c", "d"]]
+    assert together(rig, "abcd", fields, "no") == [["a"], ["b"], ["c"], ["d"]]
+    assert together(rig, "abcd", fields | {"c": Rectified(5.0)}, "all") == [["a", "d"], ["b"], ["c"]]
+    smaller = Rig({**rig.cameras, "c": rig["c"].resize((32, 48))}, depth=rig.depth)
+    assert together(smaller, "abcd", fields, "all") == [["a", "d"], ["b"], ["c"]]
+
+
+def test_only_single_bands():
+    with pytest.raises(ValueError, match="one band at a time"):
+        BandwisePATConfig(bands=3)
+
+
+def test_written_and_read_back(network, tmp_path):
+    save_weights(network, tmp_path / "w.safetensors")
+    again = from_pretrained(tmp_path / "w.safetensors")
+    assert again.config == network.config
+    assert all(torch.equal(v, network.state_dict()[k]) for k, v in again.state_dict().items())

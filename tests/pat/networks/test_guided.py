@@ -1,0 +1,91 @@
+"""GuidedPAT: colour is added and never luminance, betas in any split, gradients reach the geometry."""
+
+import pytest
+import torch
+
+from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
+from pat.media.colour import luminance
+from pat.networks.guided import GuidedPAT, GuidedPATConfig, window_around
+from pat.networks.protocol import Look
+
+SMALL = GuidedPATConfig(widths=(8, 8, 8, 8))
+HW = (32, 48)
+
+
+def rectified(beta_hw: tuple[int, int] = HW) -> Look:
+    return Look.along(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
+
+
+def lively(network: GuidedPAT) -> GuidedPAT:
+    """A network whose answer depends on everything: the head starts at zero otherwise."""
+    torch.nn.init.normal_(network.head.last.weight, std=0.1)
+    return network
+
+
+def test_luminance_is_alphas():
+    torch.manual_seed(0)
+    network = lively(GuidedPAT(SMALL))
+    alpha, beta = torch.rand(2, 1, *HW), torch.rand(2, 3, 32, 64)
+    fused = network(alpha, [beta], [rectified((32, 64))])
+    assert (luminance(fused.image) - alpha).abs().max() < 1e-5
+    assert (fused.image - alpha).abs().max() > 1e-2
+
+
+def test_three_filtered_cameras_serve_as_one():
+    """The same colours from three cameras in one place, up to what their guides (bands, not luminance) say."""
+    torch.manual_seed(0)
+    network = lively(GuidedPAT(SMALL))
+    alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
+    one = network(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()])
+    three = network(alpha, [grey] * 3, [rectified()] * 3)
+    assert (one.image - three.image).abs().max() < 1e-5
+    assert len(three.confidence) == 3
+
+
+def test_bands_must_add_up():
+    network = GuidedPAT(SMALL)
+    with pytest.raises(ValueError, match="2 bands in all, this network makes 3"):
+        network(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()])
+
+
+def test_the_window_stays_around_the_match():
+    end = torch.tensor([20.0, 3.0]).expand(1, 8, 8, 2)
+    segments = Segments(end - torch.tensor([12.0, 0.0]), end, torch.ones(1, 8, 8, dtype=torch.bool))
+    for reach, middle in ((5.0, 15.0), (-3.0, 20.0), (50.0, 8.0)):
+        window = window_around(torch.full((1, 1, 4, 4), reach), segments, 4.0)
+        assert torch.allclose(window.start[..., 0], torch.tensor(middle - 4))
+        assert torch.allclose(window.end[..., 0], torch.tensor(middle + 4))
+
+
+def test_gradients_reach_the_rig():
+    torch.manual_seed(0)
+    network = lively(GuidedPAT(SMALL))
+    translation = torch.tensor([-0.2, 0.0, 0.0], dtype=torch.float64, requires_grad=True)
+    camera = Camera(K=intrinsics(60.0, HW), cam_from_world=Pose.identity(), hw=HW)
+    beta = camera.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), translation))
+    depth = tuple(torch.tensor(d, dtype=torch.float64) for d in (1.0, 8.0))
+    fused = network(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [Look.along(Epipolar(), Pair(camera, beta, depth))])
+    fused.image.square().sum().backward()
+    assert translation.grad is not None
+    assert translation.grad.isfinite().all()
+    assert translation.grad.abs().max() > 0
+
+
+def test_nowhere_to_look_is_no_confidence():
+    torch.manual_seed(0)
+    network = lively(GuidedPAT(SMALL))
+    nowhere = Look(lambda x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), 4)
+    fused = network(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere])
+    assert fused.confidence[0].max() == 0
+    assert fused.image.isfinite().all()
+
+
+def test_without_a_head_the_image_is_what_was_found_and_carried():
+    torch.manual_seed(0)
+    network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), head_dim=0, keep_luminance=False))
+    assert not [name for name in network.state_dict() if name.startswith(("head", "propagate"))]
+    alpha, beta = torch.rand(1, 1, *HW), torch.rand(1, 3, *HW)
+    torch.nn.init.constant_(network.trust[2].bias, 20.0)
+    fused, (seen,) = network.explain(alpha, [beta], [rectified()])
+    assert seen.logit.max() > 15
+    assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)

@@ -1,0 +1,72 @@
+"""The paper's network: its parts, any number of betas of any sizes, and the rectified case written out."""
+
+import pytest
+import torch
+
+from arraygeom import Pair, Rectified, Rig, View, look
+from pat.attention import attend
+from pat.networks.paper import PAT, PATConfig
+from pat.networks.protocol import Look
+
+
+def looks(network: PAT, alpha: torch.Tensor, betas: list[torch.Tensor]) -> list[Look]:
+    hw = [tuple(p.shape[-2:]) for p in (alpha, *betas)]
+    return [Look.along(Rectified(8, alpha_is="left"), Pair(View(hw=hw[0]), View(hw=b))) for b in hw[1:]]
+
+
+def test_the_rectified_field_is_parallax_attention():
+    """Row by row: softmax over the whole row of beta (Wang et al. 2019, eq. 1)."""
+    g = torch.Generator().manual_seed(0)
+    query, key, value = (torch.randn(2, 6, 5, 9, generator=g, dtype=torch.float64) for _ in range(3))
+    weights = torch.einsum("bdhw,bdhv->bhwv", query, key).softmax(-1)
+    textbook = torch.einsum("bhwv,bdhv->bdhw", weights, value)
+    field = look(Rectified(), Pair(View(hw=(5, 9)), View(hw=(5, 9))))
+    for interpolation in ("bilinear", "nearest"):
+        ours = attend(query, key, value, field, interpolation=interpolation)
+        assert (ours - textbook).abs().max() < 1e-6
+
+
+def test_the_default_is_the_papers():
+    config = PATConfig()
+    assert (config.dim, config.scale, config.residual, config.interpolation) == (64, 1, False, "nearest")
+    network = PAT()
+    assert [type(m).__name__ for m in network.features] == [
+        *("Conv2d", "LeakyReLU", "ResidualBlock", "ResidualASPP", "ResidualBlock", "ResidualASPP", "ResidualBlock"),
+    ]
+    assert sum(type(m).__name__ == "ResidualBlock" for m in network.post) == 4
+
+
+@pytest.mark.parametrize("scale", [1, 2])
+def test_any_number_of_betas_of_any_sizes(scale):
+    torch.manual_seed(0)
+    network = PAT(PATConfig(betas=3, dim=8, scale=scale))
+    alpha = torch.rand(1, 1, 12, 20)
+    betas = [torch.rand(1, 3, 12, 20), torch.rand(1, 1, 7, 11), torch.rand(1, 3, 24, 30)]
+    fused = network(alpha, betas, looks(network, alpha, betas))
+    assert fused.image.shape == (1, 3, 12 * scale, 20 * scale)
+    assert [p.shape for p in fused.position] == [(1, 2, 12, 20)] * 3
+    fused.image.sum().backward()
+    assert all(p.grad is not None and p.grad.isfinite().all() for p in network.parameters())
+
+
+def test_the_residual_path_keeps_alpha():
+    """With the last convolution at zero the residual network returns alpha, and the paper's nothing."""
+    alpha, betas = torch.rand(1, 1, 12, 20), [torch.rand(1, 3, 12, 20)]
+    for residual, expected in ((True, alpha.expand(-1, 3, -1, -1)), (False, torch.zeros(1, 3, 12, 20))):
+        network = PAT(PATConfig(dim=8, residual=residual))
+        torch.nn.init.zeros_(network.post[-1].weight)
+        assert torch.equal(network(alpha, betas, looks(network, alpha, betas)).image, expected)
+
+
+def test_wrong_numbers_are_refused():
+    network = PAT(PATConfig(betas=2, dim=8))
+    alpha, beta = torch.rand(1, 1, 12, 20), torch.rand(1, 3, 12, 20)
+    with pytest.raises(ValueError, match="made for 2 betas, got 1"):
+        network(alpha, [beta], looks(network, alpha, [beta]))
+    with pytest.raises(ValueError, match="1 or 3 channels"):
+        network(alpha, [beta, beta[:, :2]], looks(network, alpha, [beta, beta]))
+
+
+def test_samples_follow_the_longest_segment():
+    rig = Rig({"a": View(hw=(10, 40)), "b": View(hw=(10, 40))})
+    assert Look.along(Rectified(12.0), rig.pair("a", "b")).samples == 13

@@ -1,0 +1,323 @@
+"""Consensus: a slow twin of its aggregation, true depths of a scene found again, the same bits by any road."""
+
+import cv2
+import numpy as np
+import pat.networks.semi_global
+import pytest
+import torch
+
+from arraygeom import (
+    Camera,
+    Epipolar,
+    Pair,
+    Pose,
+    Rectified,
+    Segments,
+    View,
+    intrinsics,
+    lazily,
+    pixel_grid,
+    rotation_from_vector,
+)
+from pat.media.colour import luminance
+from pat.networks import semi_global_kernels as kernels
+from pat.networks.semi_global import Balance, Consensus, consensus, equalising_blurs, matches
+
+HW = (64, 96)
+
+
+def slow_aggregate(cost: np.ndarray, guide: np.ndarray) -> np.ndarray:
+    """Semi-global matching as it is written down: one path at a time, from each pixel's predecessor."""
+    height, width, _ = cost.shape
+    total = np.zeros(cost.shape)
+    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        path = np.zeros(cost.shape)
+        rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
+        columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
+        for y in rows:
+            for x in columns:
+                path[y, x] = cost[y, x]
+                y0, x0 = y - dy, x - dx
+                if 0 <= y0 < height and 0 <= x0 < width:
+                    before = path[y0, x0]
+                    jump = max(kernels.SMALL + 1, kernels.LARGE / (1 + abs(guide[y, x] - guide[y0, x0]) / kernels.EDGE))
+                    up, down = np.append(before[1:], np.inf), np.append(np.inf, before[:-1])
+                    best = np.minimum.reduce([before, up + kernels.SMALL, down + kernels.SMALL])
+                    path[y, x] += np.minimum(best, before.min() + jump) - before.min()
+        total += path
+    return total
+
+
+def test_aggregation_is_that_of_its_slow_twin():
+    rng = np.random.default_rng(0)
+    cost = rng.integers(0, 68, (7, 9, 6)).astype(np.uint8)
+    guide = rng.random((7, 9)).astype(np.float32)
+    total = np.zeros(cost.shape, np.float32)
+    kernels.aggregate(cost, guide, total)
+    assert np.abs(total - slow_aggregate(cost, guide)).max() < 1e-2
+
+
+def test_census_is_which_of_48_neighbours_are_darker():
+    picture = np.random.default_rng(1).random((9, 11)).astype(np.float32)
+    bits = np.empty(picture.shape, np.uint64)
+    kernels.census(picture, bits)
+    y, x = 4, 5
+    window = picture[y - 3 : y + 4, x - 3 : x + 4].ravel()
+    darker = np.delete(window, 24) < picture[y, x]
+    assert f"{int(bits[y, x]):048b}" == "".join(str(int(d)) for d in darker)
+
+
+def pair_of(turn: float) -> Pair:
+    """Two cameras, the second beside the first, turned about the axis and smaller in field."""
+    camera = Camera(K=intrinsics(80.0, HW), cam_from_world=Pose.identity(), hw=HW)
+    R = rotation_from_vector(torch.tensor([0.01, -0.02, turn], dtype=torch.float64))
+    beta = Camera(
+        K=intrinsics(85.0, (80, 112)),
+        cam_from_world=Pose(R, torch.tensor([-0.25, 0.05, 0.0], dtype=torch.float64)),
+        hw=(80, 112),
+    )
+    return Pair(camera, beta, (torch.tensor(1.0).double(), torch.tensor(10.0).double()))
+
+
+def looked_at(pair: Pair, step: int) -> Segments:
+    hw = HW[0] // step, HW[1] // step
+    x = (pixel_grid(hw, dtype=torch.float64) + 0.5) * step - 0.5
+    found = lazily(Epipolar(), pair)(x.reshape(-1, 2))
+    return Segments(found.start.reshape(1, *hw, 2), found.end.reshape(1, *hw, 2), found.valid.reshape(1, *hw))
+
+
+def plane_seen(pair: Pair, depth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Alpha and beta pictures (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in beta."""
+    rough = torch.rand(1, 1, 40, 60, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+
+    def texture(X):
+        at = (X[..., :2] / depth * torch.tensor([0.6, 0.9]))[None]
+        return torch.nn.functional.grid_sample(rough, at, mode="bicubic", padding_mode="reflection", align_corners=True)
+
+    x = pixel_grid(HW, dtype=torch.float64).reshape(-1, 2)
+    X = pair.alpha.unproject(x, torch.full((len(x),), depth, dtype=torch.float64))
+    where = pair.beta.project(X)[0]
+    alpha = texture(X.reshape(*HW, 3))
+    beta_hw = pair.beta.hw
+    y = pixel_grid(beta_hw, dtype=torch.float64).reshape(-1, 2)
+    ray = pair.beta.unproject(y, torch.ones(len(y), dtype=torch.float64))
+    centre = pair.beta.cam_from_world.inverse().t
+    along = ray - centre
+    beta = texture((centre + along * ((depth - centre[2]) / along[:, 2])[:, None]).reshape(*beta_hw, 3))
+    return alpha, beta, where.reshape(*HW, 2)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, -0.6])
+def test_a_plane_is_found_again_by_unrectified_cameras(turn):
+    """To half a pixel where beta sees it, though every segment has its own direction; colours too."""
+    pair = pair_of(turn)
+    alpha, beta, where = plane_seen(pair, 2.0)
+    colours = beta * torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1).double()
+    segments = looked_at(pair, 1)
+    found = consensus(alpha, beta, colours, segments, looked_at(pair, 2))
+    position = matches(segments, found.reach)[0]
+    inner = torch.zeros(HW, dtype=torch.bool)
+    inner[8:-8, 8:-8] = True
+    seen = inner & (where > 4).all(-1) & (where < torch.tensor([107.0, 75.0])).all(-1)
+    off = (position - where).norm(dim=-1)[seen]
+    assert seen.float().mean() > 0.3
+    assert off.median() < 0.5
+    assert (off < 1.5).float().mean() > 0.95
+    wanted = alpha[0] * torch.tensor([1.0, 0.6, 0.3]).view(3, 1, 1).double() - alpha[0]
+    for colour in (found.matched[0], *found.colour[0]):
+        assert (colour - wanted)[:, seen].abs().mean() < 0.03
+
+
+def test_threads_and_blocks_change_nothing(monkeypatch):
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    call = alpha, beta, beta, looked_at(pair, 1), looked_at(pair, 2)
+    whole = consensus(*call)
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1 if threads > 1 else 3)
+        again = consensus(*call)
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(whole, again))
+    monkeypatch.setattr(pat.networks.semi_global, "BLOCK", 16)
+    pieces = consensus(*call)
+    assert (pieces.reach - whole.reach).abs().median() < 1e-3
+
+
+def test_a_batch_is_its_pictures_one_by_one():
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    fine, coarse = looked_at(pair, 1), looked_at(pair, 2)
+    one = consensus(alpha, beta, beta, fine, coarse)
+    other = consensus(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
+    both = consensus(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
+    for a, b, c in zip(one, other, both):
+        assert torch.equal(torch.cat([a, b]), c)
+
+
+def test_nowhere_to_look_is_nothing_found():
+    x = torch.zeros(1, 32, 48, 2)
+    nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
+    found = consensus(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
+    assert found.reach.abs().max() == 0
+    assert found.colour.isfinite().all()
+
+
+def test_a_cut_is_where_it_says():
+    half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
+    cut = Consensus(half, half, whole + 1, whole).cut((4, 10, 2, 16))
+    assert torch.equal(cut.reach, half[..., 2:5, 1:8])
+    assert torch.equal(cut.colour, whole[..., 4:10, 2:16])
+    assert torch.equal(cut.matched, whole[..., 4:10, 2:16] + 1)
+
+
+def test_what_nothing_sees_varies_with_brightness_as_nearby():
+    rng = np.random.default_rng(0)
+    brightness = (0.4 + 0.2 * rng.random((24, 32))).astype(np.float32)
+    colour = (0.8 * brightness - 0.3)[None]
+    weight = np.full(brightness.shape, 1e-4, np.float32)
+    weight[:, :16] = 1
+    guide = np.full(brightness.shape, 100, np.uint8)
+    unseen = np.where(weight < 1, 0, colour).astype(np.float32)
+    found = pat.networks.semi_global._regressed(unseen, brightness, weight, guide, (1000.0, 20.0))
+    assert np.abs(found - colour)[:, :, 16:].mean() < 0.6 * np.abs(colour - colour.mean()).mean()
+
+
+def blurred(picture: torch.Tensor, blur: float) -> torch.Tensor:
+    return torch.from_numpy(cv2.GaussianBlur(picture[0, 0].numpy(), (0, 0), blur))[None, None]
+
+
+def test_the_sharper_of_two_pictures_is_blurred_whichever_it_is():
+    sharp = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
+    soft = blurred(sharp, 1.25)
+    own, its = equalising_blurs(sharp, soft)
+    assert its == [0.0]
+    one, other = Balance(torch.zeros(3, 1, 1, 1, 1), (own, its)).equally_sharp(sharp, soft)
+    assert torch.equal(other, soft)
+    assert (one - soft).abs().mean() < 0.05 * (sharp - soft).abs().mean()
+    assert equalising_blurs(soft, sharp) == (its, own)
+    assert equalising_blurs(sharp, sharp.flip(-1)) == ([0.0], [0.0])
+
+
+def test_parts_are_balanced_as_the_whole_is():
+    """The right half is darker and softer than the left: by themselves the halves would be treated otherwise."""
+    alpha = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
+    alpha[..., 40:] = 0.3 * blurred(alpha, 2.0)[..., 40:]
+    beta = 0.5 * blurred(alpha, 1.0) + 0.2
+    balance = Balance.of(alpha, beta)
+    level = balance.levelled(beta)
+    assert abs(float(level.mean() - alpha.mean())) < 1e-5
+    assert abs(float(level.std() - alpha.std())) < 1e-5
+    assert balance.blurs[0] != [0.0]
+    assert torch.equal(balance.levelled(beta[..., 40:]), level[..., 40:])
+    sharp, part = (balance.equally_sharp(a, b) for a, b in ((alpha, level), (alpha[..., 40:], level[..., 40:])))
+    assert torch.allclose(part[0][..., 20:], sharp[0][..., 60:], atol=1e-6)
+    assert Balance.of(alpha[..., 40:], beta[..., 40:]).blurs != balance.blurs
+
+
+def test_a_match_has_the_detail_that_beta_lost():
+    """One view for both cameras: a quarter or more of the error of colour that beta's blur made is gone."""
+    coarse = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(2))
+    alpha = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
+    truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor([0.0, 0.1, 0.2]).view(1, 3, 1, 1)
+    beta = torch.cat([blurred(band, 1.0) for band in truth.split(1, 1)], 1)
+    fine, coarse = (pixel_grid((48 // s, 64 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
+    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in (fine, coarse)]
+    found = consensus(alpha, luminance(beta), beta, *here)
+    chroma = [picture - luminance(picture) for picture in (found.matched, beta, truth)]
+    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].abs().mean() for c in chroma[:2])
+    assert left < 0.75 * lost
+
+
+def test_colour_that_does_not_follow_brightness_is_left_alone():
+    """Red and green change places where brightness does not show it, beside edges of brightness."""
+    g = torch.Generator().manual_seed(5)
+    fine, other = (
+        torch.rand(1, 1, 24, 32, generator=g).round().repeat_interleave(4, -1).repeat_interleave(4, -2) for _ in "ab"
+    )
+    alpha = 0.35 + 0.3 * fine
+    other = other.roll((2, 2), (-1, -2)) - 0.5
+    truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
+    beta = torch.cat([blurred(band, 1.0) for band in truth.split(1, 1)], 1)
+    places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
+    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
+    found = consensus(alpha, luminance(beta), beta, *here)
+    chroma = [picture - luminance(picture) for picture in (found.matched, beta, truth)]
+    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].square().mean() for c in chroma[:2])
+    assert left < 1.05 * lost
+
+
+def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
+    """Two pictures of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
+    alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
+    view = View(hw=(alpha.shape[-2], width))
+    look = lazily(Rectified(64.0), Pair(view, view))
+    found = []
+    for step in (1, 2):
+        x = (pixel_grid((view.hw[0] // step, width // step), dtype=torch.float64) + 0.5) * step - 0.5
+        segments = look(x.reshape(-1, 2))
+        shape = (1, *x.shape[:-1])
+        found.append(
+            Segments(segments.start.reshape(*shape, 2), segments.end.reshape(*shape, 2), segments.valid.reshape(shape))
+        )
+    return alpha, beta, found
+
+
+def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
+    """A scene with little to hold on to, 64 x 256."""
+    soft = blurred(torch.rand(1, 1, 64, 256, generator=torch.Generator().manual_seed(seed)), blur)
+    return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
+
+
+def test_what_lies_beyond_the_edge_of_beta_is_not_looked_for_within_it():
+    """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
+    alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
+    noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
+    found = consensus(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
+    assert ((found.reach[..., 22:36] - 40).abs() < 2).float().mean() > 0.98
+    assert (found.facts[:, 0, :, :17] > pat.networks.semi_global.CONSISTENT).float().mean() > 0.845
+
+
+@pytest.mark.parametrize(("cut", "beyond"), [(1.0, kernels.UNSEEN), (0.0, kernels.NOWHERE)])
+def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut, beyond):
+    own, bits = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.uint64)
+    other, its = np.ones((1, 9), np.float32), np.full((1, 9), 2**48 - 1, np.uint64)
+    ends, along = np.array([[[2.0, 0.0]]], np.float32), np.array([[[-1.0, 0.0]]], np.float32)
+    length, edge = np.full((1, 1), 2, np.float32), np.full((1, 1), cut, np.float32)
+    cost = np.empty((1, 1, 5), np.uint8)
+    kernels.costs(own, bits, other, its, ends, along, length, edge, cost)
+    unlike = 48 + int(kernels.TRUNCATED)
+    assert cost.ravel().tolist() == [unlike] * 3 + [beyond] * 2
+    reach, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 3), np.float32)
+    kernels.winners(cost.astype(np.float32), ends, along, length, edge, 1, 9, reach, facts)
+    assert (reach[0, 0] > 2) == (cut == 1)
+    assert (facts[0, 0, 0] == 1) == (cut == 1)
+
+
+def test_colour_at_matches_does_not_hang_on_what_the_other_picture_shows_elsewhere():
+    """Alpha alone sees something dark on the left: whole pictures have other levels, what both see has the same."""
+    scene = faint(1, contrast=0.1, blur=3.0)
+    scene[..., :48] -= 0.35
+    tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
+    alpha, beta, segments = beside(scene, 48)
+    found = consensus(alpha, beta, beta * tint, *segments)
+    assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
+
+
+def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
+    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is blurred."""
+    g = torch.Generator().manual_seed(2)
+    coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
+    alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)
+    truth = 0.8 - 0.6 * alpha
+    beta = blurred(truth, 1.5)
+    places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
+    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
+    found = consensus(alpha, beta, beta, *here).matched + alpha
+    left, lost = ((p - truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
+    assert left < 0.7 * lost
+
+
+def enlarged(picture: torch.Tensor, times: int) -> torch.Tensor:
+    return picture.repeat_interleave(times, -1).repeat_interleave(times, -2)

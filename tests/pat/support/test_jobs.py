@@ -1,0 +1,148 @@
+"""Tasks: once each, resumed, in other processes with the same results; killed workers and commands lose nothing."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from arraygeom.atomic import write_text
+from pat.support.jobs import JobError, Task, Workers, run_tasks
+from tests.pat.fusion.test_batch import contents, material  # noqa: F401  (a fixture)
+
+
+def note(path: Path, wait: float = 0.0) -> None:
+    """Writes the number of times it was called, and who did."""
+    calls = path.with_suffix(".calls")
+    with calls.open("a") as file:
+        file.write(f"{os.getpid()}\n")
+    time.sleep(wait)
+    if path.stem == "bad":
+        raise ValueError("not good\nat all")
+    write_text(path, "done")
+
+
+def tasks(folder: Path, *names: str, wait: float = 0.0) -> list[Task]:
+    return [Task(folder / f"{name}.txt", note, (folder / f"{name}.txt", wait)) for name in names]
+
+
+def test_what_is_there_is_not_repeated(tmp_path):
+    assert str(run_tasks(tasks(tmp_path, "a", "b"))) == "2 made"
+    again = run_tasks(tasks(tmp_path, "a", "b", "c"), resume=True)
+    assert str(again) == "1 made, 2 there already"
+    assert len((tmp_path / "a.calls").read_text().split()) == 1
+    run_tasks(tasks(tmp_path, "a"))
+    assert len((tmp_path / "a.calls").read_text().split()) == 2
+
+
+def test_errors_stop_or_are_skipped(tmp_path):
+    with pytest.raises(JobError, match=r"bad.txt: not good at all .*--resume"):
+        run_tasks(tasks(tmp_path, "a", "bad", "b"))
+    assert (tmp_path / "a.txt").exists()
+    assert not (tmp_path / "b.txt").exists()
+    report = run_tasks(tasks(tmp_path, "a", "bad", "b"), resume=True, on_error="skip")
+    assert str(report) == "1 made, 1 there already, 1 failed"
+
+
+@pytest.mark.slow
+def test_workers_do_the_same_and_say_the_same(tmp_path):
+    names = [f"{i}" for i in range(10)]
+    report = run_tasks(tasks(tmp_path, *names, "bad"), workers=Workers(2), on_error="skip")
+    assert len(report.made) == 10
+    assert list(report.failed.values()) == ["not good at all"]
+    pids = {line for name in names for line in (tmp_path / f"{name}.calls").read_text().split()}
+    assert str(os.getpid()) not in pids
+    with pytest.raises(JobError, match="bad"):
+        run_tasks(tasks(tmp_path, "bad"), workers=Workers(2))
+
+
+def test_local_workers_keep_freed_memory(monkeypatch):
+    """With Dask's own setting glibc gives back every freed picture at once, and two workers were slower than one."""
+    for name in ("MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    with Workers(2).client() as client:
+        told = client.run(lambda: (os.environ.get("MALLOC_TRIM_THRESHOLD_"), os.environ["OMP_NUM_THREADS"]))
+    assert list(told.values()) == [(None, "1")] * 2
+
+
+def test_what_workers_are_told_does_not_stay_in_this_process(monkeypatch):
+    monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
+    with Workers(1).client():
+        pass
+    assert "OPENBLAS_NUM_THREADS" not in os.environ
+
+
+def test_a_scheduler_that_is_not_there_is_named(tmp_path):
+    pytest.importorskip("distributed")
+    with pytest.raises(ValueError, match="no Dask scheduler at nowhere"):
+        run_tasks(tasks(tmp_path, "a"), workers=Workers(scheduler="nowhere://x:1"))
+
+
+@pytest.mark.slow
+def test_a_killed_worker_loses_nothing(tmp_path):
+    """SIGKILL to a worker that is at a task: all are made, and only what it was at is made again."""
+    names = [f"{i:02d}" for i in range(40)]
+
+    def kill_one() -> None:
+        while len(list(tmp_path.glob("*.txt"))) < 6:
+            time.sleep(0.02)
+        last = max(tmp_path.glob("*.calls"), key=lambda p: p.stat().st_mtime)
+        os.kill(int(last.read_text().split()[0]), signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_one)
+    killer.start()
+    report = run_tasks(tasks(tmp_path, *names, wait=0.1), workers=Workers(2))
+    killer.join()
+    assert len(report.made) == 40
+    assert all((tmp_path / f"{name}.txt").read_text() == "done" for name in names)
+    repeated = [n for n in names if len((tmp_path / f"{n}.calls").read_text().split()) > 1]
+    assert len(repeated) <= 2
+
+
+@pytest.mark.slow
+def test_a_killed_command_is_resumed_to_the_same_bits(material, tmp_path):  # noqa: F811
+    """Forty frames with two workers, everything killed with SIGKILL in the middle, begun again with --resume."""
+    (tmp_path / "fast").mkdir()
+    (tmp_path / "slow").mkdir()
+    for i in range(40):
+        os.link(material / "fast" / f"fast_{8 + i % 7}.png", tmp_path / "fast" / f"f{i}.png")
+        os.link(material / "slow" / f"slow_{8 + i % 2}.png", tmp_path / "slow" / f"s{i}.png")
+    images = [a for name in ("fast", "slow") for a in ("--image", f"{name}={tmp_path / name}")]
+    given = ["--rig", material / "rig.yaml", "--alpha", "fast", "--weights", material / "tiny.safetensors", *images]
+    run = "import sys; from pat.cli.main import main\nif __name__ == '__main__': main(sys.argv[1:])"
+    (tmp_path / "run.py").write_text(run)
+
+    def command(out: str, *more: str) -> subprocess.Popen:
+        line = [sys.executable, tmp_path / "run.py", "fuse", *given, "--out", tmp_path / out, *more]
+        environment = {**os.environ, "PYTHONPATH": os.getcwd()}
+        return subprocess.Popen([str(a) for a in line], env=environment, start_new_session=True)
+
+    assert command("whole", "--threads", "1").wait() == 0
+    stopped = command("part", "--workers", "2")
+    while len(list((tmp_path / "part").glob("*_fused.png"))) < 12:
+        assert stopped.poll() is None
+        time.sleep(0.05)
+    os.killpg(stopped.pid, signal.SIGKILL)
+    stopped.wait()
+    before = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "part").glob("*_fused.png")}
+    assert 12 <= len(before) < 40
+    assert command("part", "--workers", "2", "--resume").wait() == 0
+    after = {p.name: p.stat().st_mtime_ns for p in (tmp_path / "part").glob("*_fused.png")}
+    assert len(after) == 40
+    assert {n: after[n] for n in before} == before
+    assert contents(tmp_path / "part") == contents(tmp_path / "whole")
+
+
+@pytest.mark.slow
+def test_workers_of_a_scheduler_elsewhere_do_the_work(tmp_path):
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=1, threads_per_worker=1, dashboard_address=None) as cluster:
+        there = Workers(scheduler=cluster.scheduler_address)
+        report = run_tasks(tasks(tmp_path, "a", "b", "bad"), workers=there, on_error="skip")
+    assert len(report.made) == 2
+    assert str(os.getpid()) not in (tmp_path / "a.calls").read_text().split()

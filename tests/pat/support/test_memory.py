@@ -1,0 +1,46 @@
+"""memory: amounts are read, and what was freed goes back to the system."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pat.support.memory import give_back, parse_bytes, watch_peak
+
+
+def resident() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_freed_memory_is_given_back():
+    """Every other block is freed: those that stay keep the C library from returning the rest by itself."""
+    blocks = [np.ones(2**16, np.uint8) for _ in range(4000)]
+    blocks = blocks[::2]
+    before = resident()
+    give_back()
+    assert before - resident() > 0.8 * 2000 * 2**16
+    assert all(block[0] == 1 for block in blocks)
+
+
+def test_bytes_are_read():
+    assert parse_bytes("4GiB") == 4 * 2**30
+    assert parse_bytes("500 MB") == 5e8
+    assert parse_bytes(7) == 7.0
+    with pytest.raises(ValueError, match="'4 gigs'"):
+        parse_bytes("4 gigs")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="read from /proc")
+def test_the_peak_of_a_process_is_its_own_not_that_of_its_parent():
+    held = np.ones(2**26)  # 512 MiB resident here while the other starts
+    code = "import time; held = bytearray(100 << 20); del held; time.sleep(1)"
+    process = subprocess.Popen([sys.executable, "-I", "-S", "-c", code])
+    peak = watch_peak(process.pid)()
+    assert process.wait() == 0
+    assert held.nbytes == 2**29
+    assert 100 * 2**20 < peak < 200 * 2**20
+    assert watch_peak(process.pid)() == 0

@@ -1,0 +1,98 @@
+"""Training: samples that agree with their geometry, a loss that goes down, a file that loads."""
+
+import json
+
+import pytest
+import torch
+from torch import Generator
+
+from arraygeom import Epipolar, Segments, sample
+from pat.media.colour import luminance
+from pat.media.images import write_image
+from pat.networks.guided import GuidedPATConfig
+from pat.networks.weights import load_weights
+from pat.training.train import TrainConfig, degraded, picture_loss, scenes, train
+
+SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("photos")
+    g = Generator().manual_seed(0)
+    for i in range(4):
+        smooth = torch.nn.functional.interpolate(torch.rand(1, 3, 12, 16, generator=g), (96, 128), mode="bilinear")
+        write_image(folder / f"{i}.png", smooth[0])
+    return TrainConfig(
+        photos=(folder,), out=folder / "run", network=SMALL, steps=12, batch=2, hw=(32, 48), validate=6, held_out=4
+    )
+
+
+def test_truth_is_where_the_geometry_says(config):
+    """Beta looked up at the true positions is alpha's view in colour, wherever beta sees the surface."""
+    learn, _ = scenes(config)
+    errors = []
+    for given in learn(6):
+        if len(given.betas) == 1:
+            found = sample(given.betas[0], given.position[0]).values
+            off = (found - given.truth).abs().mean(1)
+            errors.append(off[given.visible[0]].median())
+            assert (luminance(given.truth) - given.alpha).abs().max() < 1e-5
+    assert torch.stack(errors).median() < 0.05
+
+
+def test_positions_lie_on_the_segments(config):
+    learn, _ = scenes(config)
+    for given in learn(3):
+        for look, position, visible in zip(given.looks, given.position, given.visible):
+            h, w = visible.shape[1:]
+            x = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1).float().reshape(-1, 2)
+            segments = look.at(x)
+            nearest = segments.at(segments.fraction(position.reshape(len(position), -1, 2)).clamp(0, 1))
+            off = (nearest - position.reshape(len(position), -1, 2)).norm(dim=-1)
+            assert off[segments.valid & visible.reshape(len(visible), -1)].max() < 0.1
+
+
+def test_a_field_of_ones_own_trains(config):
+    """A field in a few lines, given to training, is where the samples look."""
+
+    def upper_half(pair, x):
+        found = Epipolar()(pair, x)
+        return Segments(found.start, found.at(torch.full_like(found.start[..., 0], 0.5)), found.valid)
+
+    learn, _ = scenes(config, field=upper_half)
+    whole, _ = scenes(config)
+    x = torch.tensor([[20.0, 15.0]])
+    (mine, all_of_it) = (next(source(1)).looks[0].at(x) for source in (learn, whole))
+    assert torch.allclose(2 * mine.length, all_of_it.length, rtol=1e-4)
+
+
+def test_the_same_seed_makes_the_same_samples(config):
+    first, second = (next(scenes(config)[0](1)) for _ in range(2))
+    assert torch.equal(first.alpha, second.alpha)
+    assert torch.equal(first.betas[0], second.betas[0])
+
+
+def test_every_sample_pulls_alike():
+    truth = torch.zeros(1, 3, 4, 4)
+    assert float(picture_loss(truth + 0.1, truth)) == pytest.approx(-2, abs=1e-3)
+    assert float(picture_loss(truth + 1.0, truth)) == pytest.approx(0, abs=1e-3)
+
+
+def test_a_short_run_learns_and_leaves_weights(config):
+    best = train(config)
+    lines = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [6, 12]
+    assert load_weights(best).config == SMALL
+    assert all(line["psnr"] > 5 for line in lines)
+
+
+def test_degradation_keeps_the_truth_in_colour(config):
+    from pat.synthesis.layered import LayeredScenes
+    from pat.synthesis.rigs import RigDistribution
+    from pat.training.train import photographs
+
+    scene = LayeredScenes(photographs(config)[0], RigDistribution(), hw=(32, 48)).sample(2, Generator().manual_seed(1))
+    given = degraded(scene, Generator().manual_seed(2))
+    ideal = scene.images[0]
+    assert (given.truth - luminance(given.truth) - (ideal - luminance(ideal))).abs().max() < 1e-5
