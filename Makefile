@@ -12,14 +12,14 @@ DATA ?= ../shared/data
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
-	@echo "make showcase   fuse real pictures from DATA=$(DATA) into out/showcase"
+	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
 	@echo "make readme     run both and put what they print into README.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
-	@echo "make train      train on the pictures at hand; ARGS=... goes to 'pat train'"
+	@echo "make train      train on the images at hand; ARGS=... goes to 'pat train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
 	@echo "make docs       the documentation as a site, in out/site"
@@ -34,13 +34,13 @@ demo: $(READY)
 	@$(BIN)/pat demo --out out/demo
 
 showcase: $(READY)
-	@echo "== fusing the pictures in $(DATA) into out/showcase"
+	@echo "== fusing the images in $(DATA) into out/showcase"
 	@$(BIN)/pat showcase --data $(DATA) --out out/showcase
 
 readme: demo showcase
 	@echo "== bringing README.md up to date"
 	@$(BIN)/python -m docs.update_readme --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
-		--picture out/demo/demo.png docs/demo.jpg
+		--image out/demo/demo.png docs/demo.jpg
 
 test: $(READY)
 	@echo "== tests"

@@ -44,7 +44,7 @@ from .sampling import sample, to_grid
 from .segments import Positions, Segments
 from .sensor import Band, Curve, Sensor
 from .triangulation import Triangulated, depth_of, triangulate
-from .undistortion import pinhole_view, retaken
+from .undistortion import pinhole_view, resampled
 
 __all__ = [
     "Band",
@@ -96,8 +96,8 @@ __all__ = [
     "pixel_grid",
     "plane_homography",
     "rectify",
+    "resampled",
     "resize_matrix",
-    "retaken",
     "rotation_from_vector",
     "sample",
     "segments_between",

@@ -13,7 +13,7 @@ from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
 from .distortion import Distortion
-from .pixels import HW, map_homogeneous, resize_matrix, shift_matrix, to_homogeneous, turn_matrix
+from .pixels import HW, map_homogeneous, resize_matrix, rot90_matrix, shift_matrix, to_homogeneous
 from .pose import Pose, matvec
 from .sensor import Sensor
 
@@ -31,38 +31,38 @@ AnyView = TypeVar("AnyView", bound="View")
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """What is known of every camera, calibrated or not: its picture's (height, width) and what it records."""
+    """What is known of every camera, calibrated or not: its image's (height, width) and what it records."""
 
     hw: HW
     sensor: Sensor = field(default_factory=Sensor)
 
     def resize(self: AnyView, hw: HW) -> AnyView:
         """The same view at another size."""
-        return self.mapped(resize_matrix(self.hw, hw), hw)
+        return self.transformed(resize_matrix(self.hw, hw), hw)
 
     def crop(self: AnyView, top: int, left: int, hw: HW) -> AnyView:
         """A window of the view, `hw` in size. A negative `top` or `left`, or a larger size, pads."""
-        return self.mapped(shift_matrix(left, top), hw)
+        return self.transformed(shift_matrix(left, top), hw)
 
     def turn(self: AnyView, quarter_turns: int) -> AnyView:
-        """The picture turned counter-clockwise, as `torch.rot90(image, k, (-2, -1))` turns it."""
+        """The image turned counter-clockwise, as `torch.rot90(image, k, (-2, -1))` turns it."""
         hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
-        return self.mapped(turn_matrix(self.hw, quarter_turns), hw)
+        return self.transformed(rot90_matrix(self.hw, quarter_turns), hw)
 
-    def mapped(self: AnyView, A: Float[Tensor, "3 3"], hw: HW) -> AnyView:
-        """The camera of the picture whose pixels are x' ~ A x, of size `hw`."""
+    def transformed(self: AnyView, A: Float[Tensor, "3 3"], hw: HW) -> AnyView:
+        """The camera of the image whose pixels are x' ~ A x, of size `hw`."""
         return self.replace(hw=hw)
 
-    def straighten(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Where a camera without this one's lens would have put what pixels see, and which the lens model reaches."""
         return x, torch.ones_like(x[..., 0], dtype=torch.bool)
 
-    def bend(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Straightened pixels to those of the picture: the inverse of `straighten`."""
+    def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Straightened pixels to those of the image: the inverse of `straighten`."""
         return x, torch.ones_like(x[..., 0], dtype=torch.bool)
 
     def contains(self, x: Float[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
-        """Whether points lie on the picture's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
+        """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         h, w = self.hw
         return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
 
@@ -104,16 +104,16 @@ class LensView(View):
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
-    def straighten(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Where a pinhole with the same K would have put what pixels see, and which the lens model reaches."""
         return self._each_through(Distortion.undistort, x)
 
-    def bend(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Straightened pixels to those of the picture: the inverse of `straighten`."""
+    def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+        """Straightened pixels to those of the image: the inverse of `straighten`."""
         return self._each_through(Distortion.distort, x)
 
-    def mapped(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
-        """The camera of the picture whose pixels are x' ~ A x, of size `hw`: K' = A K."""
+    def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
+        """The camera of the image whose pixels are x' ~ A x, of size `hw`: K' = A K."""
         return self.replace(K=A.to(self.K) @ self.K, hw=hw)
 
     def to(self: AnyLensView, *args: Any, **kwargs: Any) -> AnyLensView:
@@ -131,7 +131,7 @@ class LensView(View):
     def _each_through(self, f: ThroughLens, x: Tensor) -> tuple[Tensor, Tensor]:
         """Pixels to normalised points, through f, and back to pixels."""
         if self.distortion is None:
-            return super().straighten(x)
+            return super().undistort(x)
         normalised, valid = f(self.distortion, map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x))
         return map_homogeneous(self.K[..., :2, :], normalised), valid
 
@@ -145,7 +145,7 @@ class Camera(LensView):
     """A calibrated camera. Leading batch axes everywhere; every tensor may require grad.
 
     `K` maps the plane z = 1 (after the lens) to pixels, the first pixel's centre being (0, 0). It is affine,
-    not necessarily upper triangular: that of a turned picture has zeros on its diagonal.
+    not necessarily upper triangular: that of a turned image has zeros on its diagonal.
     `cam_from_world`: X_cam = R X_world + t in metres, x right, y down, z forward.
 
     >>> K = torch.tensor([[100.0, 0, 49.5], [0, 100.0, 29.5], [0, 0, 1]], dtype=torch.float64)
@@ -213,7 +213,7 @@ class Camera(LensView):
 def intrinsics(
     focal: tuple[float, float] | float, hw: HW, centre: tuple[float, float] | None = None
 ) -> Float[Tensor, "3 3"]:
-    """K from focal lengths and the principal point in pixels; by default the picture's middle.
+    """K from focal lengths and the principal point in pixels; by default the image's middle.
 
     >>> intrinsics(500.0, (480, 640))[0].tolist()
     [500.0, 0.0, 319.5]

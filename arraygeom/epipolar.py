@@ -104,11 +104,11 @@ def track(
 
 
 def segments_between(track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW) -> Segments:
-    """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's picture.
+    """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's image.
 
-    Clipped to the picture's area and to the front of beta, in closed form: with s going from 0 at far to 1 at
+    Clipped to the image's area and to the front of beta, in closed form: with s going from 0 at far to 1 at
     near in proportion to inverse depth, the homogeneous pixel is P + s D, and every limit is linear in s with a
-    slope that is one number for the whole picture.
+    slope that is one number for the whole image.
     """
     a, b = track
     w_far, w_near = (_beside(1 / d.to(a.dtype), a.ndim - 1) for d in (far, near))
@@ -145,7 +145,7 @@ def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor)
 
 
 def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tensor, hw: HW) -> Tensor:
-    """The pixels of P + s D, kept from leaving the picture by rounding; zero where not valid."""
+    """The pixels of P + s D, kept from leaving the image by rounding; zero where not valid."""
     s = torch.where(valid, s, 0.0)
     X, Y, Z = (torch.addcmul(p, s, d) for p, d in zip(P, D))
     Z = torch.where(valid, Z, 1.0)

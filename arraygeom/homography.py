@@ -1,4 +1,4 @@
-"""Maps between two pictures of one plane (Hartley & Zisserman, chapter 13).
+"""Maps between two images of one plane (Hartley & Zisserman, chapter 13).
 
 Points are (x, y) in pixels, the centre of the first pixel being (0, 0). The pose is beta from alpha:
 X_beta = R X_alpha + t.
@@ -59,8 +59,8 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Ma
     X, Y, scale = map_homogeneous(H, x).unbind(-1)
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
     scale = torch.where(valid, scale, 1.0)
-    mapped = [torch.where(valid, c, 0.0) / scale for c in (X, Y)]
-    return MappedPoints(torch.stack(mapped, -1), valid)
+    transformed = [torch.where(valid, c, 0.0) / scale for c in (X, Y)]
+    return MappedPoints(torch.stack(transformed, -1), valid)
 
 
 SMALLEST_SCALE = 1e-9
@@ -93,14 +93,14 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: i
     H = torch.cat([torch.linalg.lstsq(u1, v).solution.T, u.new_tensor([[0.0, 0.0, 1.0]])])
     for _ in range(steps):
         w = u1 @ H[2]
-        mapped = (u1 @ H[:2].T) / w[:, None]
+        transformed = (u1 @ H[:2].T) / w[:, None]
         p = u1 / w[:, None]
         zero = torch.zeros_like(p)
         slopes = [
             torch.cat([*block, -m * p[:, :2]], -1)
-            for block, m in (([p, zero], mapped[:, :1]), ([zero, p], mapped[:, 1:]))
+            for block, m in (([p, zero], transformed[:, :1]), ([zero, p], transformed[:, 1:]))
         ]
-        J, residual = torch.cat(slopes), (v - mapped).T.reshape(-1)
+        J, residual = torch.cat(slopes), (v - transformed).T.reshape(-1)
         step = torch.linalg.solve(J.T @ J + 1e-12 * torch.eye(8).to(J), J.T @ residual)
         H = H + torch.nn.functional.pad(step, (0, 1)).reshape(3, 3)
     return torch.linalg.inv(B) @ H @ A

@@ -1,4 +1,4 @@
-"""Pixel maps: what resizing, cropping, padding and turning a picture do to its coordinates.
+"""Pixel maps: what resizing, cropping, padding and turning an image do to its coordinates.
 
 Each is a 3x3 matrix A, `x_new ~ A x_old`, on pixels whose first centre is (0, 0). Cameras follow by
 K' = A K, fundamental matrices by F' = A_beta^-T F A_alpha^-1.
@@ -16,7 +16,7 @@ HW = tuple[int, int]
 def pixel_grid(
     hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
 ) -> Float[Tensor, "h w 2"]:
-    """The centres (x, y) of all pixels of a picture.
+    """The centres (x, y) of all pixels of an image.
 
     >>> pixel_grid((2, 3))[1, 2].tolist()
     [2.0, 1.0]
@@ -40,8 +40,8 @@ def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
     return _matrix([[1, 0, -left], [0, 1, -top], [0, 0, 1]])
 
 
-def turn_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
-    """Turning the picture counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
+def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
+    """Turning the image counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
 
     >>> (turn_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]

@@ -1,4 +1,4 @@
-"""Rectifying a pair: homographies after which a point has the same row in both pictures."""
+"""Rectifying a pair: homographies after which a point has the same row in both images."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ class Rectification(NamedTuple):
 def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
     """Rectifying homographies of a pinhole pair (Bouguet's: each camera is turned half way).
 
-    The new pictures have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two focal
-    lengths, and the centres of the old pictures about the middle of the new. The same R_alpha and R_beta as
+    The new images have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two focal
+    lengths, and the centres of the old images about the middle of the new. The same R_alpha and R_beta as
     OpenCV's `stereoRectify` for a horizontal pair; a vertical one is turned by a quarter, so that lines are rows
     here too. Differentiable in everything. Raises ValueError for lenses, batches, and without a baseline.
     """
     alpha, beta = pair.cameras
     if alpha.distortion is not None or beta.distortion is not None:
-        raise ValueError("rectification by homographies needs pinhole cameras: undistort the pictures first")
+        raise ValueError("rectification by homographies needs pinhole cameras: undistort the images first")
     if alpha.K.ndim > 2 or beta.K.ndim > 2:
         raise ValueError("rectification works on one pair at a time: take one of the batch")
     pose = pair.beta_from_alpha
@@ -85,7 +85,7 @@ def rotation_vector(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
 def middle_intrinsics(
     cameras: tuple[Camera, Camera], rotations: tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]], hw: HW
 ) -> Float[Tensor, "3 3"]:
-    """K of the smaller focal length that puts what both old pictures have in the middle near the new middle."""
+    """K of the smaller focal length that puts what both old images have in the middle near the new middle."""
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     seen = []
     for camera, R in zip(cameras, rotations):

@@ -17,7 +17,7 @@ from torch import Tensor
 from .camera import Camera, LensView, View
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
-from .pixels import HW, resize_matrix, shift_matrix, turn_matrix
+from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
 
 Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
@@ -37,8 +37,8 @@ class Link:
         """The same link with alpha and beta exchanged."""
         return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
 
-    def mapped(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
-        """The link between pictures whose pixels are A x of the old ones."""
+    def transformed(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
+        """The link between images whose pixels are A x of the old ones."""
         A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
         back = torch.linalg.inv(A_alpha)
         F = torch.linalg.inv(A_beta).T @ self.F @ back
@@ -66,8 +66,8 @@ class Pair:
         return isinstance(self.alpha, Camera) and isinstance(self.beta, Camera)
 
     @property
-    def bent(self) -> bool:
-        """Whether either view has a lens, so that lines are curves in its picture."""
+    def has_lens(self) -> bool:
+        """Whether either view has a lens, so that lines are curves in its image."""
         return any(isinstance(view, LensView) and view.distortion is not None for view in (self.alpha, self.beta))
 
     @property
@@ -124,19 +124,19 @@ class Pair:
         return resize_matrix(self.alpha.hw, self.beta.hw)
 
     def resize_beta(self, hw: HW) -> Pair:
-        """The pair whose beta records pictures of another size."""
-        return self.map_beta(resize_matrix(self.beta.hw, hw), hw)
+        """The pair whose beta records images of another size."""
+        return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
 
-    def turn_beta(self, quarter_turns: int) -> Pair:
-        """The pair whose beta has its picture turned; see `Camera.turn`."""
+    def rot90_beta(self, quarter_turns: int) -> Pair:
+        """The pair whose beta has its image turned; see `Camera.turn`."""
         h, w = self.beta.hw
-        return self.map_beta(turn_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
+        return self.transform_beta(rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
 
-    def map_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
-        """The pair in which beta's pixels are x' ~ A x and its picture's size is `hw`."""
+    def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
+        """The pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)
-        link = None if self.link is None else self.link.mapped(eye, A)
-        return dataclasses.replace(self, beta=self.beta.mapped(A, hw), link=link)
+        link = None if self.link is None else self.link.transformed(eye, A)
+        return dataclasses.replace(self, beta=self.beta.transformed(A, hw), link=link)
 
     def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
         """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
@@ -176,14 +176,14 @@ class Rig:
             object.__setattr__(self, "depth", depth_range(*self.depth))
 
     def __getitem__(self, name: str) -> View:
-        return self.cameras[self.known(name)]
+        return self.cameras[self.require(name)]
 
     @property
     def names(self) -> tuple[str, ...]:
         """The cameras' names in order."""
         return tuple(self.cameras)
 
-    def known(self, name: str) -> str:
+    def require(self, name: str) -> str:
         """The name itself. Raises ValueError if the rig has no such camera."""
         if name not in self.cameras:
             near = difflib.get_close_matches(name, self.names, 1)
@@ -193,7 +193,7 @@ class Rig:
 
     def betas(self, alpha: str) -> tuple[str, ...]:
         """All names but alpha's."""
-        return tuple(n for n in self.names if n != self.known(alpha))
+        return tuple(n for n in self.names if n != self.require(alpha))
 
     def pair(self, alpha: str, beta: str) -> Pair:
         """What relates two cameras of the rig, in the order given."""
@@ -211,26 +211,26 @@ class Rig:
         return self.replace(cameras={**self.cameras, name: camera})
 
     def resize(self, name: str, hw: HW) -> Rig:
-        """The rig whose camera `name` records pictures of another size."""
-        return self.mapped(name, resize_matrix(self[name].hw, hw), hw)
+        """The rig whose camera `name` records images of another size."""
+        return self.transformed(name, resize_matrix(self[name].hw, hw), hw)
 
     def crop(self, name: str, top: int, left: int, hw: HW) -> Rig:
-        """The rig whose camera `name` keeps a window of its picture; see `Camera.crop`."""
-        return self.mapped(name, shift_matrix(left, top), hw)
+        """The rig whose camera `name` keeps a window of its image; see `Camera.crop`."""
+        return self.transformed(name, shift_matrix(left, top), hw)
 
     def turn(self, name: str, quarter_turns: int) -> Rig:
-        """The rig whose camera `name` has its picture turned; see `Camera.turn`."""
+        """The rig whose camera `name` has its image turned; see `Camera.turn`."""
         hw = self[name].hw
-        return self.mapped(name, turn_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0]))
+        return self.transformed(name, rot90_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0]))
 
-    def mapped(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
-        """The rig in which the pixels of camera `name` are x' ~ A x and its picture's size is `hw`."""
+    def transformed(self, name: str, A: Float[Tensor, "3 3"], hw: HW) -> Rig:
+        """The rig in which the pixels of camera `name` are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=torch.float64)
         links = {
-            (a, b): link.mapped(A if a == name else eye, A if b == name else eye) if name in (a, b) else link
+            (a, b): link.transformed(A if a == name else eye, A if b == name else eye) if name in (a, b) else link
             for (a, b), link in self.links.items()
         }
-        return self.with_camera(name, self[name].mapped(A, hw)).replace(links=links)
+        return self.with_camera(name, self[name].transformed(A, hw)).replace(links=links)
 
     def parameters(self, *, free: Iterable[str]) -> dict[str, Tensor]:
         """Changes an optimiser may make, all zero and requiring grad; `perturbed` applies them.
@@ -315,7 +315,7 @@ def _shown(d: Tensor) -> str:
 
 
 def _focal_places(K: Tensor) -> Tensor:
-    """Where K has fx and fy, with their signs: the diagonal, or for a turned picture the other one."""
+    """Where K has fx and fy, with their signs: the diagonal, or for a turned image the other one."""
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
     return torch.where(largest, block.sign(), 0.0)

@@ -1,4 +1,4 @@
-"""Looking a picture up at positions, with validity."""
+"""Looking an image up at positions, with validity."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Interpolation = Literal["bilinear", "nearest", "bicubic"]
 
 
 class Sampled(NamedTuple):
-    """Values (B, C, *n) and whether each position (B, *n) was on the picture's area."""
+    """Values (B, C, *n) and whether each position (B, *n) was on the image's area."""
 
     values: Float[Tensor, "b c *n"]
     valid: Bool[Tensor, "b *n"]
@@ -31,8 +31,8 @@ def to_grid(x: Float[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:
     return (2 * x + 1) / x.new_tensor([w, h]) - 1
 
 
-def on_picture(x: Float[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
-    """Whether positions lie on the picture's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to 1e-3 pixels."""
+def on_image(x: Float[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
+    """Whether positions lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to 1e-3 pixels."""
     h, w = hw
     limits = x.new_tensor([w, h]) - 0.5 + SLACK
     return ((x >= -0.5 - SLACK) & (x <= limits)).all(-1)
@@ -45,13 +45,13 @@ SLACK = 1e-3
 def sample(
     image: Float[Tensor, "b c h w"], x: Float[Tensor, "k *n 2"], *, interpolation: Interpolation = "bilinear"
 ) -> Sampled:
-    """Pictures (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
+    """Images (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
 
     On the outer half pixel of the area the nearest pixels count. Outside it values are 0 and valid is False.
     """
     batch, hw = len(image), (image.shape[-2], image.shape[-1])
     x = x.expand(batch, *x.shape[1:])
-    valid = on_picture(x, hw)
+    valid = on_image(x, hw)
     grid = to_grid(torch.where(valid[..., None], x, 0.0), hw).reshape(batch, 1, -1, 2)
     values = grid_sample(image, grid, mode=interpolation, padding_mode="border", align_corners=False)
     values = values.reshape(batch, image.shape[1], *x.shape[1:-1])

@@ -1,7 +1,7 @@
 """Where to look in beta: what geometry hands to attention.
 
 `Segments` is the compact form, two points for each alpha pixel; `Positions` is the explicit one. Both hold
-(x, y) in beta's pixels, the centre of the first pixel being (0, 0). A picture of height H and width W covers
+(x, y) in beta's pixels, the centre of the first pixel being (0, 0). An image of height H and width W covers
 the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be looked up, all others cannot.
 """
 
@@ -30,7 +30,7 @@ class Positions:
 
 @dataclass(frozen=True)
 class Segments:
-    """One straight piece of beta's picture for each alpha pixel, from `start` to `end`, in beta's pixels.
+    """One straight piece of beta's image for each alpha pixel, from `start` to `end`, in beta's pixels.
 
     For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far bound.
     Where `valid` is False there is nowhere to look and the ends mean nothing (but are finite).
@@ -71,8 +71,8 @@ class Segments:
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
 
-def clip_to_picture(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
-    """The part of each segment on the picture's area (Liang and Barsky 1984); invalid where there is none."""
+def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
+    """The part of each segment on the image's area (Liang and Barsky 1984); invalid where there is none."""
     low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
     for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):
         moves = b - a
@@ -83,19 +83,19 @@ def clip_to_picture(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw
         low = torch.maximum(low, torch.where(flat, torch.where(inside, 0.0, 2.0), torch.minimum(first, last)))
         high = torch.minimum(high, torch.where(flat, 1.0, torch.maximum(first, last)))
     valid = low <= high
-    first, last = (_on_picture(start, end, s, valid, hw) for s in (low, high))
+    first, last = (_on_image(start, end, s, valid, hw) for s in (low, high))
     return Segments(first, last, valid)
 
 
-def _on_picture(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> Tensor:
-    """The points at fraction s, kept from leaving the picture by rounding; zero where not valid."""
+def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> Tensor:
+    """The points at fraction s, kept from leaving the image by rounding; zero where not valid."""
     s = torch.where(valid, s, 0.0)
     limits = zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5))
     return torch.stack([torch.where(valid, (a + s * (b - a)).clamp(-0.5, m), 0.0) for a, b, m in limits], -1)
 
 
 FLAT = 1e-6
-"""A limit of the picture that moves by less than this along a whole segment, in pixels, is either kept or not."""
+"""A limit of the image that moves by less than this along a whole segment, in pixels, is either kept or not."""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:

@@ -31,7 +31,7 @@ class Sensor:
 
     `response` is a name ("mono", "rgb", "nir"), a band or a curve. `frame_rate` is in frames a second,
     `time_offset` in seconds after the rig's clock. `coding` says how pixel values relate to light:
-    "srgb" or "linear". `bayer` is the colour filter pattern from the top left ("RGGB"), for raw pictures.
+    "srgb" or "linear". `bayer` is the colour filter pattern from the top left ("RGGB"), for raw images.
 
     A file's values are counts from 0 to 2^bits - 1 (by default the file's own 8 or 16 bits), of which
     `black_level` stands for no light. Light times `exposure` (seconds) times `gain` makes the value; a gain of three

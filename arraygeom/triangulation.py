@@ -1,4 +1,4 @@
-"""From pictures back to depth: two views along a field, N views by triangulation."""
+"""From images back to depth: two views along a field, N views by triangulation."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pictures without their lens's bending: pinhole cameras in place of those with lenses, and pictures taken across."""
+"""Images without their lens's bending: pinhole cameras in place of those with lenses, and images taken across."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ WIDEST = math.radians(62)
 
 
 def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
-    """The camera without its lens, large enough for all that the old picture shows up to `widest` radians off axis.
+    """The camera without its lens, large enough for all that the old image shows up to `widest` radians off axis.
 
     Same place, orientation and K but for the principal point: pixels in the middle keep their size. Links follow by
-    `rig.mapped(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of cameras, and for a picture whose
+    `rig.mapped(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of cameras, and for an image whose
     middle is outside its lens's range.
     """
     if camera.K.ndim > 2:
@@ -29,7 +29,7 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
         rays, valid = camera.rays(coarse_grid(camera.hw).to(camera.K))
     near_axis = valid & (rays[..., 2] >= math.cos(widest) * rays.norm(dim=-1))
     if not near_axis.any():
-        raise ValueError("no pixel of the picture is within its lens's range: check the distortion's coefficients")
+        raise ValueError("no pixel of the image is within its lens's range: check the distortion's coefficients")
     seen = rays[near_axis]
     x = (seen[:, :2] / seen[:, 2:]) @ camera.K[:2, :2].mT + camera.K[:2, 2]
     low, high = x.detach().amin(0).floor(), x.detach().amax(0).ceil()
@@ -49,15 +49,15 @@ def pixels_between(source: LensView, target: LensView) -> tuple[Float[Tensor, "h
     return found.x, valid & found.valid & source.contains(found.x)
 
 
-def retaken(
-    picture: Float[Tensor, "c h w"],
+def resampled(
+    image: Float[Tensor, "c h w"],
     source: LensView,
     target: LensView,
     *,
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """The picture that `target`, in the same place as `source`, would have taken: values (1, C, H, W) and validity.
+    """The image that `target`, in the same place as `source`, would have taken: values (1, C, H, W) and validity.
 
     Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid. The
     distance of the two places is not looked at; views that are not calibrated count as turned alike.
@@ -66,5 +66,5 @@ def retaken(
     h, w = source.hw
     nearest = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
     inside = torch.where(seen[..., None], x, nearest if extended else 0.0)
-    found = sample(picture[None], inside[None].to(picture), interpolation=interpolation)
+    found = sample(image[None], inside[None].to(image), interpolation=interpolation)
     return Sampled(found.values * (seen | extended), found.valid & seen)

@@ -109,8 +109,8 @@ def extent_of(cameras: Mapping[str, Camera]) -> float:
 
 
 def frustum(camera: Camera, length: float) -> list[np.ndarray]:
-    """Lines in the world from the centre to the picture's corners, and the picture's border, `length` away."""
-    border = seen_at(camera, picture_border(camera.hw), length)
+    """Lines in the world from the centre to the image's corners, and the image's border, `length` away."""
+    border = seen_at(camera, image_border(camera.hw), length)
     centre = numpy(camera.centre)
     corners = border[:: len(border) // 4][:4]
     return [np.stack([centre, corner]) for corner in corners] + [border]
@@ -123,13 +123,13 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
     camera = cameras[alpha or next(iter(cameras))]
     limit = 40 * max(extent_of(cameras), 0.05)
     depths = [float(d) for d in rig.depth if float(d) <= limit]
-    borders = [seen_at(camera, picture_border(camera.hw), d) for d in depths]
+    borders = [seen_at(camera, image_border(camera.hw), d) for d in depths]
     edges = zip(*(b[:: len(b) // 4][:4] for b in borders)) if len(borders) == 2 else []
     return borders + [np.stack(edge) for edge in edges]
 
 
-def picture_border(hw: HW, points: int = 16) -> Float[Tensor, "n 2"]:
-    """Points round the picture's area from its first corner back to it, `points` a side, in pixels."""
+def image_border(hw: HW, points: int = 16) -> Float[Tensor, "n 2"]:
+    """Points round the image's area from its first corner back to it, `points` a side, in pixels."""
     h, w = hw
     corners = torch.tensor([[0.0, 0], [w, 0], [w, h], [0, h], [0, 0]], dtype=torch.float64) - 0.5
     steps = torch.arange(points, dtype=torch.float64)[:, None] / points
@@ -168,7 +168,7 @@ def draw_fields(
     """Alpha's pixels x, and in every beta where a field looks for them, in the same colours.
 
     `field` is one for all betas or one for each by name (Epipolar, Curved where there are lenses, or the
-    homography-based one without calibration). `images` holds (H, W), (H, W, 3) or (3, H, W) pictures by camera name.
+    homography-based one without calibration). `images` holds (H, W), (H, W, 3) or (3, H, W) images by camera name.
     Segments are lines with a dot at their near end, positions are dots.
     """
     betas = tuple(betas or rig.betas(alpha))
@@ -176,7 +176,7 @@ def draw_fields(
     figure = Figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
     for index, name in enumerate((alpha, *betas)):
         axes = figure.add_subplot(1, 1 + len(betas), 1 + index)
-        show_picture(axes, rig[name].hw, images.get(name))
+        show_image(axes, rig[name].hw, images.get(name))
         axes.set_title(f"{name} (alpha)" if name == alpha else name, fontsize=9)
         if name == alpha:
             axes.scatter(*numpy(x).T, c=_colours(len(x)), s=22, edgecolors="white", linewidths=0.7)
@@ -223,7 +223,7 @@ def draw_residuals(
     """Measured matches against the geometry: distances from beta's points to their epipolar lines.
 
     Left, each distance drawn across its line and `magnify` times as long (by default so that the median is 2 % of
-    the width); right, their histogram, with the median. Pixels of undistorted pictures.
+    the width); right, their histogram, with the median. Pixels of undistorted images.
     """
     line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
@@ -233,7 +233,7 @@ def draw_residuals(
     ends = numpy(x_beta - magnify * distance[:, None] * direction(line[:, :2]))
     figure = Figure(figsize=(8.4, 3.4), layout="constrained")
     axes, histogram = figure.subplots(1, 2, width_ratios=[1.5, 1])
-    show_picture(axes, pair.beta.hw, image)
+    show_image(axes, pair.beta.hw, image)
     limit = max(float(size.quantile(0.95)), 1e-9)
     arrows = LineCollection(
         list(np.stack([numpy(x_beta), ends], 1)), array=numpy(size), cmap="viridis", clim=(0, limit), linewidths=1.3
@@ -251,13 +251,13 @@ def draw_residuals(
 # Shared -------------------------------------------------------------------------------------------------------
 
 
-def show_picture(axes: Axes, hw: HW, image: Any = None) -> None:
-    """The picture, or an empty frame of its size, with pixel centres at whole numbers."""
+def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
+    """The image, or an empty frame of its size, with pixel centres at whole numbers."""
     h, w = hw
     if image is not None:
-        picture = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
-        picture = picture.transpose(1, 2, 0) if picture.ndim == 3 and picture.shape[0] in (1, 3) else picture
-        axes.imshow(np.squeeze(picture), cmap="gray", interpolation="antialiased", aspect="equal")
+        pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
+        pixels = pixels.transpose(1, 2, 0) if pixels.ndim == 3 and pixels.shape[0] in (1, 3) else pixels
+        axes.imshow(np.squeeze(pixels), cmap="gray", interpolation="antialiased", aspect="equal")
     axes.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("0.94")
 
@@ -268,7 +268,7 @@ def numpy(x: Tensor) -> np.ndarray:
 
 
 def _sheet(sizes: list[HW], height: float = 2.6) -> tuple[float, float]:
-    """The figure's size in inches for pictures side by side, at most 16 wide."""
+    """The figure's size in inches for images side by side, at most 16 wide."""
     width = sum(height * w / h for h, w in sizes)
     shrink = min(1.0, 16 / width)
     return width * shrink, height * shrink + 0.3

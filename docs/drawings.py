@@ -8,7 +8,7 @@ import torch
 from matplotlib.figure import Figure
 
 from arraygeom import Dense, Epipolar, EpipolarLine, HomographyDisplacement, Local, NearestVoxels, Rectified
-from arraygeom.viz import draw_fields, draw_look, draw_rig, show_picture
+from arraygeom.viz import draw_fields, draw_look, draw_rig, show_image
 from pat.data.sample_array import ALPHA, BETA, SampleArray, load_sample
 from pat.fusion.results import save_figure
 
@@ -25,16 +25,16 @@ FAMILIES = {
 
 
 def families(array: SampleArray, x: torch.Tensor) -> Figure:
-    """Each family's answer for the same pixels, on the pale picture of beta."""
+    """Each family's answer for the same pixels, on the pale image of beta."""
     pair = array.rig.pair(ALPHA, BETA)
     figure = Figure(figsize=(11, 5), layout="constrained")
     for axes, (name, field) in zip(figure.subplots(2, 4).flat, [("alpha's pixels", None), *FAMILIES.items()]):
         if field is None:
-            show_picture(axes, pair.alpha.hw, array.images[ALPHA] * 0.5 + 0.5)
+            show_image(axes, pair.alpha.hw, array.images[ALPHA] * 0.5 + 0.5)
             for pixel in x:
                 axes.plot(*pixel.tolist(), "o", ms=6)
         else:
-            show_picture(axes, pair.beta.hw, array.images[BETA] * 0.4 + 0.6)
+            show_image(axes, pair.beta.hw, array.images[BETA] * 0.4 + 0.6)
             draw_look(axes, field, pair, x)
         axes.set_title(name, fontsize=9)
     return figure

@@ -48,7 +48,7 @@ def cell_parts(cell: dict[str, Any]) -> list[str]:
 
 
 def shown(output: dict[str, Any]) -> str:
-    """A picture, or text."""
+    """An image, or text."""
     data = output.get("data", {})
     for kind in ("image/jpeg", "image/png"):
         if kind in data:

@@ -21,17 +21,17 @@ class Readme:
     """The document to bring up to date."""
     block: UseAppendAction[tuple[str, ...]] = ()
     """NAME=FILE, once for each block."""
-    picture: tuple[Path, Path] | None = None
-    """A picture to take over at 3/4 of its size, and the name to give it."""
+    image: tuple[Path, Path] | None = None
+    """An image to take over at 3/4 of its size, and the name to give it."""
 
     def run(self) -> None:
         """Do it."""
         text = self.document.read_text()
         for name, _, file in (argument.partition("=") for argument in self.block):
-            text = with_block(text, name, without_pictures(Path(file).read_text()))
-        if self.picture:
-            picture = read_image(self.picture[0])[None]
-            write_image(self.picture[1], interpolate(picture, scale_factor=0.75, mode="bicubic", antialias=True)[0])
+            text = with_block(text, name, without_images(Path(file).read_text()))
+        if self.image:
+            image = read_image(self.image[0])[None]
+            write_image(self.image[1], interpolate(image, scale_factor=0.75, mode="bicubic", antialias=True)[0])
         write_text(self.document, text)
 
 
@@ -43,8 +43,8 @@ def with_block(text: str, name: str, content: str) -> str:
     return f"{text[: text.index(begin)]}{begin}\n\n{content.strip()}\n\n{text[text.index(end) :]}"
 
 
-def without_pictures(text: str) -> str:
-    """Markdown without the lines that are only a picture."""
+def without_images(text: str) -> str:
+    """Markdown without the lines that are only an image."""
     return "".join(line for line in text.splitlines(keepends=True) if not line.startswith("!["))
 
 

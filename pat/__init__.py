@@ -1,4 +1,4 @@
-"""The physics-aware transformer: one picture from an array of unlike cameras."""
+"""The physics-aware transformer: one image from an array of unlike cameras."""
 
 from __future__ import annotations
 

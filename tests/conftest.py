@@ -14,7 +14,7 @@ SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real pictures beside the checkout; a test that needs it skips where it is absent."""
+    """The folder of real images beside the checkout; a test that needs it skips where it is absent."""
     if not SHARED.is_dir():
-        pytest.skip(f"real pictures not at {SHARED}")
+        pytest.skip(f"real images not at {SHARED}")
     return SHARED

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from docs.update_readme import Readme, with_block, without_pictures
+from docs.update_readme import Readme, with_block, without_images
 from pat.media.images import read_image, write_image
 
 TEXT = "before\n<!-- a:begin -->\nold\n<!-- a:end -->\nafter\n"
@@ -23,8 +23,8 @@ def test_marks_are_wanted_once_and_in_order(text):
         with_block(text, "a", "new")
 
 
-def test_lines_that_are_pictures_go():
-    assert without_pictures("a\n![p](p.png)\nb ![q](q.png)\n") == "a\nb ![q](q.png)\n"
+def test_lines_that_are_images_go():
+    assert without_images("a\n![p](p.png)\nb ![q](q.png)\n") == "a\nb ![q](q.png)\n"
 
 
 def test_the_document_is_brought_up_to_date(tmp_path):

@@ -17,7 +17,7 @@ from .straight import Epipolar
 def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homography") -> Pair:
     """The pair with its exact F and the H that best places the middles of its depth-bounded segments.
 
-    Least squares in pixels of beta, over the segments that beta's picture holds of every 16th alpha pixel:
+    Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel:
     what the paper calls the homography-based approximation. `HomographyDisplacement()` on the result takes the
     displacement that covers near to far. Differentiable. Raises ValueError for uncalibrated or batched pairs and
     where beta sees nothing between the bounds.
@@ -29,7 +29,7 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
     segments = Epipolar()(pair, x)
     seen = segments.valid
     if int(seen.sum()) < 4:
-        raise ValueError("beta sees next to nothing of alpha's picture between near and far: nothing to fit a map to")
+        raise ValueError("beta sees next to nothing of alpha's image between near and far: nothing to fit a map to")
     fit = fit_homography if kind == "homography" else fit_similarity
     H = fit(x[seen], (0.5 * (segments.start + segments.end))[seen])
     return dataclasses.replace(pair, link=Link(pair.fundamental, H))
@@ -39,6 +39,6 @@ def placement_error(pair: Pair) -> Float[Tensor, ""]:
     """Root mean square distance in pixels from H x to the middles of the pair's depth-bounded segments."""
     x = coarse_grid(pair.alpha.hw).to(pair.cameras[0].K)
     segments = Epipolar()(pair, x)
-    mapped = apply_homography(pair.homography, x)
-    off = (mapped.x - 0.5 * (segments.start + segments.end)).square().sum(-1)
-    return off[segments.valid & mapped.valid].mean().sqrt()
+    transformed = apply_homography(pair.homography, x)
+    off = (transformed.x - 0.5 * (segments.start + segments.end)).square().sum(-1)
+    return off[segments.valid & transformed.valid].mean().sqrt()

@@ -1,4 +1,4 @@
-"""Fields that lenses bend: explicit positions along the picture of each ray."""
+"""Fields that lenses bend: explicit positions along the image of each ray."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class Curved:
 
     Needs a calibrated pair; without lenses it is `Epipolar` sampled. The curve is followed at `nodes` depths
     between the bounds (metres; the pair's own unless given), even in inverse depth, and the part of it on
-    beta's picture is divided evenly. Positions are exact for their depths; the spacing, and where an edge of
-    the picture cuts the curve, are to the accuracy of straight pieces between nodes. What a fisheye alpha sees
+    beta's image is divided evenly. Positions are exact for their depths; the spacing, and where an edge of
+    the image cuts the curve, are to the accuracy of straight pieces between nodes. What a fisheye alpha sees
     at 90 degrees or more off axis has no depth along the axis and nowhere to look.
     """
 
@@ -66,12 +66,12 @@ class ThroughLenses:
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with lenses."""
         alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
-        link = None if pair.link is None else pair.link.mapped(alpha.A, beta.A)
+        link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
-        there, seen = alpha.straighten(x)
+        there, seen = alpha.undistort(x)
         found = self.field(straight, there)
         found = found.positions(self.samples) if isinstance(found, Segments) else found
-        xy, shown = beta.bend(found.xy)
+        xy, shown = beta.distort(found.xy)
         mask = found.mask & seen[..., None] & shown & pair.beta.contains(xy)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
@@ -90,16 +90,16 @@ class _Straight(NamedTuple):
         pinhole = pinhole_view(view)
         return cls(view, pinhole, pinhole.K @ torch.linalg.inv(view.K))
 
-    def straighten(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        straight, valid = self.view.to(x.dtype).straighten(x)
+    def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        straight, valid = self.view.to(x.dtype).undistort(x)
         return map_homogeneous(self.A[:2], straight), valid
 
-    def bend(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        return self.view.to(x.dtype).bend(map_homogeneous(torch.linalg.inv(self.A)[:2], x))
+    def distort(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2], x))
 
 
 EDGE = 0.25
-"""How far outside the picture a sample that should be on its edge may fall, pixels; it is moved onto the edge."""
+"""How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge."""
 
 
 class _Curve(NamedTuple):
@@ -142,7 +142,7 @@ class Pieces(NamedTuple):
 
 
 def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW) -> Pieces:
-    """The parts of a polyline that lie on the picture, between nodes that are both `seen` (*n, k).
+    """The parts of a polyline that lie on the image, between nodes that are both `seen` (*n, k).
 
     A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point is somewhere.
     """

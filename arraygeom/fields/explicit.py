@@ -21,7 +21,7 @@ class NearestVoxels:
     """The `count` integer pixels of beta nearest the epipolar line, within +-`window` of H x; from F.
 
     The paper's own construction. Distances are perpendicular to the line; pixels equally far, to 1e-3 px, are
-    taken by row, then column. Where fewer pixels of the picture lie in the window the rest are masked, and
+    taken by row, then column. Where fewer pixels of the image lie in the window the rest are masked, and
     where there is no line (the epipole, no baseline) all are.
     """
 
@@ -45,8 +45,8 @@ class NearestVoxels:
         """Beside the line first; the whole window where that cannot be known to hold the nearest `count`."""
         beside = 2 + self.count // (2 * self.window + 1)
         xy, mask, distance = self._choose(self._candidates(line, centre, beside), line, centre, pair)
-        reach = (beside + 0.5) * line[:, :2].abs().amax(-1)
-        unsure = (distance.amax(-1) > reach - TIE).nonzero()[:, 0]
+        disparity = (beside + 0.5) * line[:, :2].abs().amax(-1)
+        unsure = (distance.amax(-1) > disparity - TIE).nonzero()[:, 0]
         for some in unsure.split(64):
             xy[some], mask[some], _ = self._choose(self._window(centre[some]), line[some], centre[some], pair)
         return xy, mask
@@ -107,7 +107,7 @@ class Local:
 
 @dataclass(frozen=True)
 class Dense:
-    """Every `stride`-th pixel of beta; from nothing (small pictures, and the unphysical control)."""
+    """Every `stride`-th pixel of beta; from nothing (small images, and the unphysical control)."""
 
     stride: int = 1
 

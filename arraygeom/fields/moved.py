@@ -19,7 +19,7 @@ class Moved:
 
     `displacement` (2, H, W) says by how many pixels of alpha each of its pixels moves from alpha's exposure to
     beta's, in x and y; optical flow between alpha's own frames tells it. It is looked up bilinearly, and counts as at
-    the nearest pixel outside alpha's picture. What is not known of it, `Widened` gives room for.
+    the nearest pixel outside alpha's image. What is not known of it, `Widened` gives room for.
     """
 
     field: ReceptiveField

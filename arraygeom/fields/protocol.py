@@ -27,7 +27,7 @@ class ReceptiveField(Protocol):
 
 
 def look(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Look:
-    """The field over given pixels, or over alpha's whole picture (H, W); a batch of rigs gives (*b, H, W)."""
+    """The field over given pixels, or over alpha's whole image (H, W); a batch of rigs gives (*b, H, W)."""
     return field(pair, all_pixels(pair) if x is None else x)
 
 

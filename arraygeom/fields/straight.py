@@ -1,4 +1,4 @@
-"""Fields that are straight in beta's picture: one segment for each alpha pixel."""
+"""Fields that are straight in beta's image: one segment for each alpha pixel."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
 from ..pixels import HW
 from ..rig import Depths, Pair, depth_range
-from ..segments import Segments, clip_to_picture
+from ..segments import Segments, clip_to_image
 from .protocol import CHUNK, all_pixels, in_chunks
 
 
@@ -24,9 +24,9 @@ class Epipolar:
 
     `near` and `far` (metres) override the pair's own.
 
-    Where nothing of the segment is in beta's picture and in front of beta it is invalid. Without a baseline,
+    Where nothing of the segment is in beta's image and in front of beta it is invalid. Without a baseline,
     with near = far, and for identical cameras it is a point. An alpha pixel on the epipole sees one point of
-    beta, whatever the depth: a point too. Where the epipole is inside beta's picture, segments end short of
+    beta, whatever the depth: a point too. Where the epipole is inside beta's image, segments end short of
     it: what lies on the line between the cameras would be behind one of them.
     """
 
@@ -34,7 +34,7 @@ class Epipolar:
     far: float | None = None
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Segments from near to far, inside beta's picture and in front of it. Raises ValueError for lenses."""
+        """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
         require_pinholes(pair)
         return _between(pair, *self.bounds(pair), x)
 
@@ -55,7 +55,7 @@ class EpipolarLine:
     """
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Segments across beta's picture. Raises ValueError for lenses."""
+        """Segments across beta's image. Raises ValueError for lenses."""
         if pair.link is None and pair.calibrated:
             zero, infinite = (torch.tensor(d, dtype=torch.float64) for d in (NEAREST, torch.inf))
             return _between(pair, zero, infinite, x)
@@ -79,7 +79,7 @@ class HomographyDisplacement:
 
     The paper's homography-based field. For a calibrated pair H is that of the plane at the middle of the depth
     range (`approximated` fits a better one), and `displacement=None` takes the smallest that covers near to far
-    at every pixel of alpha's picture. With calibration, the start is towards near and the end towards far.
+    at every pixel of alpha's image. With calibration, the start is towards near and the end towards far.
 
     Where there is no line (at the epipole, and without a baseline) the segment is the point H x.
     """
@@ -87,18 +87,18 @@ class HomographyDisplacement:
     displacement: float | None = None
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
-        """Segments centred on the point of the line nearest to H x, then clipped to beta's picture.
+        """Segments centred on the point of the line nearest to H x, then clipped to beta's image.
 
         Raises ValueError for lenses.
         """
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
         given = self.displacement
-        reach = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
+        disparity = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
 
         def around(x: Tensor) -> Segments:
             centre, placed = apply_homography(H, x)
-            piece = line_piece(epipolar_lines(F, x), centre, reach, hw)
+            piece = line_piece(epipolar_lines(F, x), centre, disparity, hw)
             return Segments(piece.start, piece.end, piece.valid & placed)
 
         return in_chunks(around, x)
@@ -107,7 +107,7 @@ class HomographyDisplacement:
 def covering_displacement(pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Float[Tensor, ""]:
     """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta.
 
-    Of depth-bounded segments as beta's picture clips them; 0 if there are none. Without x: for all of alpha's
+    Of depth-bounded segments as beta's image clips them; 0 if there are none. Without x: for all of alpha's
     pixels. Raises ValueError for an uncalibrated pair.
     """
     largest = _squared_reach(pair, _widest(pair) if x is None else x).max()
@@ -128,8 +128,10 @@ def _widest(pair: Pair) -> Tensor:
     if "widest" not in pair.memo:
         grid = all_pixels(pair)
         with torch.no_grad():
-            reach = torch.cat([_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)], -2)
-        index = reach.flatten(-2).argmax(-1)
+            disparity = torch.cat(
+                [_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)], -2
+            )
+        index = disparity.flatten(-2).argmax(-1)
         pair.memo["widest"] = grid.reshape(-1, 2)[index][..., None, :].to(pair.cameras[0].K)
     return pair.memo["widest"]
 
@@ -178,9 +180,9 @@ def require_pinholes(pair: Pair) -> tuple[Camera, Camera]:
 
 def require_straight(pair: Pair) -> None:
     """Raises ValueError if a view has a lens."""
-    if pair.bent:
+    if pair.has_lens:
         raise ValueError(
-            "a straight field needs pinhole cameras: use Curved or ThroughLenses, or undistort the pictures first"
+            "a straight field needs pinhole cameras: use Curved or ThroughLenses, or undistort the images first"
         )
 
 
@@ -193,15 +195,15 @@ def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) ->
 
 
 def line_piece(
-    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], reach: Float[Tensor, ""], hw: HW
+    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], disparity: Float[Tensor, ""], hw: HW
 ) -> Segments:
-    """The piece of each line within `reach` of the foot of `point`, clipped to the picture.
+    """The piece of each line within `reach` of the foot of `point`, clipped to the image.
 
     It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
     """
     foot = foot_on_line(line, point)
-    along = reach * torch.stack([-line[..., 1], line[..., 0]], -1)
-    return clip_to_picture(foot + along, foot - along, hw)
+    along = disparity * torch.stack([-line[..., 1], line[..., 0]], -1)
+    return clip_to_image(foot + along, foot - along, hw)
 
 
 def _between(pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> Segments:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ..pixels import HW
 from ..rig import Pair
-from ..segments import Positions, Segments, clip_to_picture
+from ..segments import Positions, Segments, clip_to_image
 from .protocol import Look, ReceptiveField
 
 
@@ -43,7 +43,7 @@ class Widened:
         if isinstance(found, Segments):
             longer = self._longer(found)
             if self.across == 0:
-                clipped = clip_to_picture(longer.start, longer.end, pair.beta.hw)
+                clipped = clip_to_image(longer.start, longer.end, pair.beta.hw)
                 return Segments(clipped.start, clipped.end, clipped.valid & found.valid)
             found = longer.positions(self.samples)
         else:
@@ -65,8 +65,8 @@ class Widened:
         return Segments(s.start - more, s.end + more, s.valid)
 
     def _stretched(self, p: Positions) -> Positions:
-        reach = torch.linspace(-self.along, self.along, p.xy.shape[-2], dtype=p.xy.dtype, device=p.xy.device)
-        return Positions(p.xy + reach[:, None] * tangents(p), p.mask)
+        disparity = torch.linspace(-self.along, self.along, p.xy.shape[-2], dtype=p.xy.dtype, device=p.xy.device)
+        return Positions(p.xy + disparity[:, None] * tangents(p), p.mask)
 
     def _band(self, p: Positions, hw: HW) -> Positions:
         tangent = tangents(p)

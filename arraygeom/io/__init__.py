@@ -68,7 +68,7 @@ __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention",
 def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0, hw: HW | None = None) -> Rig:
     """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
 
-    `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the pictures' (height,
+    `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the images' (height,
     width), for formats that do not state it. What looks odd but can be read gives a RigFileWarning.
     Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown format.
     """

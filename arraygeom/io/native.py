@@ -10,7 +10,7 @@ Units and the pixel convention stand in the file. Example:
       mono:
         size: [640, 400]        # width, height
         focal: 800              # pixels; or [fx, fy]
-        centre: [319.5, 199.5]  # principal point; left out: the picture's middle
+        centre: [319.5, 199.5]  # principal point; left out: the image's middle
       colour:
         size: [640, 400]
         focal: [620, 622]
@@ -20,7 +20,7 @@ Units and the pixel convention stand in the file. Example:
         response: rgb                 # a name, or {centre: 450, width: 80} in nm
         frame_rate: 30                # a second; `time_offset` in seconds after the rig's clock
         coding: linear                # or srgb, the default
-        bayer: RGGB                   # raw pictures: the pattern from the top left
+        bayer: RGGB                   # raw images: the pattern from the top left
         bits: 12                      # counts run from 0 to 4095; by default as many as the file has
         black_level: 64               # counts without light
         exposure: 0.01                # seconds

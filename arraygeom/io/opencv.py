@@ -2,7 +2,7 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; X_2 = R X_1 + T, so the world is
 camera 1; lengths in the unit of the calibration board, taken as metres. OpenCV's stereo sample writes
-`intrinsics.yml` (M1 D1 M2 D2) and `extrinsics.yml` (R T ...): name either, or their folder. It states no picture
+`intrinsics.yml` (M1 D1 M2 D2) and `extrinsics.yml` (R T ...): name either, or their folder. It states no image
 size.
 """
 

@@ -1,7 +1,7 @@
 """JSON of K, d, R and t, as pycalib writes: lists over the cameras, or one camera's matrices.
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; world->camera; the scale is arbitrary and
-taken as metres. No picture size is stated. Cameras are named cam0, cam1, ...
+taken as metres. No image size is stated. Cameras are named cam0, cam1, ...
 """
 
 from __future__ import annotations

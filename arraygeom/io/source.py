@@ -33,7 +33,7 @@ class RigFileWarning(UserWarning):
 class Source:
     """One rig file being read. Every method that looks at it raises RigFileError with the entry's name.
 
-    `hw` is the pictures' size for files that do not state it.
+    `hw` is the images' size for files that do not state it.
     """
 
     def __init__(self, path: Path, *, hw: HW | None = None) -> None:
@@ -120,7 +120,7 @@ class Source:
         """(height, width), positive and whole."""
         w, h = self.number(width, entry), self.number(height, entry)
         if min(w, h) < 1 or w != int(w) or h != int(h):
-            raise self.fail(entry, f"is {w:g} x {h:g}, wanted a picture's width x height in whole pixels")
+            raise self.fail(entry, f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
         return int(h), int(w)
 
     def size_unstated(self, K: Tensor) -> HW:
@@ -129,7 +129,7 @@ class Source:
             return self.hw
         w, h = (max(1, round(2 * c + 1)) for c in K[:2, 2].tolist())
         self.warn(
-            f"states no picture size: took {w} x {h}, twice the principal point; say `hw=(height, width)` when reading"
+            f"states no image size: took {w} x {h}, twice the principal point; say `hw=(height, width)` when reading"
         )
         return h, w
 

@@ -127,7 +127,7 @@ Free = Mapping[str, Bool[np.ndarray, "_"]]
 
 
 class Expected(NamedTuple):
-    """What is thought of a camera's intrinsics before any picture: each number's mean, and the inverse covariance.
+    """What is thought of a camera's intrinsics before any image: each number's mean, and the inverse covariance.
 
     In the order of `parameter_names`; poses have no part in it.
     """

@@ -51,7 +51,7 @@ class Calibration:
 
     @property
     def rms(self) -> float:
-        """The reprojection error of all points of all pictures, pixels, gross errors included."""
+        """The reprojection error of all points of all images, pixels, gross errors included."""
         return self.fit.scene.rms()
 
     def deviations(self) -> dict[str, float]:
@@ -66,7 +66,7 @@ def calibrate(
     """The rig that explains what its cameras saw of a board. Its world is the first camera.
 
     `lens` is the model for all cameras, or for each by name. Raises ValueError, saying what to do, if a camera has too
-    few pictures or only parallel boards, if cameras are not connected, or if their frames contradict each other.
+    few images or only parallel boards, if cameras are not connected, or if their frames contradict each other.
     """
     models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
     alone = {name: fit_alone(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()}
@@ -83,12 +83,12 @@ def calibrate(
         alone={name: a.fit.scene.rms() for name, a in alone.items()},
         epipolar=epipolar_errors(rig, begin.views),
         held_out=_held_out(cameras, begin.world_from_board, begin.views, board, together),
-        notes=(*_pictures_left_out(views, alone, begin.left_out), *together.notes),
+        notes=(*_images_left_out(views, alone, begin.left_out), *together.notes),
     )
 
 
 class Alone(NamedTuple):
-    """One camera calibrated by itself; its world is its own frame, `views` the pictures kept."""
+    """One camera calibrated by itself; its world is its own frame, `views` the images kept."""
 
     fit: Fit
     views: Views
@@ -110,7 +110,7 @@ class Alone(NamedTuple):
 
 
 def fit_alone(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady", final: bool = True) -> Alone:
-    """One camera's intrinsics and lens from its own pictures. Raises ValueError as `calibrate` does.
+    """One camera's intrinsics and lens from its own images. Raises ValueError as `calibrate` does.
 
     Where this is not `final`, as other cameras will add what they know, a focal length that is told badly is let pass.
     """
@@ -155,12 +155,12 @@ def _together(scene: Scene, alone: Mapping[str, Alone]) -> _Together:
     for index, mask in enumerate(free.values()):
         mask[:6] = index > 0
     fit = adjust(replace(scene, expected=known), free, alike=True)
-    kept = "so each camera's intrinsics are held to what its own pictures tell"
+    kept = "so each camera's intrinsics are held to what its own images tell"
     return _Together(fit, free, [*(note for a in alone.values() for note in a.notes), f"{doubts}; {kept}"], alike=True)
 
 
 def _as_expected(name: str, alone: Alone) -> Expected:
-    """What a camera's own pictures tell of its intrinsics; nothing of the numbers that were kept fixed."""
+    """What a camera's own images tell of its intrinsics; nothing of the numbers that were kept fixed."""
     fit, entries = alone.fit, parameter_names(alone.camera)
     told = [entries.index(entry.removeprefix(f"{name}.")) for entry in fit.names]
     information = np.zeros((len(entries), len(entries)))
@@ -234,7 +234,7 @@ def _observations(views: Views, index: Mapping[FrameKey, int], board: Board) -> 
 
 
 def _fitted(scene: Scene, *, final: bool = True) -> tuple[Fit, dict[str, np.ndarray], list[str]]:
-    """All that the pictures tell: fitted, and what they turn out not to tell given up, until that is nothing."""
+    """All that the images tell: fitted, and what they turn out not to tell given up, until that is nothing."""
     sigma = noise(scene, 0)
     full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(scene.cameras.items())}
     scene, free, notes = gate(scene, full, sigma, final=False)
@@ -275,15 +275,15 @@ def _held_out(
     return epipolar_errors(Rig(together.again(scene).scene.cameras), kept)
 
 
-def _pictures_left_out(
+def _images_left_out(
     views: Mapping[str, Views], alone: Mapping[str, Alone], left_out: list[tuple[str, FrameKey]]
 ) -> list[str]:
     notes = []
     for name, v in views.items():
-        if bent := [str(key) for key in v.seen if key not in alone[name].views.seen]:
-            notes.append(f"{name}: left out {', '.join(bent)}: the board found there does not fit the camera")
+        if distorted := [str(key) for key in v.seen if key not in alone[name].views.seen]:
+            notes.append(f"{name}: left out {', '.join(distorted)}: the board found there does not fit the camera")
         if astray := [str(key) for other, key in left_out if other == name]:
-            notes.append(f"{name}: left out {', '.join(astray)}: they contradict the other cameras' pictures")
+            notes.append(f"{name}: left out {', '.join(astray)}: they contradict the other cameras' images")
     return notes
 
 
@@ -294,7 +294,7 @@ def _doubts(fit: Fit, alone: Mapping[str, Alone]) -> str:
         together, by_itself = float(np.sqrt((r**2).sum(-1).mean())), alone[name].fit.scene.rms()
         fits = f"{name} fits to {by_itself:.2f} px alone but to {together:.2f} px with the others"
         if together > HOPELESS * max(by_itself, 0.3):
-            raise ValueError(f"{fits}: were the pictures {SAME_MOMENT}?")
+            raise ValueError(f"{fits}: were the images {SAME_MOMENT}?")
         if together > 0.5 and together > DOUBTFUL * by_itself:
             doubts.append(fits)
-    return f"{', '.join(doubts)} (were the pictures {SAME_MOMENT}?)" if doubts else ""
+    return f"{', '.join(doubts)} (were the images {SAME_MOMENT}?)" if doubts else ""

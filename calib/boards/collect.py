@@ -1,4 +1,4 @@
-"""Looking for the board in all pictures, and saying where it was not found and why it may be."""
+"""Looking for the board in all images, and saying where it was not found and why it may be."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from .photos import FrameKey, Photo, Photos
 from .target import Board
 
 TO_EXPLAIN = 4
-"""So many pictures without a board are looked at again to find out why."""
+"""So many images without a board are looked at again to find out why."""
 NAMED = 6
-"""So many pictures are named in a sentence."""
+"""So many images are named in a sentence."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True)
 class Collected:
-    """What each camera saw; the names of its pictures; what was found wrong with some, in sentences."""
+    """What each camera saw; the names of its images; what was found wrong with some, in sentences."""
 
     views: dict[str, Views]
     labels: dict[str, dict[FrameKey, str]]
@@ -32,9 +32,9 @@ class Collected:
 
 
 def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -> Collected:
-    """The board's points in all pictures of all cameras.
+    """The board's points in all images of all cameras.
 
-    Raises ValueError, naming pictures and cause, if a camera's pictures differ in size, if the board is found in
+    Raises ValueError, naming images and cause, if a camera's images differ in size, if the board is found in
     none of them, or if they show a board of another size.
     """
     jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
@@ -56,7 +56,7 @@ def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -
 def collect_folder(
     folder: str | Path, board: Board, *, patterns: Mapping[str, str] | None = None, progress: Progress | None = None
 ) -> Collected:
-    """`collect` for the pictures that `find_photos` finds."""
+    """`collect` for the images that `find_photos` finds."""
     from .photos import find_photos
 
     return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
@@ -72,22 +72,20 @@ def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[Fr
     if len(counts) == 1:
         return
     shown = [f"{w}x{h} ({_named([moments[k].label for k in sizes if sizes[k] == (h, w)], 2)})" for h, w in counts]
-    raise ValueError(
-        f"{name}: its pictures differ in size: {'; '.join(shown)}; keep those of one camera at one setting"
-    )
+    raise ValueError(f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting")
 
 
 def _check_board(
     name: str, moments: Mapping[FrameKey, Photo], seen: Mapping[FrameKey, Detection], board: Board
 ) -> None:
-    """Raises ValueError if no picture shows the board, or if most of some show a larger one."""
+    """Raises ValueError if no image shows the board, or if most of some show a larger one."""
     if not seen:
         why = explain(_greys(list(moments.values())), board)
         labels = _named([p.label for p in moments.values()], NAMED)
-        raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} pictures ({labels}): {why}")
+        raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}")
     if other := other_size(_greys([moments[key] for key in seen]), board):
         raise ValueError(
-            f"{name}: the pictures show a chessboard with {other} inner corners and the board given is {board}: "
+            f"{name}: the images show a chessboard with {other} inner corners and the board given is {board}: "
             "count the corners between squares, not the squares"
         )
 
@@ -100,7 +98,7 @@ def _missing(
         return []
     labels = _named([p.label for p in missing], NAMED)
     return [
-        f"{name}: no board in {len(missing)} of {len(moments)} pictures ({labels}): {explain(_greys(missing), board)}"
+        f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {explain(_greys(missing), board)}"
     ]
 
 

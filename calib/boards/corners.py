@@ -1,4 +1,4 @@
-"""Where chessboard corners are, to a hundredth of a pixel: the corner as it should look, laid over the picture.
+"""Where chessboard corners are, to a hundredth of a pixel: the corner as it should look, laid over the image.
 
 Four squares meet in a corner: grey is a + b S(d) S(e) with d, e the distances in pixels from the two edges, S the step
 from -1 to 1 blurred by a Gaussian. Position, levels and blur of each corner are fitted by least squares to the pixels
@@ -56,13 +56,13 @@ class Shape(NamedTuple):
 
     along: Float[np.ndarray, "n 2 2"]
     normal: Float[np.ndarray, "n 2 2"]
-    bend: Float[np.ndarray, "n 2"]
+    distort: Float[np.ndarray, "n 2"]
 
 
 def refine_corners(
     grey: UInt8[np.ndarray, "h w"], x: Float[np.ndarray, "n 2"], p: Float[np.ndarray, "n 2"], *, clear: float = 0.5
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Corners at about `x` where the picture has them, and which of them look like corners at all.
+    """Corners at about `x` where the image has them, and which of them look like corners at all.
 
     `p` is their place on the board, in squares; nothing but the corner's own squares is nearer to its edges than
     `clear` squares.
@@ -78,7 +78,7 @@ def refine_corners(
 
 
 def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: Bool[np.ndarray, " n"]) -> Map:
-    """From the board to the picture: a homography and on top of it a polynomial, of degree 5 if the points allow.
+    """From the board to the image: a homography and on top of it a polynomial, of degree 5 if the points allow.
 
     Points that are far off the others' map have no say.
     """
@@ -89,10 +89,10 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
     flat = cv2.perspectiveTransform(p[good][:, None], H)[:, 0]
     basis = _powers((p[good] - middle) / size, degree)
     for _ in range(4):
-        bend = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * (x[good] - flat), rcond=None)[0]
-        off = np.linalg.norm(x[good] - flat - basis @ bend, axis=-1)
+        distort = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * (x[good] - flat), rcond=None)[0]
+        off = np.linalg.norm(x[good] - flat - basis @ distort, axis=-1)
         weight = 1 / (1 + (off / max(3 * float(np.median(off)), 1e-3)) ** 2)
-    return lambda q: cv2.perspectiveTransform(q[:, None], H)[:, 0] + _powers((q - middle) / size, degree) @ bend
+    return lambda q: cv2.perspectiveTransform(q[:, None], H)[:, 0] + _powers((q - middle) / size, degree) @ distort
 
 
 def _powers(q: Array, degree: int) -> Array:
@@ -117,15 +117,15 @@ def _fitted(grey: Array, start: Array, shape: Shape, clear: float) -> tuple[Arra
     h, w = grey.shape
     length = np.linalg.norm(shape.along, axis=-1).min(1)
     inside = np.minimum(np.minimum(start[:, 0], w - 1 - start[:, 0]), np.minimum(start[:, 1], h - 1 - start[:, 1]))
-    reach = np.minimum(np.minimum(0.45 * length, LONGEST), inside - 1)
+    disparity = np.minimum(np.minimum(0.45 * length, LONGEST), inside - 1)
     sine = np.abs(np.linalg.det(shape.normal))
     width = np.minimum(clear * length * sine - BLEED, WIDEST)
-    usable = (reach >= SHORTEST) & (width >= THINNEST) & (sine > 0.2)
+    usable = (disparity >= SHORTEST) & (width >= THINNEST) & (sine > 0.2)
     found, good = start.copy(), np.zeros(len(start), dtype=bool)
     if usable.any():
         part = Shape(*(v[usable] for v in shape))
-        at, misfit = _least_squares(grey, start[usable], part, reach[usable], width[usable])
-        near = np.linalg.norm(at - start[usable], axis=-1) < MOVED * reach[usable]
+        at, misfit = _least_squares(grey, start[usable], part, disparity[usable], width[usable])
+        near = np.linalg.norm(at - start[usable], axis=-1) < MOVED * disparity[usable]
         found[usable], good[usable] = at, near & (misfit < MISFIT)
     return found, good
 
@@ -144,13 +144,13 @@ class Look(NamedTuple):
         return Look(self.x + step[:, :2].clip(-1, 1), self.level + step[:, 2:3], self.contrast + step[:, 3:4], blur)
 
 
-def _least_squares(grey: Array, start: Array, shape: Shape, reach: Array, width: Array) -> tuple[Array, Array]:
+def _least_squares(grey: Array, start: Array, shape: Shape, disparity: Array, width: Array) -> tuple[Array, Array]:
     """Gauss-Newton on all corners at once: their places, and what is left (root mean square) in contrasts."""
-    pixels = _around(start, reach)
+    pixels = _around(start, disparity)
     values = grey[pixels[..., 1].clip(0, grey.shape[0] - 1), pixels[..., 0].clip(0, grey.shape[1] - 1)]
-    look = _first_look(values, pixels, Look(start, *np.ones((3, len(start), 1))), shape, reach, width)
+    look = _first_look(values, pixels, Look(start, *np.ones((3, len(start), 1))), shape, disparity, width)
     for _ in range(STEPS):
-        root, left, J = _linearised(values, pixels, look, shape, reach, width)
+        root, left, J = _linearised(values, pixels, look, shape, disparity, width)
         J *= root[..., None]
         A = J.swapaxes(1, 2) @ J
         A += 1e-6 * np.eye(5) * (np.trace(A, axis1=1, axis2=2)[:, None, None] / 5 + 1e-9)
@@ -162,16 +162,16 @@ def _least_squares(grey: Array, start: Array, shape: Shape, reach: Array, width:
     return look.x, misfit / np.abs(look.contrast[:, 0]).clip(1e-9)
 
 
-def _around(x: Array, reach: Array) -> Array:
+def _around(x: Array, disparity: Array) -> Array:
     """The pixels (n, m, 2) of a square about each corner."""
-    half = int(np.ceil(reach.max()))
+    half = int(np.ceil(disparity.max()))
     row = np.arange(-half, half + 1)
     return np.rint(x).astype(int)[:, None] + np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
 
 
-def _first_look(values: Array, pixels: Array, look: Look, shape: Shape, reach: Array, width: Array) -> Look:
+def _first_look(values: Array, pixels: Array, look: Look, shape: Shape, disparity: Array, width: Array) -> Look:
     """With the level and the contrast that fit at the places given."""
-    root, d, e = _distances(pixels - look.x[:, None], shape, reach, width)
+    root, d, e = _distances(pixels - look.x[:, None], shape, disparity, width)
     pattern, weight = erf(d) * erf(e), root**2
     level = np.average(values, weights=weight + 1e-9, axis=1)[:, None]
     contrast = (weight * pattern * (values - level)).sum(1) / (weight * pattern**2).sum(1).clip(1e-9)
@@ -179,10 +179,10 @@ def _first_look(values: Array, pixels: Array, look: Look, shape: Shape, reach: A
 
 
 def _linearised(
-    values: Array, pixels: Array, look: Look, shape: Shape, reach: Array, width: Array
+    values: Array, pixels: Array, look: Look, shape: Shape, disparity: Array, width: Array
 ) -> tuple[Array, Array, Array]:
     """Roots of the weights (n, m), what is left of the values (n, m), derivatives by a step (n, m, 5)."""
-    root, d, e = _distances(pixels - look.x[:, None], shape, reach, width)
+    root, d, e = _distances(pixels - look.x[:, None], shape, disparity, width)
     _, _, b, blur = look
     S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
     by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))
@@ -192,13 +192,13 @@ def _linearised(
     return root, values - look.level - b * S * T, J
 
 
-def _distances(offset: Array, shape: Shape, reach: Array, width: Array) -> tuple[Array, Array, Array]:
+def _distances(offset: Array, shape: Shape, disparity: Array, width: Array) -> tuple[Array, Array, Array]:
     """The root of how much each pixel counts, and its distances from the first and the second edge."""
     unit = shape.along / np.linalg.norm(shape.along, axis=-1, keepdims=True)
     straight = np.einsum("npk,njk->npj", offset, shape.normal)
     run = np.einsum("npk,njk->npj", offset, unit)
-    d, e = np.moveaxis(straight - shape.bend[:, None] * run**2, -1, 0)
+    d, e = np.moveaxis(straight - shape.distort[:, None] * run**2, -1, 0)
     far = np.linalg.norm(offset, axis=-1)
     beside = np.minimum(np.abs(d), np.abs(e))
-    weight = np.clip(reach[:, None] + 0.5 - far, 0, 1) * np.clip(width[:, None] + 0.5 - beside, 0, 1)
+    weight = np.clip(disparity[:, None] + 0.5 - far, 0, 1) * np.clip(width[:, None] + 0.5 - beside, 0, 1)
     return np.sqrt(weight), d, e

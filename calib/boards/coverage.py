@@ -1,4 +1,4 @@
-"""Which part of each picture, which depths and which tilts the boards covered, and what is missing."""
+"""Which part of each image, which depths and which tilts the boards covered, and what is missing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .photos import FrameKey
 from .target import Board
 
 CELLS = 6, 8
-"""The picture is divided into so many rows and columns."""
+"""The image is divided into so many rows and columns."""
 WIDE_ENOUGH = 0.6
 DEEP_ENOUGH = 1.5
 TILTED_ENOUGH = 20.0
@@ -25,7 +25,7 @@ PLACES = ("top left", "top", "top right"), ("left", "middle", "right"), ("bottom
 class Coverage(NamedTuple):
     """What one camera's boards covered.
 
-    cells: points in each cell of the picture. depths: (nearest, furthest) point, metres. tilts: (least, most)
+    cells: points in each cell of the image. depths: (nearest, furthest) point, metres. tilts: (least, most)
     angle between the board's normal and the optical axis, degrees. missing: sentences on what is lacking.
     """
 
@@ -69,9 +69,9 @@ def _missing(found: Coverage) -> list[str]:
         if not part.any()
     ]
     if empty:
-        missing.append(f"no points at the {', '.join(empty)} of the picture: the lens is a guess there")
+        missing.append(f"no points at the {', '.join(empty)} of the image: the lens is a guess there")
     elif found.share < WIDE_ENOUGH:
-        missing.append(f"points in only {found.share:.0%} of the picture: fill it, corners too")
+        missing.append(f"points in only {found.share:.0%} of the image: fill it, corners too")
     if found.depths[1] < DEEP_ENOUGH * found.depths[0]:
         near, far = found.depths
         missing.append(

@@ -1,6 +1,6 @@
-"""Finding a board's points in a picture, to a fraction of a pixel.
+"""Finding a board's points in an image, to a fraction of a pixel.
 
-OpenCV 4.10 and newer, and 5. Pictures that are dim, flat or inverted (near infrared, narrow bands) are stretched,
+OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands) are stretched,
 equalised and inverted in turn until the board is found.
 """
 
@@ -20,25 +20,25 @@ from .target import Board, Charuco, Chessboard, Circles, marker_dictionary
 Grey = UInt8[np.ndarray, "h w"]
 
 FEWEST = 8
-"""Fewer points of a board than this in a picture are not used: a pose needs 4, a check of it more."""
+"""Fewer points of a board than this in an image are not used: a pose needs 4, a check of it more."""
 ENOUGH = 0.6
-"""If less than this share of a board's corners look like corners, the picture is not fit for fitting them."""
+"""If less than this share of a board's corners look like corners, the image is not fit for fitting them."""
 CROOKED = 0.35
 """A board is refused if its points are this far (of their spacing) from a smoothly bent grid: a false detection."""
 SMALL = 640
-"""Pictures are reduced to this width when they are only asked which board they show."""
+"""Images are reduced to this width when they are only asked which board they show."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
 
 
 class Detection(NamedTuple):
-    """The points of a board seen in one picture: their numbers on the board and their pixels."""
+    """The points of a board seen in one image: their numbers on the board and their pixels."""
 
     ids: Int[np.ndarray, " n"]
     x: Float[np.ndarray, "n 2"]
 
 
 def detect(grey: Grey, board: Board) -> Detection | None:
-    """The board's points in a grey picture (uint8), or None if it is not found."""
+    """The board's points in a grey image (uint8), or None if it is not found."""
     for candidate in _versions(grey):
         found = _FINDERS[type(board)](candidate, board)
         if found is not None and _believable(found, board):
@@ -47,9 +47,9 @@ def detect(grey: Grey, board: Board) -> Detection | None:
     return None
 
 
-def to_grey(picture: np.ndarray) -> Grey:
-    """A picture (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
-    grey = picture if picture.ndim == 2 else cv2.cvtColor(picture[..., :3], cv2.COLOR_BGR2GRAY)
+def to_grey(image: np.ndarray) -> Grey:
+    """An image (H, W) or (H, W, 3) in grey, 8 bits; one that is dim or of 16 bits is stretched to all of them."""
+    grey = image if image.ndim == 2 else cv2.cvtColor(image[..., :3], cv2.COLOR_BGR2GRAY)
     low, high = np.percentile(grey[::4, ::4], (0.5, 99.5))
     if grey.dtype == np.uint8 and high - low > 100:
         return grey
@@ -57,17 +57,17 @@ def to_grey(picture: np.ndarray) -> Grey:
     return np.clip(np.rint(scaled), 0, 255).astype(np.uint8)
 
 
-def explain(pictures: Iterable[Grey], board: Board) -> str:
-    """Why a board may not have been found in pictures: the likeliest cause, in words."""
-    reasons = Counter(_reason(grey, board) for grey in pictures)
-    return reasons.most_common(1)[0][0] if reasons else "there are no pictures"
+def explain(images: Iterable[Grey], board: Board) -> str:
+    """Why a board may not have been found in images: the likeliest cause, in words."""
+    reasons = Counter(_reason(grey, board) for grey in images)
+    return reasons.most_common(1)[0][0] if reasons else "there are no images"
 
 
-def other_size(pictures: Iterable[Grey], board: Board) -> str | None:
-    """The size of the chessboard that pictures show if most of them show another one than `board`, in its words."""
+def other_size(images: Iterable[Grey], board: Board) -> str | None:
+    """The size of the chessboard that images show if most of them show another one than `board`, in its words."""
     if not isinstance(board, Chessboard):
         return None
-    sizes = Counter(size for grey in pictures if (size := _grid_size(grey)) is not None)
+    sizes = Counter(size for grey in images if (size := _grid_size(grey)) is not None)
     if not sizes:
         return None
     size, votes = sizes.most_common(1)[0]
@@ -131,7 +131,7 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
 def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
     """Corners where they are to a hundredth of a pixel; of boards that may be seen in part, without those that hide.
 
-    Where few look as corners should, as in pictures too small for it, all are taken where gradients say.
+    Where few look as corners should, as in images too small for it, all are taken where gradients say.
     """
     if isinstance(board, Circles):
         return found
@@ -144,10 +144,10 @@ def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
     return Detection(found.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
 
 
-def _by_gradients(grey: Grey, x: np.ndarray, reach: float) -> np.ndarray:
+def _by_gradients(grey: Grey, x: np.ndarray, disparity: float) -> np.ndarray:
     """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
     apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(reach * np.quantile(apart, 0.1), 2, 11))
+    half = int(np.clip(disparity * np.quantile(apart, 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
@@ -175,25 +175,25 @@ def _smooth(found: Detection, board: Board) -> bool:
     u, v = ((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0)).T
     terms = [u**i * v**j for i in range(4) for j in range(4 - i)] if len(p) >= 30 else [u**0, u, v]
     basis = np.stack(terms, 1)
-    bend = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
-    left = np.linalg.norm(found.x - flat - basis @ bend, axis=-1)
+    distort = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
+    left = np.linalg.norm(found.x - flat - basis @ distort, axis=-1)
     return bool(np.median(left) < CROOKED * np.median(apart) and np.isfinite(left).all())
 
 
 def _reason(grey: Grey, board: Board) -> str:
     low, high = np.percentile(grey, (2, 98))
     if high - low < 40:
-        return "the pictures have hardly any contrast: expose them longer, or light the board"
+        return "the images have hardly any contrast: expose them longer, or light the board"
     if isinstance(board, Charuco) and (reason := _charuco_reason(grey, board)):
         return reason
     if other := other_size([grey], board):
         return f"a chessboard with {other} inner corners is seen: is the board's size right?"
     if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
-        return "it is found once the picture is mirrored: save the pictures as the camera sees, not mirrored"
+        return "it is found once the image is mirrored: save the images as the camera sees, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
-        return "the pictures are blurred: focus, and hold the board still"
+        return "the images are blurred: focus, and hold the board still"
     whole = "" if isinstance(board, Charuco) else ", whole and with its white margin"
-    return f"no such board is seen{whole}: check the board's name, and that it is in the picture, large and lit"
+    return f"no such board is seen{whole}: check the board's name, and that it is in the image, large and lit"
 
 
 def _charuco_reason(grey: Grey, board: Charuco) -> str | None:
@@ -210,7 +210,7 @@ def _charuco_reason(grey: Grey, board: Charuco) -> str | None:
         if len(seen := _markers(grey, name)) >= 6:
             return f"{len(seen)} markers of the dictionary {name} are seen, not of {board.dictionary}: name that one"
     if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)) >= 4:
-        return "its markers are found once the picture is mirrored: save the pictures as the camera sees, not mirrored"
+        return "its markers are found once the image is mirrored: save the images as the camera sees, not mirrored"
     return None
 
 
@@ -222,7 +222,7 @@ def _markers(grey: Grey, dictionary: str) -> list[int]:
 
 
 def _grid_size(grey: Grey) -> tuple[int, int] | None:
-    """The (columns, rows) of inner corners of the largest chessboard in a picture."""
+    """The (columns, rows) of inner corners of the largest chessboard in an image."""
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     done, _, meta = cv2.findChessboardCornersSBWithMeta(

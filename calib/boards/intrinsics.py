@@ -1,4 +1,4 @@
-"""One camera from its pictures of a board, to start from: Zhang's method, by OpenCV."""
+"""One camera from its images of a board, to start from: Zhang's method, by OpenCV."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from .photos import FrameKey
 from .target import Board
 
 Lens = Literal["brown-conrady", "kannala-brandt", "none"]
-FEWEST_PICTURES = 3
+FEWEST_IMAGES = 3
 FEWEST_TILT = 8.0
 """Boards whose normals are all within this many degrees of each other count as parallel."""
 
 
 @dataclass(frozen=True)
 class Views:
-    """What one camera saw of the board: its pictures' size and, by moment, the points found."""
+    """What one camera saw of the board: its images' size and, by moment, the points found."""
 
     hw: HW
     seen: Mapping[FrameKey, Detection]
@@ -35,7 +35,7 @@ Solved = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 
 
 class Start(NamedTuple):
-    """A camera at the origin, the board's pose in it by moment, and each picture's reprojection error in pixels."""
+    """A camera at the origin, the board's pose in it by moment, and each image's reprojection error in pixels."""
 
     camera: Camera
     cam_from_board: dict[FrameKey, Pose]
@@ -43,13 +43,13 @@ class Start(NamedTuple):
 
 
 def calibrate_camera(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady") -> Start:
-    """A camera's intrinsics, lens and board poses from its own pictures.
+    """A camera's intrinsics, lens and board poses from its own images.
 
-    Raises ValueError if there are fewer than three pictures with a board, or if the board was never tilted.
+    Raises ValueError if there are fewer than three images with a board, or if the board was never tilted.
     """
-    if len(views.seen) < FEWEST_PICTURES:
+    if len(views.seen) < FEWEST_IMAGES:
         raise ValueError(
-            f"{name}: the board is found in {len(views.seen)} of its pictures and {FEWEST_PICTURES} is the least: "
+            f"{name}: the board is found in {len(views.seen)} of its images and {FEWEST_IMAGES} is the least: "
             "take ten or more, at several distances and tilts"
         )
     fisheye = lens == "kannala-brandt"
@@ -74,12 +74,12 @@ def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
     if widest < FEWEST_TILT:
         raise ValueError(
             f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be "
-            "told apart: tilt the board by 20 to 40 degrees, to different sides, in most of the pictures"
+            "told apart: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
         )
 
 
 def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
-    """`cam_from_board` of one picture, for a camera whose intrinsics are known."""
+    """`cam_from_board` of one image, for a camera whose intrinsics are known."""
     directions, valid = camera.rays(torch.from_numpy(found.x))
     rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))

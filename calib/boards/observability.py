@@ -1,4 +1,4 @@
-"""What the pictures can tell of a camera, and what had better be left alone."""
+"""What the images can tell of a camera, and what had better be left alone."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def usual(camera: Camera) -> Expected:
 def gate(
     scene: Scene, free: Free, sigma: dict[str, float], *, final: bool = True
 ) -> tuple[Scene, dict[str, np.ndarray], list[str]]:
-    """Keep fixed, at what a plain camera has, every number of a lens that the pictures do not tell, worst first.
+    """Keep fixed, at what a plain camera has, every number of a lens that the images do not tell, worst first.
 
     Returns the scene with those numbers set, what is still free, and sentences that say so. Once the fit is `final`,
     raises ValueError where a focal length is not told.
@@ -72,14 +72,14 @@ def gate(
             if not final:
                 break
             raise ValueError(
-                f"{name}: the pictures do not tell the focal length: tilt the board by 20 to 40 degrees, to different "
+                f"{name}: the images do not tell the focal length: tilt the board by 20 to 40 degrees, to different "
                 "sides, and bring it close in some of them"
             )
         mine[name][index] = False
         places.pop(worst)
         information = np.delete(np.delete(information, worst, 0), worst, 1)
         scene = _plain(scene, name, entry)
-        notes.append(f"{name}: {_described(scene.cameras[name], entry)}: the pictures do not tell it")
+        notes.append(f"{name}: {_described(scene.cameras[name], entry)}: the images do not tell it")
     return scene, mine, notes
 
 
@@ -117,6 +117,6 @@ def _plain(scene: Scene, name: str, entry: str) -> Scene:
 def _described(camera: Camera, entry: str) -> str:
     kind, index = entry.split(".")
     if kind == "centre":
-        return f"the principal point's {'xy'[int(index)]} is kept at the picture's middle"
+        return f"the principal point's {'xy'[int(index)]} is kept at the image's middle"
     assert camera.distortion is not None
     return f"the lens's {LENS_TERMS[camera.distortion.model][int(index)]} is kept at 0"

@@ -1,6 +1,6 @@
-"""Which camera took which picture when: folders, file names, videos.
+"""Which camera took which image when: folders, file names, videos.
 
-A folder for each camera, or files in one folder whose names begin with the camera's, or patterns. Pictures of
+A folder for each camera, or files in one folder whose names begin with the camera's, or patterns. Images of
 one moment have the same number (or the same name, apart from what all names of the camera share).
 """
 
@@ -17,7 +17,7 @@ import numpy as np
 
 from .detect import Grey, to_grey
 
-PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
 """Of a video, at most this many frames are looked at: every first, second, fourth, eighth ..., so that videos of
@@ -28,13 +28,13 @@ FrameKey = int | str
 
 @dataclass(frozen=True)
 class Photo:
-    """One picture of one camera; decoding it is put off until it is needed. `label` is what to call it in words."""
+    """One image of one camera; decoding it is put off until it is needed. `label` is what to call it in words."""
 
     label: str
     decode: Callable[[], np.ndarray]
 
     def read(self) -> Grey:
-        """The picture in grey. Raises ValueError if it cannot be read."""
+        """The image in grey. Raises ValueError if it cannot be read."""
         return to_grey(self.decode())
 
 
@@ -43,23 +43,23 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 
 
 def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> Photos:
-    """The pictures of every camera below a folder.
+    """The images of every camera below a folder.
 
     `patterns` (camera name: pattern of file names, relative to the folder) says it outright. Otherwise every
-    subfolder with pictures or a video is a camera, or, where there is none, every beginning of file names before
+    subfolder with images or a video is a camera, or, where there is none, every beginning of file names before
     a final number is (left01.jpg, right01.jpg), or every video.
     Raises FileNotFoundError and ValueError, saying what was looked for.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder of pictures: give one with a subfolder for each camera")
+        raise FileNotFoundError(f"{folder}: no such folder of images: give one with a subfolder for each camera")
     cameras = _by_pattern(folder, patterns) if patterns else _by_folder(folder) or _by_name(folder)
     if not cameras:
-        raise ValueError(f"{folder}: no pictures or videos here: give a folder with a subfolder for each camera")
+        raise ValueError(f"{folder}: no images or videos here: give a folder with a subfolder for each camera")
     return {name: _moments(name, files) for name, files in cameras.items()}
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:
-    """What tells the pictures of one camera apart: the part of the names that differs, as a number if it is one.
+    """What tells the images of one camera apart: the part of the names that differs, as a number if it is one.
 
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
     [8, 9, 10]
@@ -84,7 +84,7 @@ def _by_pattern(folder: Path, patterns: Mapping[str, str]) -> dict[str, list[Pat
     for name, pattern in patterns.items():
         cameras[name] = sorted(p for p in folder.glob(pattern) if _usable(p))
         if not cameras[name]:
-            raise ValueError(f"{name}: no picture or video in {folder} is called '{pattern}'")
+            raise ValueError(f"{name}: no image or video in {folder} is called '{pattern}'")
     return cameras
 
 
@@ -102,30 +102,30 @@ def _by_name(folder: Path) -> dict[str, list[Path]]:
 
 
 def _usable(path: Path) -> bool:
-    return path.is_file() and path.suffix.lower() in PICTURES | VIDEOS and not path.name.startswith(".")
+    return path.is_file() and path.suffix.lower() in IMAGE_SUFFIXES | VIDEOS and not path.name.startswith(".")
 
 
 def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     videos = [f for f in files if f.suffix.lower() in VIDEOS]
     if len(videos) > 1 or (videos and len(videos) < len(files)):
         raise ValueError(
-            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} pictures: keep one video, or pictures"
+            f"{name}: has {len(videos)} videos and {len(files) - len(videos)} images: keep one video, or images"
         )
     if videos:
         return dict(_video_frames(videos[0]))
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
-        raise ValueError(f"{name}: two pictures have the same number, such as {files[0].name}: give each its own")
+        raise ValueError(f"{name}: two images have the same number, such as {files[0].name}: give each its own")
     return {key: Photo(file.name, _reader(file)) for key, file in zip(keys, files)}
 
 
 def _reader(path: Path) -> Callable[[], np.ndarray]:
     def decode() -> np.ndarray:
         flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
-        if picture is None:
-            raise ValueError(f"{path}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
-        return picture
+        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+        if image is None:
+            raise ValueError(f"{path}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
+        return image
 
     return decode
 
@@ -135,7 +135,7 @@ def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
     count = int(video.get(cv2.CAP_PROP_FRAME_COUNT))
     video.release()
     if count < 1:
-        raise ValueError(f"{path}: not a video that can be read: save pictures from it, or convert it to .mp4")
+        raise ValueError(f"{path}: not a video that can be read: save images from it, or convert it to .mp4")
     step = 1 << max(0, math.ceil(math.log2(count / MOST_FRAMES)))
     for index in range(0, count, step):
         yield index, Photo(f"{path.name} frame {index}", _frame_reader(path, index))
@@ -145,10 +145,10 @@ def _frame_reader(path: Path, index: int) -> Callable[[], np.ndarray]:
     def decode() -> np.ndarray:
         video = cv2.VideoCapture(str(path))
         video.set(cv2.CAP_PROP_POS_FRAMES, index)
-        done, picture = video.read()
+        done, image = video.read()
         video.release()
         if not done:
             raise ValueError(f"{path}: frame {index} cannot be read: is the video whole?")
-        return picture
+        return image
 
     return decode

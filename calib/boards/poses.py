@@ -18,7 +18,7 @@ from .photos import FrameKey
 from .target import Board, Charuco
 
 TOLERANCE = 0.03
-"""A frame agrees with a pose if it predicts the board to this share of the picture's width: one view of a small board
+"""A frame agrees with a pose if it predicts the board to this share of the image's width: one view of a small board
 gives its tilt, hence the other camera's place, no better."""
 FEWEST_TO_JUDGE = 3
 """Two cameras that share fewer frames than this are taken at their word."""
@@ -57,7 +57,7 @@ class Seen:
 class RigStart(NamedTuple):
     """`cam_from_world` of each camera (the first is the world), `world_from_board` of each moment, views as numbered.
 
-    left_out: pictures that disagree with the others, (camera, moment).
+    left_out: images that disagree with the others, (camera, moment).
     """
 
     cam_from_world: dict[str, Pose]
@@ -70,7 +70,7 @@ def initial_rig(cameras: Sequence[Seen], board: Board) -> RigStart:
     """All cameras' poses and all boards' from pairs, along the tree whose edges hold most corners.
 
     Raises ValueError if cameras are not connected by frames that both see, or if the frames of a pair contradict
-    each other: pictures that are mirrored, or not of the same moments.
+    each other: images that are mirrored, or not of the same moments.
     """
     pairs = {(a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))}
     poses = _along_tree(cameras, pairs, board)
@@ -138,7 +138,7 @@ def symmetry_poses(board: Board) -> list[Pose]:
 
 
 def _prediction_errors(a: Seen, b: Seen, a_from_b: Pose, keys: Iterable[FrameKey], board: Board) -> np.ndarray:
-    """By frame: the median distance in a's picture to where b's board pose says, at the best numbering."""
+    """By frame: the median distance in a's image to where b's board pose says, at the best numbering."""
     detections, poses = zip(*((a.views.seen[key], b.poses[key]) for key in keys))
     counts = [len(d.ids) for d in detections]
     points = torch.from_numpy(board.points)
@@ -195,7 +195,7 @@ def _agreement(anchor: Seen, views: Sequence[Seen], key: FrameKey, poses: Mappin
 
 
 def _numbered(camera: Seen, key: FrameKey, cam_from_board: Pose, board: Board) -> tuple[float, Detection]:
-    """The numbering of a picture's points that suits a board pose best, and its median error in pixels."""
+    """The numbering of an image's points that suits a board pose best, and its median error in pixels."""
     found = camera.views.seen[key]
     choices = [Detection(image[found.ids], found.x) for image in board.symmetries]
     errors = []
@@ -215,8 +215,8 @@ def _why_unconnected(
     if not crossing:
         see = "see" if len(rest) > 1 else "sees"
         return (
-            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take pictures with the "
-            "board where both see it, and check that pictures of one moment have the same number"
+            f"{_listed(rest)} never {see} the board in the same frame as {_listed(joined)}: take images with the "
+            "board where both see it, and check that images of one moment have the same number"
         )
     (a, b), pair = max(crossing.items(), key=lambda edge: len(edge[1].shared))
     by_name = {c.name: c for c in cameras}
@@ -230,17 +230,17 @@ def _contradiction(a: Seen, b: Seen, board: Board) -> str:
     """What would make two cameras' frames agree: one mirrored, or one a few frames late."""
     for mirrored, other in () if isinstance(board, Charuco) else ((b, a), (a, b)):
         if (found := pair_pose(other, _mirrored(mirrored, board), board)) and found.trusted:
-            return f"they agree once {mirrored.name} is mirrored: save its pictures as the camera sees, not mirrored"
+            return f"they agree once {mirrored.name} is mirrored: save its images as the camera sees, not mirrored"
     for shift in (1, -1, 2, -2, 3, -3):
         found = pair_pose(a, _shifted(a, b, shift), board)
         if found and found.trusted and len(found.shared) >= FEWEST_TO_JUDGE:
             frames, late = ("frame", "frames")[abs(shift) > 1], "late" if shift > 0 else "early"
-            return f"they agree once {b.name} is taken to be {abs(shift)} {frames} {late}: renumber its pictures"
-    return "were the pictures taken at the same moments, numbered alike, and the cameras not moved in between?"
+            return f"they agree once {b.name} is taken to be {abs(shift)} {frames} {late}: renumber its images"
+    return "were the images taken at the same moments, numbered alike, and the cameras not moved in between?"
 
 
 def _mirrored(seen: Seen, board: Board) -> Seen:
-    """The camera as if its pictures were mirrored."""
+    """The camera as if its images were mirrored."""
     width, columns = seen.views.hw[1], board.columns
     K = seen.camera.K.clone()
     K[0, 2] = width - 1 - K[0, 2]
@@ -254,7 +254,7 @@ def _mirrored(seen: Seen, board: Board) -> Seen:
 
 
 def _shifted(a: Seen, b: Seen, shift: int) -> Seen:
-    """b with each picture numbered as the one `shift` before it among all numbers of both."""
+    """b with each image numbered as the one `shift` before it among all numbers of both."""
     keys = sorted({*a.views.seen, *b.views.seen}, key=lambda k: (isinstance(k, str), k))
     renamed = {key: keys[i - shift] for i, key in enumerate(keys) if 0 <= i - shift < len(keys)}
     seen = {renamed[key]: d for key, d in b.views.seen.items() if key in renamed}

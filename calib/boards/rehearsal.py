@@ -1,6 +1,6 @@
 """A calibration rehearsed: what the cameras of a rig would photograph of a board, before one is printed.
 
-`rehearse` writes a folder such as `pat calibrate` reads. So one sees which board, how many pictures and which depths a
+`rehearse` writes a folder such as `pat calibrate` reads. So one sees which board, how many images and which depths a
 planned array needs, and how well it would be known then.
 """
 
@@ -43,10 +43,10 @@ def rehearse(rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: fl
         rays = fine_rays(camera)
         for i in range(count):
             pose = camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
-            picture = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
+            image = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
             with write_atomically(folder / name / f"{i:03d}.png") as temporary:
                 temporary.write_bytes(
-                    cv2.imencode(".png", np.clip(picture.round(), 0, 255).astype(np.uint8))[1].tobytes()
+                    cv2.imencode(".png", np.clip(image.round(), 0, 255).astype(np.uint8))[1].tobytes()
                 )
     return boards
 
@@ -80,7 +80,7 @@ Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
 def photograph(
     camera: Camera, cam_from_board: Pose, board: Board, *, dpi: float | None = None, rays: Rays | None = None
 ) -> UInt8[np.ndarray, "h w"]:
-    """The picture that a camera takes of a printed board, through its lens: the mean of four points a pixel.
+    """The image that a camera takes of a printed board, through its lens: the mean of four points a pixel.
 
     The print is drawn at `dpi`; by default so that its pixels are about as large as the distance of those points, for
     then none is skipped. `rays` are `fine_rays(camera)`, if they are there already.
@@ -95,8 +95,8 @@ def photograph(
     on_print = (on_board[:, :2].numpy() * per_metre + origin).astype(np.float32).reshape(*hw, 2)
     on_print[~(valid & (distance > 0)).reshape(hw).numpy()] = -1
     u, v = cv2.split(on_print)
-    picture = cv2.remap(print_, u, v, cv2.INTER_LINEAR, borderValue=(WALL,))
-    return np.asarray(cv2.resize(picture, camera.hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+    image = cv2.remap(print_, u, v, cv2.INTER_LINEAR, borderValue=(WALL,))
+    return np.asarray(cv2.resize(image, camera.hw[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def fine_rays(camera: Camera) -> Rays:

@@ -14,7 +14,7 @@ from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from arraygeom import Camera, Pose, Rig
-from arraygeom.viz import COLOURS, draw_rig, show_picture
+from arraygeom.viz import COLOURS, draw_rig, show_image
 
 from .bundle import BoardPoses
 from .calibrate import Calibration
@@ -31,7 +31,7 @@ h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% } .note { color:
 
 
 def report_html(calibration: Calibration, *, title: str = "Calibration", notes: Sequence[str] = ()) -> str:
-    """The report: accuracy by camera, pair and picture, coverage, residual fields, uncertainties, the rig."""
+    """The report: accuracy by camera, pair and image, coverage, residual fields, uncertainties, the rig."""
     covers = coverages(calibration)
     advice = [*notes, *calibration.notes, *(f"{n}: {m}" for n, c in covers.items() for m in c.missing)]
     parts = [
@@ -43,8 +43,8 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
         "<h2>Pairs</h2>" + pair_table(calibration) if len(calibration.views) > 1 else "",
         "<h2>The rig and the boards</h2>",
         image(draw_scene(calibration)),
-        "<h2>Residuals of each picture</h2><p>Root mean square, pixels.</p>",
-        image(draw_by_picture(calibration)),
+        "<h2>Residuals of each image</h2><p>Root mean square, pixels.</p>",
+        image(draw_by_image(calibration)),
     ]
     for name in calibration.views:
         parts += [
@@ -108,7 +108,7 @@ def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
     """One row a camera: how much was seen, how well it fits, and its numbers with their deviations."""
     residuals = calibration.fit.scene.residuals()
-    head = "camera|pictures, points|error px, together (alone)|noise px|focal length px|principal point px|lens|covered"
+    head = "camera|images, points|error px, together (alone)|noise px|focal length px|principal point px|lens|covered"
     rows = []
     for name, camera in calibration.fit.scene.cameras.items():
         views, r, covered = calibration.views[name], residuals[name], covers[name]
@@ -122,7 +122,7 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
                 _with_deviations(calibration, name, camera, "focal"),
                 _with_deviations(calibration, name, camera, "centre"),
                 _with_deviations(calibration, name, camera, "distortion"),
-                f"{covered.share:.0%} of the picture, {covered.depths[0]:.3g} to {covered.depths[1]:.3g} m, "
+                f"{covered.share:.0%} of the image, {covered.depths[0]:.3g} to {covered.depths[1]:.3g} m, "
                 f"tilts {covered.tilts[0]:.0f} to {covered.tilts[1]:.0f} deg",
             )
         )
@@ -227,8 +227,8 @@ def draw_scene(calibration: Calibration) -> Figure:
     return figure
 
 
-def draw_by_picture(calibration: Calibration) -> Figure:
-    """The root mean square residual of every picture of every camera, by frame."""
+def draw_by_image(calibration: Calibration) -> Figure:
+    """The root mean square residual of every image of every camera, by frame."""
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
@@ -248,16 +248,16 @@ def draw_by_picture(calibration: Calibration) -> Figure:
 
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """One camera: where points were seen; the mean residual of each part of the picture, magnified; their scatter."""
+    """One camera: where points were seen; the mean residual of each part of the image, magnified; their scatter."""
     seen, r = calibration.fit.scene.seen[name], calibration.fit.scene.residuals()[name]
     hw = calibration.views[name].hw
     figure = Figure(figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed")
     left, middle, right = figure.subplots(1, 3)
-    show_picture(left, hw)
+    show_image(left, hw)
     left.imshow(np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal")
     left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
     left.set_title(f"points seen (red: none), {covered.share:.0%} covered", fontsize=9)
-    show_picture(middle, hw)
+    show_image(middle, hw)
     _draw_field(middle, seen.x, r, hw)
     limit = max(4 * calibration.fit.sigma[name], 1e-3)
     right.plot(*np.clip(r, -limit, limit).T, ".", ms=1.5, color=COLOURS[0])
@@ -285,7 +285,7 @@ def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) ->
 
 
 def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figure:
-    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's picture."""
+    """By beta (rows) and depth (columns): the deviation of the predicted pixel, over the first camera's image."""
     covariance = rig_covariance(calibration)
     assert covariance is not None
     alpha, *betas = calibration.views

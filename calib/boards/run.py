@@ -35,9 +35,9 @@ def calibrate_photos(
     depth: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> Said:
-    """From a folder of pictures to a rig file, its report and its covariance; the rig is written last.
+    """From a folder of images to a rig file, its report and its covariance; the rig is written last.
 
-    Raises ValueError and OSError for what is wrong with the pictures, and then writes nothing.
+    Raises ValueError and OSError for what is wrong with the images, and then writes nothing.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")

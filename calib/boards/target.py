@@ -48,7 +48,7 @@ class Board(ABC):
         """The renumberings of the points under turns of the board, the identity first.
 
         A detector may have numbered the points in any of these ways: colours do not tell, as they are inverted in
-        some pictures (near infrared).
+        some images (near infrared).
         """
         points = self.points[:, :2] - (self.points[:, :2].max(0) + self.points[:, :2].min(0)) / 2
         found = []

@@ -1,4 +1,4 @@
-"""What is wrong with a rig, from one picture of each camera: the usual mistakes, told apart by matched points."""
+"""What is wrong with a rig, from one image of each camera: the usual mistakes, told apart by matched points."""
 
 from __future__ import annotations
 
@@ -51,8 +51,8 @@ class Figures(NamedTuple):
     misfit: the part of it (root mean square, pixels) that is the rig's and not the matches' own.
     front: share of the points that lie in front of both cameras, of those whose depth can be told.
     inside: share of those in front that lie in the rig's depth range; NaN without one.
-    handed: share of the triangles of neighbouring points that are turned over from one picture to the other, or not,
-    as they should be: mirrored pictures turn them over.
+    handed: share of the triangles of neighbouring points that are turned over from one image to the other, or not,
+    as they should be: mirrored images turn them over.
     """
 
     off: float
@@ -74,7 +74,7 @@ class Figures(NamedTuple):
         if not math.isnan(self.inside):
             parts.append(f"{self.inside:.0%} within the depth range")
         if self.handed < 0.5:
-            parts.append("one picture mirrored against the other")
+            parts.append("one image mirrored against the other")
         return ", ".join(parts)
 
 
@@ -82,9 +82,9 @@ class Figures(NamedTuple):
 class Diagnosis:
     """What the doctor found.
 
-    named: the mistake, or `NOTHING`. equal: other kinds of mistake that explain the pictures as well.
+    named: the mistake, or `NOTHING`. equal: other kinds of mistake that explain the images as well.
     before, after: figures of the rig as given and of the repaired one. tried: all explanations, best first.
-    matches: how many points were used. healthy: the rig as given fits the pictures.
+    matches: how many points were used. healthy: the rig as given fits the images.
     """
 
     named: Remedy
@@ -105,7 +105,7 @@ class Diagnosis:
         if self.healthy:
             return "nothing wrong: the points lie on their lines as well as they can be located"
         return (
-            f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these pictures: "
+            f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
             "it has drifted or was never better; `pat rig refine` may repair it"
         )
 
@@ -114,7 +114,7 @@ class Diagnosis:
         lines = [self.verdict, f"as given: {self.before}"]
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after}")
-        return "\n".join([*lines, f"from {self.matches} points seen in two pictures"])
+        return "\n".join([*lines, f"from {self.matches} points seen in two images"])
 
     def as_json(self) -> str:
         """The same for programs, with the ten best explanations."""
@@ -138,19 +138,19 @@ def _plain(figures: Figures) -> dict[str, float | None]:
 
 
 def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosis:
-    """Which usual mistake, if any, was made with a rig, by one picture (C, H, W) of two or more of its cameras.
+    """Which usual mistake, if any, was made with a rig, by one image (C, H, W) of two or more of its cameras.
 
-    Raises ValueError, one line, for a camera that the rig lacks, fewer than two pictures, equal ones, and pictures in
+    Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and images in
     which too few points match; and for a rig that says nothing of how its cameras are related.
     """
     for name in images:
-        rig.known(name)
+        rig.require(name)
     sizes = {name: (int(image.shape[1]), int(image.shape[2])) for name, image in images.items()}
     return diagnose_matches(rig, sizes, match_cameras(images))
 
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
-    """The same of points matched already, of pictures of these sizes."""
+    """The same of points matched already, of images of these sizes."""
     pairs = {names: _some(matches) for names, matches in related(rig, pairs).items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
     figures = _examine(rig, tried, pairs)
@@ -209,7 +209,7 @@ def _area(triangles: Tensor) -> Tensor:
 
 
 def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
-    """Whether one of two cameras is that of a mirrored picture."""
+    """Whether one of two cameras is that of a mirrored image."""
     views = [rig[name] for name in names]
     return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
 

@@ -1,4 +1,4 @@
-"""A rig from pictures alone: fundamental matrices and rough maps between cameras that nobody has calibrated."""
+"""A rig from images alone: fundamental matrices and rough maps between cameras that nobody has calibrated."""
 
 from __future__ import annotations
 
@@ -45,18 +45,18 @@ class Started(NamedTuple):
 
 
 def start(images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None) -> Started:
-    """An uncalibrated rig of the cameras that took these pictures (C, H, W), good enough to fuse with.
+    """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
 
     F of every two cameras that see the same, by MAGSAC++ (Barath et al. 2020), and a rough map. With rough focal
     lengths, in pixels, of both cameras an essential matrix is fitted too, of five numbers instead of seven: it is
     taken where it fits points better that were held out. All F are then fitted together, with lenses, and taken on
-    the same condition. Raises ValueError, one line: fewer than two pictures, equal ones, too few points, a focal length
+    the same condition. Raises ValueError, one line: fewer than two images, equal ones, too few points, a focal length
     of no camera.
     """
     focal = dict(focal or {})
     for name, length in focal.items():
         if name not in images or length <= 0:
-            raise ValueError(f"--focal: '{name}={length:g}' is no camera with a picture, or not positive")
+            raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
     found = Started(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {})
     links, matched = {}, match_cameras(images)

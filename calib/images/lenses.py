@@ -1,6 +1,6 @@
 """Lenses of cameras that nobody has calibrated: what F alone cannot fit where they bend lines.
 
-Such a lens has OpenCV's first four terms about the picture's middle, r counting in halves of the picture's longer side;
+Such a lens has OpenCV's first four terms about the image's middle, r counting in halves of the image's longer side;
 F relates what is straight. `refine` fits both together to matched points (Fitzgibbon 2001 has one radial term, as a
 quotient).
 """
@@ -44,13 +44,13 @@ def uncalibrated_lenses(rig: Rig) -> dict[str, LensView]:
 def spoken_lenses(rig: Rig) -> str:
     """A sentence on the lenses of views that are not calibrated; empty if there are none."""
     lenses = uncalibrated_lenses(rig)
-    bent = ", ".join(f"{name} by up to {float(bending(view)):.1f} px" for name, view in lenses.items())
-    return f"lenses bend lines; without them F does not fit: {bent}" if lenses else ""
+    distorted = ", ".join(f"{name} by up to {float(bending(view)):.1f} px" for name, view in lenses.items())
+    return f"lenses bend lines; without them F does not fit: {distorted}" if lenses else ""
 
 
 def bending(view: LensView) -> Float[Tensor, ""]:
     """By how much the lens bends at most: pixels, beyond what the homography does that is nearest to it."""
     x = coarse_grid(view.hw).reshape(-1, 2)
-    straight, valid = view.to(torch.float64).straighten(x)
+    straight, valid = view.to(torch.float64).undistort(x)
     x, straight = x[valid], straight[valid]
     return (apply_homography(fit_homography(x, straight), x).x - straight).norm(dim=-1).max()

@@ -1,4 +1,4 @@
-"""Points seen in two pictures, and what they tell of a rig that is known only in part: a rough map, a depth range."""
+"""Points seen in two images, and what they tell of a rig that is known only in part: a rough map, a depth range."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ LOCATED = (0.15, 0.2, 0.3, np.inf)
 PLENTY = 40
 """So many points that are located well are enough, and others are left out."""
 MANY = 60
-"""With fewer matches that agree, the pictures may be mirrored."""
+"""With fewer matches that agree, the images may be mirrored."""
 AGREE = 5.0
 """How far from its line, in pixels, a match may be that agrees: lenses bend lines."""
 STILL = 0.05
-"""Pictures whose points move less than this are one picture."""
+"""Images whose points move less than this are one image."""
 
 
 class Matches(NamedTuple):
@@ -48,7 +48,7 @@ class Matches(NamedTuple):
 
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
-    """SIFT features of both pictures' luminance, contrast evened, that choose each other and pass the ratio test.
+    """SIFT features of both images' luminance, contrast evened, that choose each other and pass the ratio test.
 
     Where patches around them are alike, beta's are moved to where those fit best.
     """
@@ -56,21 +56,21 @@ def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) 
 
 
 class Features(NamedTuple):
-    """SIFT features of one picture: points (x, y), sizes (pixels) and directions (radians), their descriptors.
+    """SIFT features of one image: points (x, y), sizes (pixels) and directions (radians), their descriptors.
 
-    picture: its luminance, contrast evened, in which they were found.
+    image: its luminance, contrast evened, in which they were found.
     """
 
     points: NDArray[np.float64]
     sizes: NDArray[np.float64]
     directions: NDArray[np.float64]
     descriptors: NDArray[np.float32]
-    picture: NDArray[np.uint8]
+    image: NDArray[np.uint8]
 
 
-def detect(picture: Float[Tensor, "_ h w"]) -> Features:
-    """SIFT features of a picture's luminance, its contrast evened."""
-    grey = rgb_to_grayscale(picture)[0] if picture.shape[0] == 3 else picture[0]
+def detect(image: Float[Tensor, "_ h w"]) -> Features:
+    """SIFT features of an image's luminance, its contrast evened."""
+    grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
     even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
@@ -95,7 +95,7 @@ def _sharp(a: Features, b: Features) -> Matches:
     ratio, turn = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
     c, s = ratio * np.cos(turn), ratio * np.sin(turn)
     maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
-    y, deviation = sharpened(a.picture, b.picture, a.points[i], b.points[j], maps)
+    y, deviation = sharpened(a.image, b.image, a.points[i], b.points[j], maps)
     kept = torch.from_numpy(_good_enough(deviation))
     return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y)).only(kept)
 
@@ -109,19 +109,19 @@ def _good_enough(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:
-    """Points seen in both pictures of every two cameras, those alone that some fundamental matrix agrees with.
+    """Points seen in both images of every two cameras, those alone that some fundamental matrix agrees with.
 
-    Where few agree, the second picture is tried mirrored: features do not survive that. Pairs with fewer than 20
-    are left out. Raises ValueError, one line, if no pair is left, for fewer than two pictures, and for equal ones.
+    Where few agree, the second image is tried mirrored: features do not survive that. Pairs with fewer than 20
+    are left out. Raises ValueError, one line, if no pair is left, for fewer than two images, and for equal ones.
     """
     if len(images) < 2:
-        raise ValueError("matching needs the pictures of two cameras or more: give --image NAME=FILE for each")
-    features = {name: detect(picture) for name, picture in images.items()}
+        raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
+    features = {name: detect(image) for name, image in images.items()}
     found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
         if images[a].shape[1:] == images[b].shape[1:] and float(_movement(matches)) < STILL:
-            raise ValueError(f"the pictures of '{a}' and '{b}' are the same picture: give each camera its own")
+            raise ValueError(f"the images of '{a}' and '{b}' are the same image: give each camera its own")
     if not kept:
         (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
         raise ValueError(
@@ -131,13 +131,13 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     return kept
 
 
-def _agreeing(a: Features, b: Features, picture: Tensor) -> Matches:
-    """Matches that some F puts within `AGREE` pixels of their lines; of the mirrored picture if those are more."""
+def _agreeing(a: Features, b: Features, image: Tensor) -> Matches:
+    """Matches that some F puts within `AGREE` pixels of their lines; of the mirrored image if those are more."""
     straight = agreeing(_sharp(a, b))
     if len(straight.alpha) >= MANY:
         return straight
-    x, y = agreeing(_sharp(a, detect(picture.flip(-1))))
-    mirrored = Matches(x, torch.stack([picture.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
+    x, y = agreeing(_sharp(a, detect(image.flip(-1))))
+    mirrored = Matches(x, torch.stack([image.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
     return max(straight, mirrored, key=lambda m: len(m.alpha))
 
 
@@ -153,7 +153,7 @@ def agreeing(matches: Matches, *, within: float = AGREE) -> Matches:
 
 
 def _movement(matches: Matches) -> Tensor:
-    """How far most points are from one picture to the other: the 90th percentile, pixels."""
+    """How far most points are from one image to the other: the 90th percentile, pixels."""
     return (matches.alpha - matches.beta).norm(dim=-1).quantile(0.9)
 
 
@@ -190,7 +190,7 @@ def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) 
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
     kept = near_lines(near, fitted, within=3)
     if len(kept.alpha) < ENOUGH:
-        raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
+        raise ValueError(f"only {len(kept.alpha)} points seen in both images agree with F: check that it is theirs")
     H, displacement = rough_map(kept, fitted)
     return FittedLink(Link(fitted, H), kept, displacement)
 
@@ -211,7 +211,7 @@ def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, 
 
 def straightened(pair: Pair, matches: Matches) -> Matches:
     """The points where cameras without lenses would see them; those that the lens models do not reach are left out."""
-    (x, seen), (y, also) = pair.alpha.straighten(matches.alpha), pair.beta.straighten(matches.beta)
+    (x, seen), (y, also) = pair.alpha.undistort(matches.alpha), pair.beta.undistort(matches.beta)
     return Matches(x, y).only(seen & also)
 
 
@@ -220,7 +220,7 @@ def with_map(pair: Pair, matches: Matches) -> FittedLink:
     F = pair.fundamental
     kept = near_lines(straightened(pair, matches), F, within=3)
     if len(kept.alpha) < ENOUGH:
-        raise ValueError(f"only {len(kept.alpha)} points seen in both pictures agree with F: check that it is theirs")
+        raise ValueError(f"only {len(kept.alpha)} points seen in both images agree with F: check that it is theirs")
     H, displacement = rough_map(kept, F)
     return FittedLink(Link(F, H), kept, displacement)
 
@@ -230,12 +230,12 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
     """
-    straight = Matches(pair.alpha.straighten(matches.alpha)[0], pair.beta.straighten(matches.beta)[0])
+    straight = Matches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(straight, pair.fundamental) <= 3)
     found = triangulate([camera.to(torch.float64) for camera in pair.cameras], torch.stack(near))
     depth = pair.cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
     if len(depth) < ENOUGH:
-        raise ValueError(f"only {len(depth)} points seen in both pictures fit the calibration: is it theirs?")
+        raise ValueError(f"only {len(depth)} points seen in both images fit the calibration: is it theirs?")
     low, high = _percentiles(depth, 0.02)
     return 0.9 * low, 1.25 * high
 
@@ -248,7 +248,7 @@ def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
     except cv2.error:
         found = None
     if found is None or found.shape != (3, 3):
-        raise ValueError("no fundamental matrix fits the points seen in both pictures")
+        raise ValueError("no fundamental matrix fits the points seen in both images")
     return torch.from_numpy(found)
 
 
@@ -257,7 +257,7 @@ def similarity(matches: Matches) -> Float[Tensor, "3 3"]:
     x, y = (points.numpy() for points in matches)
     found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
     if found is None:
-        raise ValueError("the points seen in both pictures follow no common map")
+        raise ValueError("the points seen in both images follow no common map")
     return torch.from_numpy(np.vstack([found, [0, 0, 1]]))
 
 

@@ -1,7 +1,7 @@
 """The usual mistakes in rigs, each with what undoes it.
 
-A `Remedy` turns the rig that was given into the rig that is right if that mistake was made, for the pictures as they
-are. What was done to pictures without telling the rig is done to the rig's camera.
+A `Remedy` turns the rig that was given into the rig that is right if that mistake was made, for the images as they
+are. What was done to images without telling the rig is done to the rig's camera.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix
-from arraygeom.pixels import HW, shift_matrix, turn_matrix
+from arraygeom.pixels import HW, rot90_matrix, shift_matrix
 
 KINDS = (
     *("nothing", "resized", "turned or mirrored", "cameras swapped", "pose inverted", "R transposed"),
@@ -48,9 +48,9 @@ NOTHING = Remedy("nothing", "as given", lambda rig: rig)
 
 
 def remedies(rig: Rig, sizes: Mapping[str, HW]) -> list[Remedy]:
-    """All single mistakes that can have been made with a rig whose pictures have these sizes, likely ones first.
+    """All single mistakes that can have been made with a rig whose images have these sizes, likely ones first.
 
-    Where pictures do not have the sizes that the rig states, only what explains it.
+    Where images do not have the sizes that the rig states, only what explains it.
     """
     names = [name for name in rig.names if name in sizes]
     wrong = tuple(name for name in names if rig[name].hw != sizes[name])
@@ -86,7 +86,7 @@ def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
 
 
 def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:
-    """Mirroring a picture left to right (`across`), or top to bottom.
+    """Mirroring an image left to right (`across`), or top to bottom.
 
     >>> (mirror_matrix((4, 6), across=True) @ torch.tensor([5.0, 1.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 1.0, 1.0]
@@ -98,15 +98,15 @@ def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:
 
 
 TURNS: dict[str, Callable[[HW], Tensor]] = {
-    "turned by 180 degrees": lambda hw: turn_matrix(hw, 2),
-    "turned by 90 degrees counter-clockwise": lambda hw: turn_matrix(hw, 1),
-    "turned by 90 degrees clockwise": lambda hw: turn_matrix(hw, 3),
+    "turned by 180 degrees": lambda hw: rot90_matrix(hw, 2),
+    "turned by 90 degrees counter-clockwise": lambda hw: rot90_matrix(hw, 1),
+    "turned by 90 degrees clockwise": lambda hw: rot90_matrix(hw, 3),
     "mirrored left to right": lambda hw: mirror_matrix(hw, across=True),
     "mirrored top to bottom": lambda hw: mirror_matrix(hw, across=False),
     "mirrored about the diagonal (rows and columns exchanged)": lambda hw: TRANSPOSE,
-    "mirrored about the other diagonal": lambda hw: turn_matrix(hw[::-1], 2) @ TRANSPOSE,
+    "mirrored about the other diagonal": lambda hw: rot90_matrix(hw[::-1], 2) @ TRANSPOSE,
 }
-"""What may be done to a picture by turning and mirroring it: x' ~ A x, A being that of the picture's size."""
+"""What may be done to an image by turning and mirroring it: x' ~ A x, A being that of the image's size."""
 
 
 def turned_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
@@ -132,7 +132,7 @@ def on_cameras(rig: Rig, names: Iterable[str], change: Callable[[Camera], Camera
 def on_pixels(rig: Rig, names: Iterable[str], change: Callable[[View], tuple[Tensor, HW]]) -> Rig:
     """The rig with the pixels of some cameras mapped: x' ~ A x, and the new size."""
     for name in names:
-        rig = rig.mapped(name, *change(rig[name]))
+        rig = rig.transformed(name, *change(rig[name]))
     return rig
 
 
@@ -151,7 +151,7 @@ def _calibrated(rig: Rig, names: Iterable[str]) -> list[str]:
 def _swapped(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
     for a, b in combinations(names, 2):
         if rig[a].hw == sizes[b] and rig[b].hw == sizes[a]:
-            yield Remedy("cameras swapped", f"pictures of '{a}' and '{b}' swapped", partial(swap, a=a, b=b))
+            yield Remedy("cameras swapped", f"images of '{a}' and '{b}' swapped", partial(swap, a=a, b=b))
 
 
 def _poses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
@@ -195,19 +195,19 @@ def _transposed(camera: Camera) -> Camera:
 
 
 def _turned(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
-    """Pictures turned or mirrored after calibration, where the sizes allow it."""
+    """Images turned or mirrored after calibration, where the sizes allow it."""
     for words in TURNS:
         for group, spoken in _groups(names):
             if all(turned_view(rig[n], words)[1] == sizes[n] for n in group):
                 repair = partial(on_pixels, names=group, change=partial(turned_view, words=words))
-                yield Remedy("turned or mirrored", f"picture of {spoken} {words}", repair)
+                yield Remedy("turned or mirrored", f"image of {spoken} {words}", repair)
 
 
 def _scaled(names: list[str]) -> Iterator[Remedy]:
-    """K is for pictures of another size than the rig says."""
+    """K is for images of another size than the rig says."""
     for factor in RESIZED:
         for group, spoken in _groups(names):
-            words = f"K of {spoken} is for pictures {1 / factor:.3g} times as large"
+            words = f"K of {spoken} is for images {1 / factor:.3g} times as large"
             yield Remedy("resized", words, partial(on_pixels, names=group, change=partial(_magnified, factor=factor)))
 
 
@@ -218,18 +218,18 @@ def _magnified(view: View, factor: float) -> tuple[Tensor, HW]:
 
 
 def _of_sizes(rig: Rig, wrong: tuple[str, ...], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
-    """What makes the sizes that the rig states those of the pictures."""
+    """What makes the sizes that the rig states those of the images."""
     spoken = ", ".join(map(repr, wrong))
     if all(rig[n].hw == sizes[n][::-1] for n in wrong):
         for words in TURNS:
             if all(turned_view(rig[n], words)[1] == sizes[n] for n in wrong):
                 repair = partial(on_pixels, names=wrong, change=partial(turned_view, words=words))
-                yield Remedy("turned or mirrored", f"picture of {spoken} {words}", repair)
+                yield Remedy("turned or mirrored", f"image of {spoken} {words}", repair)
         words = f"size of {spoken} written as height, width"
         yield Remedy("x and y exchanged", words, partial(_to_sizes, names=wrong, sizes=sizes, matrix=_cut_at_corner))
     for words, matrix in FITS.items():
         repair = partial(_to_sizes, names=wrong, sizes=sizes, matrix=matrix)
-        yield Remedy("resized", f"picture of {spoken} {words}", repair)
+        yield Remedy("resized", f"image of {spoken} {words}", repair)
 
 
 def _cut_at_corner(old: HW, new: HW) -> Tensor:
@@ -245,12 +245,12 @@ FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "cut out of the middle": _cut_from_middle,
     "cut off at the right and the bottom": _cut_at_corner,
 }
-"""How a picture may have come to another size."""
+"""How an image may have come to another size."""
 
 
 def _to_sizes(rig: Rig, names: Iterable[str], sizes: Mapping[str, HW], matrix: Callable[[HW, HW], Tensor]) -> Rig:
     for name in names:
-        rig = rig.mapped(name, matrix(rig[name].hw, sizes[name]), sizes[name])
+        rig = rig.transformed(name, matrix(rig[name].hw, sizes[name]), sizes[name])
     return rig
 
 
@@ -258,7 +258,7 @@ def _lenses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
     curved = [n for n in _calibrated(rig, names) if n not in bare_cameras(rig, names)]
     for group, spoken in _groups(curved):
         drop, turn = (partial(on_cameras, names=group, change=change) for change in (_without_lens, _opposite_lens))
-        yield Remedy("distortion", f"pictures of {spoken} are undistorted already: distortion applied twice", drop)
+        yield Remedy("distortion", f"images of {spoken} are undistorted already: distortion applied twice", drop)
         yield Remedy("distortion", f"distortion of {spoken} with the wrong sign (the inverse map)", turn)
 
 

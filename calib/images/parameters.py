@@ -28,7 +28,7 @@ UNITS = {
     "centre": ("px", 1.0),
 }
 LENS_SIGMA = 0.2
-"""The same part where a lens is not calibrated: it counts in halves of the picture's longer side."""
+"""The same part where a lens is not calibrated: it counts in halves of the image's longer side."""
 LINK_SIGMA = 0.1
 """Of the seven numbers of an F in coordinates that span about -1 to 1: next to nothing is known of them."""
 

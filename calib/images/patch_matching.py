@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 HALF = 7
-"""Patches are 15 x 15 pixels, of the coarser picture."""
+"""Patches are 15 x 15 pixels, of the coarser image."""
 STEPS = 12
 SETTLED = 0.01
 """Steps below this, in pixels, end the search for nine points in ten."""
@@ -54,28 +54,28 @@ def sharpened(
     row = np.arange(-HALF, HALF + 1.0)
     around = np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
     weight = np.exp(-(around**2).sum(1) / (2 * (HALF / 1.6) ** 2))
-    picture = beta.astype(np.float32)
-    slopes = [cv2.Sobel(picture, cv2.CV_32F, 1 - k, k, ksize=3) / 8 for k in (0, 1)]
+    image = beta.astype(np.float32)
+    slopes = [cv2.Sobel(image, cv2.CV_32F, 1 - k, k, ksize=3) / 8 for k in (0, 1)]
     found = Patches(_sampled(alpha.astype(np.float32), x[:, None] + step * around), y, step * beta_from_alpha)
     for _ in range(STEPS):
-        found, alike, moved, deviation = _moved(found, [picture, *slopes], around, weight)
+        found, alike, moved, deviation = _moved(found, [image, *slopes], around, weight)
         if np.quantile(moved, 0.9) < SETTLED:
             break
     good = (alike > ALIKE) & (np.linalg.norm(found.y - y, axis=1) < NEAR)
     return Sharpened(np.where(good[:, None], found.y, y), np.where(good, deviation, np.inf))
 
 
-def _sampled(picture: Array, x: Array) -> Array:
+def _sampled(image: Array, x: Array) -> Array:
     x = x.astype(np.float32)
-    return cv2.remap(picture, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).astype(np.float64)
+    return cv2.remap(image, x[..., 0], x[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT).astype(np.float64)
 
 
-def _moved(found: Patches, pictures: list[Array], around: Array, weights: Array) -> tuple[Patches, Array, Array, Array]:
+def _moved(found: Patches, images: list[Array], around: Array, weights: Array) -> tuple[Patches, Array, Array, Array]:
     """The patches after a step, how alike they were before it (correlation), how far they moved; and how well their
     places are known, by what is left (the worse axis's deviation, pixels)."""
     weight = weights / weights.sum()
     at = found.y[:, None] + around @ found.A.swapaxes(1, 2)
-    seen, across, down = (_sampled(p, at) for p in pictures)
+    seen, across, down = (_sampled(p, at) for p in images)
     seen, wanted = (v - (v @ weight)[:, None] for v in (seen, found.values))
     both, power, own = ((a * b) @ weight for a, b in ((seen, wanted), (seen, seen), (wanted, wanted)))
     gain = (both / (power + 1e-6))[:, None]

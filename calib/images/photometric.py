@@ -51,10 +51,10 @@ class Attended(Protocol):
 Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Attended]
 """Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
 Describe = Callable[[Tensor], Tensor]
-"""A grey picture (1, 1, H, W) to features (1, D, H, W) whose inner product says how alike two pixels are."""
+"""A grey image (1, 1, H, W) to features (1, D, H, W) whose inner product says how alike two pixels are."""
 
 LARGEST = 480
-"""Pictures are reduced to this many pixels along their longer side."""
+"""Images are reduced to this many pixels along their longer side."""
 PIXELS = 6000
 """Alpha pixels that are looked at, about, on a grid."""
 SHARPNESS = 20.0
@@ -62,7 +62,7 @@ SHARPNESS = 20.0
 WINDOW = 9
 """Values are relative to the mean and the deviation in windows this wide, so that exposure and filters do not count."""
 EVEN = 0.02
-"""Deviations below this, of pictures in 0..1, are noise."""
+"""Deviations below this, of images in 0..1, are noise."""
 PART = 0.06
 """A pair known by F alone is looked at within this part of beta's size around the rough map."""
 
@@ -79,12 +79,12 @@ class Views:
 
     @classmethod
     def of(cls, images: Mapping[str, Float[Tensor, "_ _ _"]], describe: Describe | None = None) -> Views:
-        """The frame's pictures reduced and described; by patches, unless by something better."""
-        grey = {name: _reduced(picture) for name, picture in images.items()}
-        keys = {name: (describe or patches)(picture) for name, picture in grey.items()}
+        """The frame's images reduced and described; by patches, unless by something better."""
+        grey = {name: _reduced(image) for name, image in images.items()}
+        keys = {name: (describe or patches)(image) for name, image in grey.items()}
         sizes = {name: (int(p.shape[2]), int(p.shape[3])) for name, p in grey.items()}
         grid = {name: _grid(hw) for name, hw in sizes.items()}
-        return cls(sizes, keys, {name: structure(picture) for name, picture in grey.items()}, grid)
+        return cls(sizes, keys, {name: structure(image) for name, image in grey.items()}, grid)
 
 
 def photometric_errors(
@@ -100,7 +100,7 @@ def photometric_errors(
     pair, x = rig.pair(*names).to(torch.float32), views.grid[alpha]
     look = field_of(pair)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
-    query, own = (picture[alpha][:, :, rows][..., columns] for picture in (views.keys, views.values))
+    query, own = (image[alpha][:, :, rows][..., columns] for image in (views.keys, views.values))
     found = attend(query, views.keys[beta], views.values[beta], look)
     seen = look.mask.any(-1) if isinstance(look, Positions) else look.valid
     sure = found.peak[0].detach().sqrt()
@@ -111,8 +111,8 @@ def field_of(pair: Pair) -> ReceptiveField:
     """Where to look: the segment of calibrated pinholes, the curve through lenses, the line of a pair known by F."""
     if pair.link is not None or not pair.calibrated:
         line = HomographyDisplacement(PART * max(pair.beta.hw))
-        return ThroughLenses(line, 64) if pair.bent else line
-    return Curved(64, nodes=16) if pair.bent else Epipolar()
+        return ThroughLenses(line, 64) if pair.has_lens else line
+    return Curved(64, nodes=16) if pair.has_lens else Epipolar()
 
 
 def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:
@@ -153,8 +153,8 @@ def _local_mean(grey: Tensor) -> Tensor:
     return avg_pool2d(pad(grey, (r, r, r, r), mode="replicate"), WINDOW, 1)
 
 
-def _reduced(picture: Tensor) -> Tensor:
-    grey = (rgb_to_grayscale(picture) if picture.shape[0] == 3 else picture)[None].float()
+def _reduced(image: Tensor) -> Tensor:
+    grey = (rgb_to_grayscale(image) if image.shape[0] == 3 else image)[None].float()
     h, w = grey.shape[-2:]
     factor = LARGEST / max(h, w)
     if factor >= 1:

@@ -1,4 +1,4 @@
-"""A better rig from ordinary pictures: points matched between its cameras, what is known of it, and nothing else.
+"""A better rig from ordinary images: points matched between its cameras, what is known of it, and nothing else.
 
 Chosen numbers z, in standard deviations of what they were known to (a calibration's, say), minimise
 
@@ -6,7 +6,7 @@ Chosen numbers z, in standard deviations of what they were known to (a calibrati
 
 with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points' own noise:
 Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). Numbers of which the
-pictures say nothing new keep their values. Points held out decide whether the result is accepted. What the points
+images say nothing new keep their values. Points held out decide whether the result is accepted. What the points
 told is then the prior of a second fit, to the photometric error of the fusion itself: see `photometric`.
 """
 
@@ -33,9 +33,9 @@ Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
 FREE = ("rotation", "centre")
 MORE = ("translation",)
-"""Freed too where points demand it: along their lines pictures tell little of it, and depths would drift."""
+"""Freed too where points demand it: along their lines images tell little of it, and depths would drift."""
 NO_NARROWER = 0.9
-"""A number is left alone if the pictures leave more than this part of its standard deviation."""
+"""A number is left alone if the images leave more than this part of its standard deviation."""
 HELD_OUT = 4
 """One part in so many of the points, or of the frames, is held out."""
 CELL = 24
@@ -91,7 +91,7 @@ class Refined:
     """A rig made better, or not.
 
     rig: the better one if `accepted`, else the one given. changes: what is different in it. left_alone: numbers that
-    the pictures do not determine. fitted, held_out: agreement before and after of the points that were used, and of
+    the images do not determine. fitted, held_out: agreement before and after of the points that were used, and of
     those that were not. photometric: what the fusion's own error did, if it was asked.
     """
 
@@ -113,7 +113,7 @@ class Refined:
         else:
             lines.append("not accepted: held-out points come no nearer to their lines; the rig stays as it is")
         if self.left_alone:
-            lines.append(f"left alone, not determined by these pictures: {', '.join(self.left_alone)}")
+            lines.append(f"left alone, not determined by these images: {', '.join(self.left_alone)}")
         if self.photometric is not None:
             b, a, kept = self.photometric
             verdict = "kept" if kept else "not kept"
@@ -129,14 +129,14 @@ def refine(
     sigma: Mapping[str, float] | None = None,
     attend: Attend | None = None,
 ) -> Refined:
-    """The rig after its free numbers are fitted to points matched in frames, each with a picture of every camera.
+    """The rig after its free numbers are fitted to points matched in frames, each with an image of every camera.
 
-    The first camera that has pictures keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
+    The first camera that has images keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
     always free, and views that are known by F alone are given lenses where points that were held out come nearer to
-    their lines so. With two frames or more, whole frames are held out, else parts of the picture. With `attend`,
+    their lines so. With two frames or more, whole frames are held out, else parts of the image. With `attend`,
     the fusion's own error then has its say, with what the points told as its prior.
-    Raises ValueError, one line: a camera that the rig lacks, a picture of another size than the rig says, equal
-    pictures, too few points.
+    Raises ValueError, one line: a camera that the rig lacks, an image of another size than the rig says, equal
+    images, too few points.
     """
     for frame in frames:
         _check(rig, frame)
@@ -171,8 +171,8 @@ def fitted(
     found = _fitted(rig, frames, free, sigma)
     if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
         found = _nearer(found, _fitted(rig, frames, (*FREE, *MORE), sigma))
-    bent = with_lenses(rig, rig.names)
-    return found if bent is rig else _nearer(found, _fitted(bent, frames, free, sigma))
+    has_lens = with_lenses(rig, rig.names)
+    return found if has_lens is rig else _nearer(found, _fitted(has_lens, frames, free, sigma))
 
 
 def _fitted(
@@ -374,7 +374,7 @@ def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
 
 
 def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:
-    """Points to use and points to hold out: whole frames if there are several, else squares of alpha's picture."""
+    """Points to use and points to hold out: whole frames if there are several, else squares of alpha's image."""
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)
         return _joined(frames[:-held_out]), _joined(frames[-held_out:])
@@ -408,12 +408,12 @@ def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
 
 
 def _check(rig: Rig, frame: Frame) -> None:
-    for name, picture in frame.items():
+    for name, image in frame.items():
         h, w = rig[name].hw
-        if tuple(picture.shape[1:]) != (h, w):
-            got = f"{picture.shape[2]}x{picture.shape[1]}"
+        if tuple(image.shape[1:]) != (h, w):
+            got = f"{image.shape[2]}x{image.shape[1]}"
             raise ValueError(
-                f"the picture of '{name}' is {got}, the rig says {w}x{h}: `pat rig doctor` tells what was done to it"
+                f"the image of '{name}' is {got}, the rig says {w}x{h}: `pat rig doctor` tells what was done to it"
             )
 
 

@@ -1,6 +1,6 @@
 """How far matched points are from what a rig says of them: across the lines, in front, at which depth.
 
-Everything is measured in the pixels of the pictures as they are, through any lens, and is differentiable in the rig.
+Everything is measured in the pixels of the images as they are, through any lens, and is differentiable in the rig.
 A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
 """
 
@@ -22,7 +22,7 @@ from .matches import Matches
 class Residuals(NamedTuple):
     """Signed distances in pixels, one a match, and where they exist.
 
-    sampson: from the nearest pair of points that would fit (Hartley & Zisserman 11.4.3), in both pictures together.
+    sampson: from the nearest pair of points that would fit (Hartley & Zisserman 11.4.3), in both images together.
     line: from the epipolar line (the curve, through a lens), in beta.
     """
 
@@ -117,7 +117,7 @@ def nature(pair: Pair) -> tuple[object, ...]:
 
 
 def stacked(pairs: Sequence[Pair]) -> Pair:
-    """A batch of pairs of one nature; picture sizes are those of the first."""
+    """A batch of pairs of one nature; image sizes are those of the first."""
     link = None
     if pairs[0].link is not None:
         link = Link(torch.stack([pair.fundamental for pair in pairs]))
@@ -148,7 +148,7 @@ def _for_each(pair: Pair, matches: Matches) -> tuple[Tensor, Tensor]:
 def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
     """Rays of the pixels and E; or the straightened pixels and F. And where the rays exist."""
     if pair.link is not None or not pair.calibrated:
-        (a, seen), (b, also) = pair.alpha.straighten(x), pair.beta.straighten(y)
+        (a, seen), (b, also) = pair.alpha.undistort(x), pair.beta.undistort(y)
         return (to_homogeneous(a), to_homogeneous(b)), pair.fundamental, seen & also
     (a, seen), (b, also) = (camera.rays(points) for camera, points in zip(pair.cameras, (x, y)))
     return (a, b), essential_matrix(pair.beta_from_alpha), seen & also

@@ -112,18 +112,18 @@ def _attend_backward(
 @_attend_backward.register_fake
 def _(query, key, value, points, mask, bias, statistics, logsum, *rest):
     wanted = rest[-1]
-    pictures = (_channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted))
+    images = (_channels_last_like(t) if want else t.new_empty(0) for t, want in zip((query, key, value), wanted))
     weights = (*logsum.shape, rest[2])
     return (
-        *pictures,
+        *images,
         torch.empty_like(points, memory_format=torch.contiguous_format) if wanted[3] else points.new_empty(0),
         points.new_empty(weights if wanted[4] else 0),
     )
 
 
-def _channels_last_like(picture: Tensor) -> Tensor:
-    b, d, h, w = picture.shape
-    return picture.new_empty(b, h, w, d).permute(0, 3, 1, 2)
+def _channels_last_like(image: Tensor) -> Tensor:
+    b, d, h, w = image.shape
+    return image.new_empty(b, h, w, d).permute(0, 3, 1, 2)
 
 
 def _keep(ctx, inputs, output) -> None:

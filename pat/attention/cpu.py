@@ -85,21 +85,21 @@ def backward(
                 *_channel_tasks(here, here.by_value, last, upstream, call.value_channels, value_out),
             ]
         )
-    pictures = (
+    images = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
         for out, like, want in zip((query_out, key_out, value_out), (query, key, value), wanted)
     )
     points_out = points_out.sum_to_size(look.points.shape) if wanted[3] else points_out
-    return *pictures, points_out, bias_out
+    return *images, points_out, bias_out
 
 
 def _accumulated(tensor: Tensor) -> torch.dtype:
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
 
 
-def _channels_last(picture: Tensor) -> Tensor:
+def _channels_last(image: Tensor) -> Tensor:
     """(b, d, h, w) to (b, h, w, d); a copy only if it does not lie in memory like that."""
-    return picture.permute(0, 2, 3, 1).contiguous()
+    return image.permute(0, 2, 3, 1).contiguous()
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

@@ -8,7 +8,7 @@ weights, and in backward the addition of the query to the taps' gradients. Some 
 in turn, a few taps at a time, since they share most of them. Everything else is work on samples, eight at a
 time.
 
-Pictures come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
+Images come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
 integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the
 others.
 """
@@ -472,20 +472,20 @@ def _exponentials32(x):
 
 
 @compiled
-def inner_products(x, rows, first, last, picture, channels, out):
-    """out[t] = x . picture[rows[t]], for first <= t < last; rows is padded to a multiple of TAP_BLOCK."""
+def inner_products(x, rows, first, last, image, channels, out):
+    """out[t] = x . image[rows[t]], for first <= t < last; rows is padded to a multiple of TAP_BLOCK."""
     c = 0
     for t in range(first, last, LANES):
         store(out, t, splat(zero(x)))
     while c + WIDE <= channels:
-        _inner_products_64(x, rows, first, last, picture, channels, c, out)
+        _inner_products_64(x, rows, first, last, image, channels, c, out)
         c += WIDE
     if c < channels:
-        _inner_products_of_rest(x, rows, first, last, picture, channels, c, out)
+        _inner_products_of_rest(x, rows, first, last, image, channels, c, out)
 
 
 @compiled
-def _inner_products_64(x, rows, first, last, picture, channels, c, out):
+def _inner_products_64(x, rows, first, last, image, channels, c, out):
     """The 64 channels from c on, with x in registers."""
     x0, x1, x2, x3 = load(x, c), load(x, c + 8), load(x, c + 16), load(x, c + 24)
     x4, x5, x6, x7 = load(x, c + 32), load(x, c + 40), load(x, c + 48), load(x, c + 56)
@@ -493,27 +493,27 @@ def _inner_products_64(x, rows, first, last, picture, channels, c, out):
         add_totals(
             out,
             t,
-            _inner_product_64(picture, rows[t] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
-            _inner_product_64(picture, rows[t + 1] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
-            _inner_product_64(picture, rows[t + 2] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
-            _inner_product_64(picture, rows[t + 3] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(image, rows[t] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(image, rows[t + 1] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(image, rows[t + 2] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
+            _inner_product_64(image, rows[t + 3] * channels + c, x0, x1, x2, x3, x4, x5, x6, x7),
         )
 
 
 @compiled
-def _inner_product_64(picture, at, x0, x1, x2, x3, x4, x5, x6, x7):
-    a = mul(x0, load(picture, at))
-    a = fma(x1, load(picture, at + 8), a)
-    a = fma(x2, load(picture, at + 16), a)
-    a = fma(x3, load(picture, at + 24), a)
-    a = fma(x4, load(picture, at + 32), a)
-    a = fma(x5, load(picture, at + 40), a)
-    a = fma(x6, load(picture, at + 48), a)
-    return fma(x7, load(picture, at + 56), a)
+def _inner_product_64(image, at, x0, x1, x2, x3, x4, x5, x6, x7):
+    a = mul(x0, load(image, at))
+    a = fma(x1, load(image, at + 8), a)
+    a = fma(x2, load(image, at + 16), a)
+    a = fma(x3, load(image, at + 24), a)
+    a = fma(x4, load(image, at + 32), a)
+    a = fma(x5, load(image, at + 40), a)
+    a = fma(x6, load(image, at + 48), a)
+    return fma(x7, load(image, at + 56), a)
 
 
 @compiled
-def _inner_products_of_rest(x, rows, first, last, picture, channels, first_channel, out):
+def _inner_products_of_rest(x, rows, first, last, image, channels, first_channel, out):
     whole = first_channel + (channels - first_channel) // LANES * LANES
     for t in range(first, last, TAP_BLOCK):
         r0, r1, r2, r3 = (
@@ -525,72 +525,72 @@ def _inner_products_of_rest(x, rows, first, last, picture, channels, first_chann
         a0 = a1 = a2 = a3 = splat(zero(x))
         for c in range(first_channel, whole, LANES):
             q = load(x, c)
-            a0 = fma(q, load(picture, r0 + c), a0)
-            a1 = fma(q, load(picture, r1 + c), a1)
-            a2 = fma(q, load(picture, r2 + c), a2)
-            a3 = fma(q, load(picture, r3 + c), a3)
+            a0 = fma(q, load(image, r0 + c), a0)
+            a1 = fma(q, load(image, r1 + c), a1)
+            a2 = fma(q, load(image, r2 + c), a2)
+            a3 = fma(q, load(image, r3 + c), a3)
         add_totals(out, t, a0, a1, a2, a3)
         for c in range(whole, channels):
-            out[t] += x[c] * load_one(picture, r0 + c)
-            out[t + 1] += x[c] * load_one(picture, r1 + c)
-            out[t + 2] += x[c] * load_one(picture, r2 + c)
-            out[t + 3] += x[c] * load_one(picture, r3 + c)
+            out[t] += x[c] * load_one(image, r0 + c)
+            out[t + 1] += x[c] * load_one(image, r1 + c)
+            out[t + 2] += x[c] * load_one(image, r2 + c)
+            out[t + 3] += x[c] * load_one(image, r3 + c)
 
 
 @compiled
-def weighted_sum(weights, rows, first, last, picture, channels, begin, end, out):
-    """out[c] += weights[t] picture[rows[t], c] for first <= t < last and the channels begin <= c < end.
+def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
+    """out[c] += weights[t] image[rows[t], c] for first <= t < last and the channels begin <= c < end.
 
     Weights and rows are padded to a multiple of TAP_BLOCK.
     """
     c = begin
     while c + WIDE <= end:
-        _weighted_sum_64(weights, rows, first, last, picture, channels, c, out)
+        _weighted_sum_64(weights, rows, first, last, image, channels, c, out)
         c += WIDE
     while c + 4 * LANES <= end:
-        _weighted_sum_32(weights, rows, first, last, picture, channels, c, out)
+        _weighted_sum_32(weights, rows, first, last, image, channels, c, out)
         c += 4 * LANES
     while c + LANES <= end:
-        _weighted_sum_8(weights, rows, first, last, picture, channels, c, out)
+        _weighted_sum_8(weights, rows, first, last, image, channels, c, out)
         c += LANES
     for tail in range(c, end):
         for t in range(first, last):
-            out[tail] += weights[t] * load_one(picture, rows[t] * channels + tail)
+            out[tail] += weights[t] * load_one(image, rows[t] * channels + tail)
 
 
 @compiled
-def _weighted_sum_64(weights, rows, first, last, picture, channels, c, out):
+def _weighted_sum_64(weights, rows, first, last, image, channels, c, out):
     a0, a1, a2, a3 = load(out, c), load(out, c + 8), load(out, c + 16), load(out, c + 24)
     a4, a5, a6, a7 = load(out, c + 32), load(out, c + 40), load(out, c + 48), load(out, c + 56)
     for t in range(first, last):
         w, r = splat(weights[t]), rows[t] * channels + c
-        a0 = fma(w, load(picture, r), a0)
-        a1 = fma(w, load(picture, r + 8), a1)
-        a2 = fma(w, load(picture, r + 16), a2)
-        a3 = fma(w, load(picture, r + 24), a3)
-        a4 = fma(w, load(picture, r + 32), a4)
-        a5 = fma(w, load(picture, r + 40), a5)
-        a6 = fma(w, load(picture, r + 48), a6)
-        a7 = fma(w, load(picture, r + 56), a7)
+        a0 = fma(w, load(image, r), a0)
+        a1 = fma(w, load(image, r + 8), a1)
+        a2 = fma(w, load(image, r + 16), a2)
+        a3 = fma(w, load(image, r + 24), a3)
+        a4 = fma(w, load(image, r + 32), a4)
+        a5 = fma(w, load(image, r + 40), a5)
+        a6 = fma(w, load(image, r + 48), a6)
+        a7 = fma(w, load(image, r + 56), a7)
     _store_32(out, c, a0, a1, a2, a3)
     _store_32(out, c + 32, a4, a5, a6, a7)
 
 
 @compiled
-def _weighted_sum_32(weights, rows, first, last, picture, channels, c, out):
+def _weighted_sum_32(weights, rows, first, last, image, channels, c, out):
     a0, a1, a2, a3 = load(out, c), load(out, c + 8), load(out, c + 16), load(out, c + 24)
     b0 = b1 = b2 = b3 = splat(zero(weights))
     for t in range(first, last, 2):
         w, r = splat(weights[t]), rows[t] * channels + c
-        a0 = fma(w, load(picture, r), a0)
-        a1 = fma(w, load(picture, r + 8), a1)
-        a2 = fma(w, load(picture, r + 16), a2)
-        a3 = fma(w, load(picture, r + 24), a3)
+        a0 = fma(w, load(image, r), a0)
+        a1 = fma(w, load(image, r + 8), a1)
+        a2 = fma(w, load(image, r + 16), a2)
+        a3 = fma(w, load(image, r + 24), a3)
         w, r = splat(weights[t + 1]), rows[t + 1] * channels + c
-        b0 = fma(w, load(picture, r), b0)
-        b1 = fma(w, load(picture, r + 8), b1)
-        b2 = fma(w, load(picture, r + 16), b2)
-        b3 = fma(w, load(picture, r + 24), b3)
+        b0 = fma(w, load(image, r), b0)
+        b1 = fma(w, load(image, r + 8), b1)
+        b2 = fma(w, load(image, r + 16), b2)
+        b3 = fma(w, load(image, r + 24), b3)
     _store_32(out, c, add(a0, b0), add(a1, b1), add(a2, b2), add(a3, b3))
 
 
@@ -603,28 +603,28 @@ def _store_32(out, c, a, b, d, e):
 
 
 @compiled
-def _weighted_sum_8(weights, rows, first, last, picture, channels, c, out):
+def _weighted_sum_8(weights, rows, first, last, image, channels, c, out):
     a0, a1 = load(out, c), splat(zero(weights))
     a2 = a3 = a1
     for t in range(first, last, TAP_BLOCK):
-        a0 = fma(splat(weights[t]), load(picture, rows[t] * channels + c), a0)
-        a1 = fma(splat(weights[t + 1]), load(picture, rows[t + 1] * channels + c), a1)
-        a2 = fma(splat(weights[t + 2]), load(picture, rows[t + 2] * channels + c), a2)
-        a3 = fma(splat(weights[t + 3]), load(picture, rows[t + 3] * channels + c), a3)
+        a0 = fma(splat(weights[t]), load(image, rows[t] * channels + c), a0)
+        a1 = fma(splat(weights[t + 1]), load(image, rows[t + 1] * channels + c), a1)
+        a2 = fma(splat(weights[t + 2]), load(image, rows[t + 2] * channels + c), a2)
+        a3 = fma(splat(weights[t + 3]), load(image, rows[t + 3] * channels + c), a3)
     store(out, c, add(add(a0, a1), add(a2, a3)))
 
 
 @compiled
-def _block_products(pixels, counts, x, rows, picture, channels, out):
+def _block_products(pixels, counts, x, rows, image, channels, out):
     """`inner_products` for the pixels of a block. Neighbours look at much the same pixels of beta: at a few of
     those in turn, which then lie in the first cache."""
     for t in range(0, _most(counts, pixels), CHUNK):
         for i in range(pixels):
-            inner_products(_of(x, i), _of(rows, i), t, min(t + CHUNK, counts[i]), picture, channels, _of(out, i))
+            inner_products(_of(x, i), _of(rows, i), t, min(t + CHUNK, counts[i]), image, channels, _of(out, i))
 
 
 @compiled
-def _block_sums(pixels, counts, weights, rows, picture, channels, out):
+def _block_sums(pixels, counts, weights, rows, image, channels, out):
     """`weighted_sum` likewise, from 0."""
     for i in range(pixels):
         _fill(_of(out, i), 0, channels, zero(out.first))
@@ -633,7 +633,7 @@ def _block_sums(pixels, counts, weights, rows, picture, channels, out):
         for t in range(0, _most(counts, pixels), CHUNK):
             for i in range(pixels):
                 last = min(t + CHUNK, counts[i])
-                weighted_sum(_of(weights, i), _of(rows, i), t, last, picture, channels, c, end, _of(out, i))
+                weighted_sum(_of(weights, i), _of(rows, i), t, last, image, channels, c, end, _of(out, i))
 
 
 @compiled
@@ -716,7 +716,7 @@ class Look(NamedTuple):
 
 
 class Call(NamedTuple):
-    """The inputs of a call: pictures, where to look, bias (of no length if there is none), and the numbers of
+    """The inputs of a call: images, where to look, bias (of no length if there is none), and the numbers of
     channels of the query and the value."""
 
     query: Any
@@ -900,7 +900,7 @@ def _samples(block, slot, n):
 
 
 @compiled
-def _on_picture(x, y, look, slack):
+def _on_image(x, y, look, slack):
     low = -HALF - slack
     return (x >= low) & (y >= low) & (x <= look.last_x - low) & (y <= look.last_y - low)
 
@@ -935,7 +935,7 @@ def _collect_positions(place, look, samples):
     for i in range(look.samples):
         x, y = points[2 * i], points[2 * i + 1]
         samples.index[n], samples.x[n], samples.y[n] = i, x, y
-        n += (mask[i] != 0) & _on_picture(x, y, look, look.slack)
+        n += (mask[i] != 0) & _on_image(x, y, look, look.slack)
     return n
 
 
@@ -946,7 +946,7 @@ def _collect_segment(place, look, samples):
     _walk(splat(x0), splat(dx), look, samples.x)
     _walk(splat(y0), splat(dy), look, samples.y)
     sure = look.slack - look.slack
-    if _on_picture(x0, y0, look, sure) & _on_picture(x0 + dx, y0 + dy, look, sure):
+    if _on_image(x0, y0, look, sure) & _on_image(x0 + dx, y0 + dy, look, sure):
         for i in range(look.samples):
             samples.index[i] = i
         return look.samples
@@ -954,7 +954,7 @@ def _collect_segment(place, look, samples):
     for i in range(look.samples):
         x, y = samples.x[i], samples.y[i]
         samples.index[n], samples.x[n], samples.y[n] = i, x, y
-        n += _on_picture(x, y, look, look.slack)
+        n += _on_image(x, y, look, look.slack)
     return n
 
 

@@ -63,7 +63,7 @@ def backward(
     fixed = torch.are_deterministic_algorithms_enabled()
     scales = _scales(query, key, value, upstream, statistics_upstream) if fixed else query.new_ones(2, dtype=counted)
     sums = torch.int64 if fixed else counted
-    pictures = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
+    images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
     points_out = query.new_zeros(b, *look.points.shape[1:], dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 1, dtype=counted)
@@ -71,14 +71,14 @@ def backward(
     _backward[_programs(query)](
         *inputs,
         *(statistics, saved[1], upstream, statistics_upstream, scales),
-        *(query_out, *pictures, points_out, bias_out),
+        *(query_out, *images, points_out, bias_out),
         **options,
         WANTS_BIAS=wanted[4],
         FIXED=fixed,
     )
     if fixed:
-        pictures = [(t.double() / s.double()).to(counted) for t, s in zip(pictures, scales)]
-    key_out, value_out = (t.to(query.dtype).permute(0, 3, 1, 2) for t in pictures)
+        images = [(t.double() / s.double()).to(counted) for t, s in zip(images, scales)]
+    key_out, value_out = (t.to(query.dtype).permute(0, 3, 1, 2) for t in images)
     found = (
         query_out.permute(0, 3, 1, 2),
         key_out,
@@ -108,8 +108,8 @@ def _accumulated(tensor: Tensor) -> torch.dtype:
     return torch.float64 if tensor.dtype == torch.float64 else torch.float32
 
 
-def _channels_last(picture: Tensor) -> Tensor:
-    return picture.permute(0, 2, 3, 1).contiguous()
+def _channels_last(image: Tensor) -> Tensor:
+    return image.permute(0, 2, 3, 1).contiguous()
 
 
 def _programs(query: Tensor) -> tuple[int]:
@@ -186,19 +186,19 @@ def _cell(x, y, height, width, NEAREST):
 
 
 @compiled
-def _rows(picture, pixel, channel, D, live, NUMBER):
-    return tl.load(picture + pixel[:, None] * D + channel[None, :], mask=live, other=0).to(NUMBER)
+def _rows(image, pixel, channel, D, live, NUMBER):
+    return tl.load(image + pixel[:, None] * D + channel[None, :], mask=live, other=0).to(NUMBER)
 
 
 @compiled
-def _dots(x, picture, pixel, across, below, channel, D, live, NEAREST, NUMBER):
+def _dots(x, image, pixel, across, below, channel, D, live, NEAREST, NUMBER):
     """Inner products with the four pixels around (with one, four times, if nearest)."""
-    a = tl.sum(x * _rows(picture, pixel, channel, D, live, NUMBER), 1)
+    a = tl.sum(x * _rows(image, pixel, channel, D, live, NUMBER), 1)
     if NEAREST:
         return a, a, a, a
-    b = tl.sum(x * _rows(picture, pixel + across, channel, D, live, NUMBER), 1)
-    c = tl.sum(x * _rows(picture, pixel + below, channel, D, live, NUMBER), 1)
-    d = tl.sum(x * _rows(picture, pixel + across + below, channel, D, live, NUMBER), 1)
+    b = tl.sum(x * _rows(image, pixel + across, channel, D, live, NUMBER), 1)
+    c = tl.sum(x * _rows(image, pixel + below, channel, D, live, NUMBER), 1)
+    d = tl.sum(x * _rows(image, pixel + across + below, channel, D, live, NUMBER), 1)
     return a, b, c, d
 
 
@@ -210,14 +210,14 @@ def _blend(a, b, c, d, u, v):
 
 
 @compiled
-def _blended(picture, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBER):
-    """The picture at the samples."""
-    a = _rows(picture, pixel, channel, D, live, NUMBER)
+def _blended(image, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBER):
+    """The image at the samples."""
+    a = _rows(image, pixel, channel, D, live, NUMBER)
     if NEAREST:
         return a
-    b = _rows(picture, pixel + across, channel, D, live, NUMBER)
-    c = _rows(picture, pixel + below, channel, D, live, NUMBER)
-    d = _rows(picture, pixel + across + below, channel, D, live, NUMBER)
+    b = _rows(image, pixel + across, channel, D, live, NUMBER)
+    c = _rows(image, pixel + below, channel, D, live, NUMBER)
+    d = _rows(image, pixel + across + below, channel, D, live, NUMBER)
     return _blend(a, b, c, d, u[:, None], v[:, None])
 
 
@@ -300,7 +300,7 @@ def _forward(
 
 @compiled
 def _add(out, pixel, weight, x, channel, D, live, scale, FIXED):
-    """Adds weight x to pixels of a picture."""
+    """Adds weight x to pixels of an image."""
     at = out + pixel[:, None] * D + channel[None, :]
     add = weight[:, None] * x
     if FIXED:

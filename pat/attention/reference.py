@@ -8,7 +8,7 @@ For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that 
     output   = sum_l weight_l V(x_l)
 
 (the physics-aware transformer, eq. 3 to 5: no scale, no position code). Shapes are written on the lines with
-b pictures, d channels, r rows of w alpha pixels, l samples. Alpha is worked off in bands of rows, so that
+b images, d channels, r rows of w alpha pixels, l samples. Alpha is worked off in bands of rows, so that
 without gradients no more than `BAND_BYTES` of gathered keys and values exist at a time.
 """
 
@@ -23,7 +23,7 @@ from arraygeom.segments import sample_fractions
 
 BAND_BYTES = 2**27
 EDGE_SLACK = 1e-3
-"""Samples this far (pixels) off the picture's area still count: rounding puts clipped ends there."""
+"""Samples this far (pixels) off the image's area still count: rounding puts clipped ends there."""
 LEAST_SPREAD = 1e-4
 """A spread (pixels) below this reads 0: it is rounding, and its derivative noise."""
 
@@ -73,7 +73,7 @@ def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor |
     """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
     accumulate = torch.float64 if query.dtype == torch.float64 else torch.float32
     with torch.autocast(query.device.type, enabled=False):
-        key, value = (pixels(picture.to(accumulate)) for picture in (key, value))
+        key, value = (pixels(plane.to(accumulate)) for plane in (key, value))
         bands = [
             _band(
                 query[:, :, top:bottom].to(accumulate).permute(0, 2, 3, 1),
@@ -86,8 +86,8 @@ def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor |
             for top, bottom in _bands(query, key, value, look.samples)
         ]
         out = Attended(*(torch.cat(part, 1) for part in zip(*bands)))
-    image = out.value.to(query.dtype).permute(0, 3, 1, 2)
-    return Attended(image, out.position.permute(0, 3, 1, 2), out.spread, out.peak)
+    value = out.value.to(query.dtype).permute(0, 3, 1, 2)
+    return Attended(value, out.position.permute(0, 3, 1, 2), out.spread, out.peak)
 
 
 def _bands(query: Tensor, key: Tensor, value: Tensor, samples: int) -> list[tuple[int, int]]:
@@ -97,15 +97,15 @@ def _bands(query: Tensor, key: Tensor, value: Tensor, samples: int) -> list[tupl
     return [(top, min(top + rows, ha)) for top in range(0, ha, rows)]
 
 
-def pixels(picture: Tensor) -> Tensor:
+def pixels(image: Tensor) -> Tensor:
     """Channels last: (b, d, h, w) to (b, h, w, d)."""
-    return picture.permute(0, 2, 3, 1).contiguous()
+    return image.permute(0, 2, 3, 1).contiguous()
 
 
 def _band(q: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
     b, r, w, _ = q.shape
     xy = look.positions().to(q.dtype)  # p r w l 2
-    counts = look.mask & on_picture(xy, hw=key.shape[1:3])  # p r w l
+    counts = look.mask & on_image(xy, hw=key.shape[1:3])  # p r w l
     xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, look.samples, 2)
     at = _nearest if nearest else _bilinear
 
@@ -117,27 +117,27 @@ def _band(q: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None
     return Attended(out, *_statistics(weight, xy))
 
 
-def on_picture(xy: Tensor, *, hw: tuple[int, int] | torch.Size) -> Tensor:
-    """Whether (..., 2) points lie on the picture's area, which reaches half a pixel beyond the border's
+def on_image(xy: Tensor, *, hw: tuple[int, int] | torch.Size) -> Tensor:
+    """Whether (..., 2) points lie on the image's area, which reaches half a pixel beyond the border's
     centres."""
     last = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5]) + EDGE_SLACK
     return ((xy >= -0.5 - EDGE_SLACK) & (xy <= last)).all(-1)
 
 
-def _nearest(picture: Tensor, xy: Tensor) -> Tensor:
+def _nearest(image: Tensor, xy: Tensor) -> Tensor:
     """(b, h, w, d) at (b, ..., 2): (b, ..., d), of the pixel on whose area the position lies."""
     x, y = (xy.detach() + 0.5).floor().long().unbind(-1)
-    h, w = picture.shape[1:3]
-    return _pick(picture, x.clamp(0, w - 1), y.clamp(0, h - 1))
+    h, w = image.shape[1:3]
+    return _pick(image, x.clamp(0, w - 1), y.clamp(0, h - 1))
 
 
-def _bilinear(picture: Tensor, xy: Tensor) -> Tensor:
+def _bilinear(image: Tensor, xy: Tensor) -> Tensor:
     """(b, h, w, d) at (b, ..., 2): (b, ..., d); beyond the border's centres the border's value."""
-    h, w = picture.shape[1:3]
+    h, w = image.shape[1:3]
     x0, x1, u = _cell(xy[..., 0], w)
     y0, y1, v = _cell(xy[..., 1], h)
-    upper = (1 - u) * _pick(picture, x0, y0) + u * _pick(picture, x1, y0)
-    lower = (1 - u) * _pick(picture, x0, y1) + u * _pick(picture, x1, y1)
+    upper = (1 - u) * _pick(image, x0, y0) + u * _pick(image, x1, y0)
+    lower = (1 - u) * _pick(image, x0, y1) + u * _pick(image, x1, y1)
     return (1 - v) * upper + v * lower
 
 
@@ -150,11 +150,11 @@ def _cell(c: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
     return index, (index + 1).clamp(max=n - 1), (c - lower)[..., None]
 
 
-def _pick(picture: Tensor, x: Tensor, y: Tensor) -> Tensor:
+def _pick(image: Tensor, x: Tensor, y: Tensor) -> Tensor:
     """The channels at integer pixels: (b, h, w, d) at (b, ...) gives (b, ..., d)."""
-    b, h, w, d = picture.shape
+    b, h, w, d = image.shape
     first = (torch.arange(b, device=x.device) * (h * w)).view(b, *[1] * (x.dim() - 1))
-    return picture.reshape(b * h * w, d)[first + y * w + x]
+    return image.reshape(b * h * w, d)[first + y * w + x]
 
 
 def _softmax(score: Tensor, counts: Tensor) -> Tensor:

@@ -224,7 +224,7 @@ def _attend_chunks(
 ) -> Attended:
     """Asks `look` for a piece of alpha at a time.
 
-    Segments are small: they are gathered for the whole picture. Explicit positions are used at once, and
+    Segments are small: they are gathered for the whole image. Explicit positions are used at once, and
     asked for again in backward.
     """
     ha, wa = query.shape[2:]

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from ..fusion.fuse import Plan, Tile
-    from ..fusion.results import FusedFrame
+    from ..fusion.results import Frame
 
 FIELDS: dict[str, Callable[[], ReceptiveField]] = {
     "epipolar": Epipolar,
@@ -54,7 +54,7 @@ console = Console(stderr=True, highlight=False)
 
 @dataclass
 class Demo:
-    """Fuse the sample array of the package; write picture, depth, confidence and a figure, print PSNR and SSIM."""
+    """Fuse the sample array of the package; write image, depth, confidence and a figure, print PSNR and SSIM."""
 
     out: Path = Path("out/demo")
     """Folder for the results."""
@@ -79,7 +79,7 @@ class Demo:
         written = save_frame(frame, self.out)
         report_figure(sample, baseline, frame, self.out / "demo.png")
         rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
-        scores = {name: score(picture.clamp(0, 1), sample.truth) for name, picture in rows.items()}
+        scores = {name: score(image.clamp(0, 1), sample.ground_truth) for name, image in rows.items()}
         lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]
         table = "\n".join(["                 PSNR    SSIM", *lines, ""])
         print(table, end="")
@@ -89,11 +89,11 @@ class Demo:
 
 @dataclass
 class Fuse:
-    """Fuse one frame: a rig file and a picture of each camera in, one picture at alpha's view out. Or many frames.
+    """Fuse one frame: a rig file and an image of each camera in, one image at alpha's view out. Or many frames.
 
     Example: pat fuse --rig rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the pictures, frames are fused one by one:
+    With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused one by one:
     the first of each camera, the second, and so on. With --sequence the cameras have clocks of their own (frame_rate
     and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
     """
@@ -117,9 +117,9 @@ class Fuse:
     match_levels: bool = False
     """Bring every beta to alpha's brightness and contrast first (other exposures, filters)."""
     bits: Literal[8, 16, 32] = 8
-    """Bits a channel of the fused picture: 8 or 16 coded as sRGB, or 32 for linear light as floats (tif, exr)."""
+    """Bits a channel of the fused image: 8 or 16 coded as sRGB, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
-    """Format of the fused picture."""
+    """Format of the fused image."""
     sequence: bool = False
     """Frames in the order of time, the cameras not synchronised; also writes a video."""
     frame_rate: UseAppendAction[tuple[str, ...]] = ()
@@ -135,7 +135,7 @@ class Fuse:
     resume: bool = False
     """Fuse only the frames that are not in --out; of a single frame, only the tiles that were not finished."""
     on_error: Literal["stop", "skip"] = "stop"
-    """What to do when a frame cannot be fused (a corrupt picture, a full disk): stop, or report it and go on."""
+    """What to do when a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on."""
     workers: int = 1
     """Processes on this machine, for many frames."""
     scheduler: str | None = None
@@ -145,7 +145,7 @@ class Fuse:
 
     def run(self) -> None:
         """Do it."""
-        from ..fusion.batch import find_pictures
+        from ..fusion.batch import find_images
         from ..support.memory import parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
@@ -155,8 +155,8 @@ class Fuse:
         rig = self._rig()
         files = dict(_name_and_file(text) for text in self.image)
         if len(files) < len(self.image):
-            raise ValueError("--image: a camera is given twice; give each camera one picture")
-        found = {rig.known(name): find_pictures(path, name=name) for name, path in files.items()}
+            raise ValueError("--image: a camera is given twice; give each camera one image")
+        found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
         if self.sequence or max(map(len, found.values())) > 1:
             return self._many(rig, found)
         self._one(rig, {name: paths[0] for name, paths in found.items()})
@@ -176,7 +176,7 @@ class Fuse:
         from ..fusion.results import save_frame, view_of
         from ..fusion.views import ViewFiles
 
-        images = ViewFiles(rig, files, alpha=rig.known(self.alpha))
+        images = ViewFiles(rig, files, alpha=rig.require(self.alpha))
         rig = images.developed
         store = self.out / ".tiles"
         if not self.resume:
@@ -203,7 +203,7 @@ class Fuse:
         batch = Batch(
             rig,
             files,
-            rig.known(self.alpha),
+            rig.require(self.alpha),
             self.out,
             weights=self.weights,
             sequence=self.sequence,
@@ -230,9 +230,9 @@ class Fuse:
 
 @dataclass
 class Evaluate:
-    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR and SSIM, tables and pictures.
+    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR and SSIM, tables and images.
 
-    The left picture made grey is alpha, the right one, reduced, is beta, the left one in colour is the truth.
+    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the truth.
     Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
     """
 
@@ -251,7 +251,7 @@ class Evaluate:
     controls: bool = False
     """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must fall."""
     out: Path = Path("out/evaluate")
-    """Folder for scores.md, scores.csv and, for each data set, a strip of pictures a pair."""
+    """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
     weights: str = "mono-colour"
     """Name of weights in the package, or a file."""
 
@@ -274,7 +274,7 @@ class Evaluate:
 
         folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
         if not folders:
-            raise ValueError(f"no pictures: give at least one of --{', --'.join(DATA_SETS)}")
+            raise ValueError(f"no images: give at least one of --{', --'.join(DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         network, bands = load_weights(self.weights), PROTOCOLS[self.protocol]
@@ -286,7 +286,7 @@ class Evaluate:
         write_text(self.out / "scores.md", text)
         write_csv(self.out / "scores.csv", every)
         print(text, end="")
-        console.print(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, pictures in {self.out}")
+        console.print(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 
 
 @dataclass
@@ -306,7 +306,7 @@ class Ablate:
     scenes: int = 12
     """How many scenes."""
     hw: tuple[int, int] = (240, 320)
-    """Height and width of both pictures."""
+    """Height and width of both images."""
     seed: int = 0
     """Of the scenes."""
     out: Path = Path("out/ablate")
@@ -330,7 +330,7 @@ class Ablate:
 
 @dataclass
 class Showcase:
-    """Fuse real pictures: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
+    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
 
     data: Path
     """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
@@ -356,7 +356,7 @@ class Show:
     alpha: str | None = None
     """The camera to look from; by default the first."""
     image: UseAppendAction[tuple[str, ...]] = ()
-    """NAME=FILE: pictures to draw on, if wanted."""
+    """NAME=FILE: images to draw on, if wanted."""
     out: Path = Path("out/show")
     """Folder for rig.png (cameras in space; if calibrated) and fields.png (where some pixels look)."""
 
@@ -369,9 +369,9 @@ class Show:
         from ..media.images import read_image
 
         rig = Rig.load(self.rig)
-        alpha = rig.known(self.alpha or rig.names[0])
+        alpha = rig.require(self.alpha or rig.names[0])
         files = dict(_name_and_file(text) for text in self.image)
-        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        images = {rig.require(name): read_image(path, name=name) for name, path in files.items()}
         written = []
         if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
             written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
@@ -393,7 +393,7 @@ class Explore:
     image: UseAppendAction[tuple[str, ...]]
     """NAME=FILE, once for each camera."""
     alpha: str | None = None
-    """The camera to click in; by default the first with a picture."""
+    """The camera to click in; by default the first with an image."""
     port: int = 0
     """Port on localhost; 0 takes a free one."""
     browser: bool = True
@@ -409,7 +409,7 @@ class Explore:
             raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
         rig = Rig.load(self.rig)
         files = dict(_name_and_file(text) for text in self.image)
-        images = {rig.known(name): read_image(path, name=name) for name, path in files.items()}
+        images = {rig.require(name): read_image(path, name=name) for name, path in files.items()}
         serve(rig, images, alpha=self.alpha, port=self.port, browser=self.browser)
 
 
@@ -417,7 +417,7 @@ class Explore:
 class Train:
     """Train weights by a recipe, on scenes made from photographs while training; see `pat train --help`.
 
-    Example: pat train mono-colour-small --photos ~/pictures --out runs/mine --minutes 60
+    Example: pat train mono-colour-small --photos ~/images --out runs/mine --minutes 60
     """
 
     config: TrainConfig
@@ -433,12 +433,12 @@ class Train:
 class Calibrate:
     """Photographs of a board in, a rig out, with a report of how good it is.
 
-    A folder for each camera, or file names like left01.jpg, right01.jpg; pictures of one moment have the same number.
+    A folder for each camera, or file names like left01.jpg, right01.jpg; images of one moment have the same number.
     Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
     """
 
     photos: Positional[Path]
-    """Folder with the pictures (or videos) of all cameras."""
+    """Folder with the images (or videos) of all cameras."""
     board: str
     """charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm or acircles:4x11:20mm."""
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("rig.yaml")
@@ -528,12 +528,12 @@ class Render:
 
 @dataclass
 class DataShow:
-    """Draw samples of rendered scenes: recorded pictures, where some pixels look, truth and depth."""
+    """Draw samples of rendered scenes: recorded images, where some pixels look, truth and depth."""
 
     folder: Positional[Path]
     """Folder that `pat render` made."""
     out: Path = Path("out/data.png")
-    """Picture to write."""
+    """Image to write."""
     samples: int = 6
     """How many patches."""
     alpha: str | None = None
@@ -654,9 +654,9 @@ class Convert:
 
 @dataclass
 class Doctor:
-    """Find the usual mistakes in a rig, by features matched between one picture of each camera.
+    """Find the usual mistakes in a rig, by features matched between one image of each camera.
 
-    Half-pixel and one-pixel shifts, R transposed, pose inverted, units, cameras swapped, pictures resized, cropped,
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, units, cameras swapped, images resized, cropped,
     turned or mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
     Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --fix better.yaml
     """
@@ -675,7 +675,7 @@ class Doctor:
         from calib.images.doctor import diagnose
 
         rig = Rig.load(self.rig)
-        found = diagnose(rig, named_pictures(rig, self.image))
+        found = diagnose(rig, named_images(rig, self.image))
         print(found.as_json() if self.json else found.as_text())
         if self.fix is not None and found.named.kind != "nothing":
             found.repaired.save(self.fix)
@@ -686,7 +686,7 @@ class Doctor:
 
 @dataclass
 class Refine:
-    """Improve a rig by ordinary pictures of its cameras: points matched between them, then the fusion's own error.
+    """Improve a rig by ordinary images of its cameras: points matched between them, then the fusion's own error.
 
     Points that were held out decide: no rig is written unless they come nearer to their lines.
     Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
@@ -730,7 +730,7 @@ class Refine:
 
 @dataclass
 class Start:
-    """Make a rig from pictures alone: fundamental matrices and rough maps, good enough to fuse with.
+    """Make a rig from images alone: fundamental matrices and rough maps, good enough to fuse with.
 
     Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
     """
@@ -788,7 +788,7 @@ class SystemsList:
 
 @dataclass
 class SystemsRun:
-    """Render a scene for an array, record it, fuse it, compare with the truth: PSNR, SSIM and pictures.
+    """Render a scene for an array, record it, fuse it, compare with the truth: PSNR, SSIM and images.
 
     Example: pat systems run fast-slow --out out/fast-slow
     """
@@ -798,7 +798,7 @@ class SystemsRun:
     full: bool = False
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
     photos: Path | None = None
-    """Folder of photographs for the scene's surfaces; by default patterns and pictures that scikit-image ships."""
+    """Folder of photographs for the scene's surfaces; by default patterns and images that scikit-image ships."""
     recording: Path | None = None
     """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
     out: Path | None = None
@@ -870,7 +870,7 @@ Command = (
 )
 
 
-def fuse_frame(weights: str, rig: Rig, images: Mapping[str, Tensor], **options: Any) -> FusedFrame:
+def fuse_frame(weights: str, rig: Rig, images: Mapping[str, Tensor], **options: Any) -> Frame:
     """`pat.fusion.fuse.fuse` with named weights, and a bar on the terminal."""
     from ..fusion.fuse import fuse
     from ..networks.weights import load_weights
@@ -889,34 +889,34 @@ def _numbers(values: tuple[float, float] | None, between: str = ", ") -> str:
 
 
 def _spread_out(hw: tuple[int, int]) -> Tensor:
-    """Twelve pixels (12, 2) spread over a picture."""
+    """Twelve pixels (12, 2) spread over an image."""
     from arraygeom import pixel_grid
 
     spots = (pixel_grid((3, 4)) + 0.5) / pixel_grid((3, 4)).new_tensor([4, 3])
     return (spots * spots.new_tensor([hw[1], hw[0]])).floor().reshape(-1, 2)
 
 
-def named_pictures(rig: Rig, texts: Iterable[str]) -> dict[str, Tensor]:
-    """The pictures of `--image NAME=FILE`, by camera. Raises ValueError for a camera given twice, or not of the rig."""
+def named_images(rig: Rig, texts: Iterable[str]) -> dict[str, Tensor]:
+    """The images of `--image NAME=FILE`, by camera. Raises ValueError for a camera given twice, or not of the rig."""
     from ..media.images import read_image
 
-    return {rig.known(name): read_image(path, name=name) for name, path in _files_by_name(texts).items()}
+    return {rig.require(name): read_image(path, name=name) for name, path in _files_by_name(texts).items()}
 
 
 def frames_of(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
-    """The pictures of `--image NAME=FILE`, a camera's first in the first frame, its second in the second, and so on.
+    """The images of `--image NAME=FILE`, a camera's first in the first frame, its second in the second, and so on.
 
-    Raises ValueError for cameras with unlike numbers of pictures.
+    Raises ValueError for cameras with unlike numbers of images.
     """
     from ..media.images import read_image
 
     files: dict[str, list[Path]] = {}
     for name, path in map(_name_and_file, texts):
-        files.setdefault(rig.known(name), []).append(path)
+        files.setdefault(rig.require(name), []).append(path)
     counts = {name: len(paths) for name, paths in files.items()}
     if len(set(counts.values())) > 1:
         spoken = ", ".join(f"'{name}' {count}" for name, count in counts.items())
-        raise ValueError(f"--image: every camera needs a picture of every frame; given are {spoken}")
+        raise ValueError(f"--image: every camera needs an image of every frame; given are {spoken}")
     frames = zip(*files.values())
     return [{n: read_image(path, name=n) for n, path in zip(files, frame)} for frame in frames]
 
@@ -924,7 +924,7 @@ def frames_of(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
 def _files_by_name(texts: Iterable[str]) -> dict[str, Path]:
     pairs = [_name_and_file(text) for text in texts]
     if len(dict(pairs)) < len(pairs):
-        raise ValueError("--image: a camera is given twice; give each camera one picture")
+        raise ValueError("--image: a camera is given twice; give each camera one image")
     return dict(pairs)
 
 
@@ -960,7 +960,7 @@ def _command(arguments: list[str]) -> Any:
     return tyro.cli(
         Command,  # type: ignore[arg-type]
         prog="pat",
-        description="Fuse the pictures of an array of unlike cameras into one. --debug shows an error's traceback.",
+        description="Fuse the images of an array of unlike cameras into one. --debug shows an error's traceback.",
         args=arguments,
     )
 

@@ -1,6 +1,6 @@
 """Makes the sample array that ships in pat/data/sample: `python -m pat.data.make_sample`.
 
-Its textures are patterns and pictures that scikit-image ships, free to use (astronaut: NASA; chelsea, coffee and
+Its textures are patterns and images that scikit-image ships, free to use (astronaut: NASA; chelsea, coffee and
 rocket: CC0).
 """
 
@@ -28,7 +28,7 @@ from ..synthesis.photos import PhotoBank
 from ..synthesis.rigs import RigBatch, RigDistribution
 
 HW = (400, 640)
-PICTURES = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")
+IMAGE_SUFFIXES = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")
 
 
 def sample_cameras() -> dict[str, Camera]:
@@ -47,26 +47,26 @@ def sample_cameras() -> dict[str, Camera]:
 
 def photographs() -> list[np.ndarray]:
     """The textures (H, W, 3), uint8."""
-    return [io.imread(Path(data_dir) / name)[..., :3] for name in PICTURES]
+    return [io.imread(Path(data_dir) / name)[..., :3] for name in IMAGE_SUFFIXES]
 
 
 def main(out: Path = SAMPLE, seed: int = 2) -> None:
-    """Render a layered scene with the sample rig, record it, and write rig, pictures and truth."""
+    """Render a layered scene with the sample rig, record it, and write rig, images and truth."""
     cameras = sample_cameras()
     rig = Rig(cameras, depth=depth_range(1.4, 20.0), name="sample: mono + colour")
     generator = torch.Generator().manual_seed(seed)
-    pictures = photographs()
-    bank = PhotoBank(pictures + patterns(np.random.default_rng(seed), 4), photos=len(pictures))
+    images = photographs()
+    bank = PhotoBank(images + patterns(np.random.default_rng(seed), 4), photos=len(images))
     scenes = LayeredScenes(bank, RigDistribution(), hw=HW, layers=(9, 12), seed=seed)
     near, far = (torch.tensor([d], dtype=torch.float64) for d in (1.6, 16.0))
     views = scenes.render(RigBatch([_batched(c) for c in cameras.values()], near, far), generator, oversampling=2)
-    truth, seen = views.images
-    mono = record(luminance(truth), [Noise(8000, 3), Clip(), Quantise(8)], generator).image
+    ground_truth, seen = views.images
+    mono = record(luminance(ground_truth), [Noise(8000, 3), Clip(), Quantise(8)], generator).image
     colour = record(seen, [Noise(4000, 3), Clip(), Quantise(8)], generator).image
     out.mkdir(parents=True, exist_ok=True)
     rig.save(out / "rig.yaml")
-    for name, picture in {ALPHA: mono, BETA: colour, "truth": truth}.items():
-        write_image(out / f"{name}.png", picture[0])
+    for name, image in {ALPHA: mono, BETA: colour, "truth": ground_truth}.items():
+        write_image(out / f"{name}.png", image[0])
 
 
 def _batched(camera: Camera) -> Camera:

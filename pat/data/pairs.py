@@ -38,7 +38,7 @@ class Calibration(NamedTuple):
 
 @dataclass(frozen=True)
 class StereoPair:
-    """Two pictures, 0..1, grey or RGB, and what is known about them.
+    """Two images, 0..1, grey or RGB, and what is known about them.
 
     `max_disparity` is in pixels of left, None for a pair that is not rectified.
     """
@@ -64,7 +64,7 @@ class _Middlebury(NamedTuple):
 
     left: str
     right: str
-    truth: str
+    ground_truth: str
     scale: int
 
 
@@ -86,12 +86,12 @@ LEFT_AND_RIGHT = (
     ("im2.", "im6."),
     ("im0.", "im1."),
 )
-"""What marks the left picture's path, and what stands in its place in the right one's."""
+"""What marks the left image's path, and what stands in its place in the right one's."""
 
 PAPER_DISPARITY = 120.0
 """How far the paper looks in a rectified pair, in pixels of left; taken where a data set does not say."""
 
-PICTURES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm"}
+IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".ppm", ".pgm"}
 
 
 def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
@@ -111,7 +111,7 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
 def kitti_pairs(root: str | Path) -> Iterator[StereoPair]:
     """Colour KITTI pairs: image_2 / image_3, colored_0 / colored_1, or left.png / right.png.
 
-    With a `calib.txt` beside the pictures or above them that has P2 and P3, the pair has its calibration.
+    With a `calib.txt` beside the images or above them that has P2 and P3, the pair has its calibration.
     """
     return (_with_kitti_calibration(pair, file) for pair, file in _pairs_and_files(root))
 
@@ -160,11 +160,11 @@ def _folder(root: str | Path) -> Path:
 
 
 def _no_pair(root: Path) -> ValueError:
-    return ValueError(f"{root}: holds no stereo pair: check the folder and how its pictures are named")
+    return ValueError(f"{root}: holds no stereo pair: check the folder and how its images are named")
 
 
 def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:
-    """Left pictures in folders of Middlebury's collections, in order."""
+    """Left images in folders of Middlebury's collections, in order."""
     return sorted(
         (file, layout)
         for key, layout in MIDDLEBURY.items()
@@ -174,7 +174,7 @@ def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:
 
 
 def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
-    coded = read_image(left.with_name(layout.truth))[0] * 255
+    coded = read_image(left.with_name(layout.ground_truth))[0] * 255
     return StereoPair(
         left.parent.relative_to(root).as_posix(),
         read_image(left),
@@ -202,8 +202,8 @@ def _rectified_pair(root: Path, left: Path, right: Path, max_disparity: float) -
 
 
 def _right_of(left: Path, root: Path) -> list[Path]:
-    """The right picture of `left`, or nothing."""
-    if left.suffix.lower() not in PICTURES:
+    """The right image of `left`, or nothing."""
+    if left.suffix.lower() not in IMAGE_SUFFIXES:
         return []
     before, inside = root.as_posix(), left.as_posix()[len(root.as_posix()) :]
     rights = (Path(before + mark[1].join(inside.rsplit(mark[0], 1))) for mark in LEFT_AND_RIGHT if mark[0] in inside)
@@ -242,14 +242,14 @@ def _syntim_pair(left: Path) -> StereoPair:
     (K_left, R_left, t_left), (K_right, R_right, t_right) = cameras
     R = R_right @ R_left.mT
     calibration = Calibration(K_left, K_right, R, t_right - R @ t_left)
-    pictures = read_image(left), read_image(_syntim_right(left))
-    return StereoPair(left.stem.replace("0_", "_"), *pictures, calibration=calibration)
+    images = read_image(left), read_image(_syntim_right(left))
+    return StereoPair(left.stem.replace("0_", "_"), *images, calibration=calibration)
 
 
 def _read_syntim(file: Path) -> tuple[Tensor, Tensor, Tensor]:
     """K, R and t of X_cam = R X_world + t in metres, from a file of x_cam = R^T (X - t) in millimetres."""
     if not file.is_file():
-        raise FileNotFoundError(f"{file}: no such calibration: it should be beside the pictures")
+        raise FileNotFoundError(f"{file}: no such calibration: it should be beside the images")
     text = file.read_text()
     values = [float(x) for x in re.findall(r"[-+]?\d+\.\d+(?:[eE][-+]?\d+)?", text)]
     if len(values) != 17:

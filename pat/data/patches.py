@@ -24,7 +24,7 @@ from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig, middle_depth
 from arraygeom.sampling import sample
-from pat.synthesis.rendered import RENDER_FILE, Frame, Rendered, is_rendered
+from pat.synthesis.rendered import RENDER_FILE, Rendered, RenderedFrame, is_rendered
 
 PAPER_WIDTH = 2048
 
@@ -45,7 +45,7 @@ class Patches:
 
     @classmethod
     def like_the_papers(cls, hw: HW) -> Patches:
-        """96x32 patches that cover of a picture of this size what the paper's cover of its own.
+        """96x32 patches that cover of an image of this size what the paper's cover of its own.
 
         >>> Patches.like_the_papers((384, 512))
         Patches(hw=(32, 96), grid=(7, 7), reduce=1)
@@ -55,14 +55,14 @@ class Patches:
 
     @property
     def count(self) -> int:
-        """How many there are of one picture."""
+        """How many there are of one image."""
         return self.grid[0] * self.grid[1]
 
     def corners(self, hw: HW) -> list[tuple[int, int]]:
-        """(top, left) of each. Raises ValueError for a picture that is smaller than a patch."""
+        """(top, left) of each. Raises ValueError for an image that is smaller than a patch."""
         if hw[0] < self.hw[0] or hw[1] < self.hw[1]:
             raise ValueError(
-                f"patches of {self.hw[1]}x{self.hw[0]} do not fit into a picture of {hw[1]}x{hw[0]}: give smaller ones"
+                f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image of {hw[1]}x{hw[0]}: give smaller ones"
             )
         tops, lefts = (_spread(whole - part, n) for whole, part, n in zip(hw, self.hw, self.grid))
         return [(top, left) for top in tops for left in lefts]
@@ -119,7 +119,7 @@ def scene_rig(folder: Path) -> Rig:
 def cut(folder: Path, patches: Patches, *, alpha: str) -> Stack:
     """All patches of a scene.
 
-    Raises ValueError, naming the folder, for pictures that cannot be read, patches that do not fit, and a rig
+    Raises ValueError, naming the folder, for images that cannot be read, patches that do not fit, and a rig
     that is not calibrated.
     """
     rig = scene_rig(folder)
@@ -160,23 +160,25 @@ def _windows(rig: Rig, alpha: str, patches: Patches) -> dict[str, tuple[Corners,
 
 
 def _placed(x: list[float], hw: HW, whole: HW) -> tuple[int, int]:
-    """(top, left) of a window about x, moved into the picture."""
+    """(top, left) of a window about x, moved into the image."""
     top, left = (round(x[1] - (hw[0] - 1) / 2), round(x[0] - (hw[1] - 1) / 2))
     return min(max(top, 0), whole[0] - hw[0]), min(max(left, 0), whole[1] - hw[1])
 
 
 def _beta_size(alpha: Camera, beta: Camera, patches: Patches) -> HW:
-    """About alpha's angle of view, a multiple of the reduction, and within beta's picture."""
+    """About alpha's angle of view, a multiple of the reduction, and within beta's image."""
     ratio = [float(beta.K[i, :2].norm() / alpha.K[i, :2].norm()) for i in (1, 0)]
     r = patches.reduce
     sides = [max(round(n * s / r), 1) * r for n, s in zip(patches.hw, ratio)]
     h, w = (min(side, whole // r * r) for side, whole in zip(sides, beta.hw))
     if min(h, w) < r:
-        raise ValueError(f"a picture of {beta.hw[1]}x{beta.hw[0]} is too small for patches reduced {r} times")
+        raise ValueError(f"an image of {beta.hw[1]}x{beta.hw[0]} is too small for patches reduced {r} times")
     return h, w
 
 
-def _cut_view(camera: Camera, frame: Frame, corners: Corners, hw: HW, reduce: int) -> tuple[Tensor, Tensor, Camera]:
+def _cut_view(
+    camera: Camera, frame: RenderedFrame, corners: Corners, hw: HW, reduce: int
+) -> tuple[Tensor, Tensor, Camera]:
     windows = [camera.crop(top, left, hw) for top, left in corners]
     small = hw[0] // reduce, hw[1] // reduce
     rgb = torch.stack([frame.rgb[:, top : top + hw[0], left : left + hw[1]] for top, left in corners])
@@ -246,11 +248,11 @@ def stacked(rigs: list[Rig]) -> Rig:
 
 
 def same_cameras(one: Rig, other: Rig) -> None:
-    """Raises ValueError unless two rigs have the same cameras with pictures of the same sizes."""
+    """Raises ValueError unless two rigs have the same cameras with images of the same sizes."""
     sizes = [{name: f"{c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items()} for rig in (one, other)]
     if sizes[0] != sizes[1]:
         said = [", ".join(f"{name} {wh}" for name, wh in s.items()) for s in sizes]
-        raise ValueError(f"has pictures of other sizes than the first ({said[1]}; first: {said[0]}): one rig a folder")
+        raise ValueError(f"has images of other sizes than the first ({said[1]}; first: {said[0]}): one rig a folder")
 
 
 def _stack(cameras: list[Camera]) -> Camera:

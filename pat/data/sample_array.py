@@ -24,7 +24,7 @@ class SampleArray(NamedTuple):
 
     rig: Rig
     images: dict[str, Tensor]
-    truth: Float[Tensor, "3 h w"]
+    ground_truth: Float[Tensor, "3 h w"]
 
 
 def load_sample() -> SampleArray:

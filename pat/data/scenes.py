@@ -43,12 +43,12 @@ class Patch:
     """What the cameras record of a patch, and the truth; one, or a batch of them.
 
     `images` are coded as the chains leave them (sRGB by default), by camera, alpha first; `rig` is that of those
-    pictures. `truth` is alpha's ideal view in colour (sRGB, 0..1), and `depth` its depth in metres, both on the
+    images. `truth` is alpha's ideal view in colour (sRGB, 0..1), and `depth` its depth in metres, both on the
     grid that alpha had before its chain.
     """
 
     images: dict[str, Float[Tensor, "*b _ _ _"]]
-    truth: Float[Tensor, "*b 3 h w"]
+    ground_truth: Float[Tensor, "*b 3 h w"]
     depth: Float[Tensor, "*b h w"]
     rig: Rig
     alpha: str
@@ -80,7 +80,7 @@ class ScenePatches(Dataset[Patch]):
         self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
         self.chains = default_chains(self.scenes.rig) if chains is None else chains
         for name in self.chains:
-            self.scenes.rig.known(name)
+            self.scenes.rig.require(name)
         self.cases, self.seed, self.epoch = cases, seed, 0
 
     def __len__(self) -> int:
@@ -104,7 +104,7 @@ class ScenePatches(Dataset[Patch]):
         recorded = record_array(rgb, rig, self._chains(alpha, seed), seed=seed, depth=depth)
         return Patch(
             images={name: recorded.images[name][0] for name in (alpha, *rig.betas(alpha))},
-            truth=coded(rgb[alpha])[0],
+            ground_truth=coded(rgb[alpha])[0],
             depth=depth[alpha][0],
             rig=recorded.rig,
             alpha=alpha,
@@ -126,7 +126,7 @@ class SceneStacks:
         self.folders = scene_folders(root)
         self._kept: OrderedDict[int, Stack] = OrderedDict()
         self.rig = scene_rig(self.folders[0])
-        self.alpha = self.rig.known(alpha or self.rig.names[0])
+        self.alpha = self.rig.require(alpha or self.rig.names[0])
         self.patches = patches or Patches.like_the_papers(self.rig[self.alpha].hw)
 
     def __len__(self) -> int:
@@ -170,7 +170,7 @@ def collate(patches: Sequence[Patch]) -> Patch:
     first = patches[0]
     return Patch(
         images={name: torch.stack([p.images[name] for p in patches]) for name in first.images},
-        truth=torch.stack([p.truth for p in patches]),
+        ground_truth=torch.stack([p.ground_truth for p in patches]),
         depth=torch.stack([p.depth for p in patches]),
         rig=stacked([p.rig for p in patches]),
         alpha=first.alpha,
@@ -193,7 +193,7 @@ class RenderedScenes:
         self._pool: list[int] = []
 
     def sample(self, batch: int, generator: Generator) -> ArrayBatch:
-        """Ideal pictures (sRGB) of alpha and betas with their truth; all cameras are pinholes."""
+        """Ideal images (sRGB) of alpha and betas with their truth; all cameras are pinholes."""
         self._exchange(batch, generator)
         count = self.scenes.patches.count
         drawn = [(self._pool[_draw(len(self._pool), generator)], _draw(count, generator)) for _ in range(batch)]
@@ -227,7 +227,7 @@ def _draw(below: int, generator: Generator) -> int:
 
 
 def coded(rgb: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Linear light as an sRGB picture."""
+    """Linear light as an sRGB image."""
     return record(rgb, [Clip(), Coded()], Generator()).image
 
 

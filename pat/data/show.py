@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from arraygeom.fields import ReceptiveField
-from arraygeom.viz import COLOURS, draw_look, numpy, show_picture, suitable_field
+from arraygeom.viz import COLOURS, draw_look, numpy, show_image, suitable_field
 from pat.fusion.results import colour_depth
 
 from .scenes import Patch
@@ -22,28 +22,30 @@ LOOKS = 6
 def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = None) -> Figure:
     """One line for each patch: alpha and betas as recorded with a few pixels' fields, truth, depth."""
     columns = len(patches[0].images) + 2
-    h, w = patches[0].truth.shape[-2:]
+    h, w = patches[0].ground_truth.shape[-2:]
     figure = Figure(figsize=(3.2 * columns, (3.2 * h / w + 0.35) * len(patches)), layout="constrained")
     for row, patch in enumerate(patches):
         x = _spots(patch.rig[patch.alpha].hw)
         for column, (name, image) in enumerate(patch.images.items()):
             axes = figure.add_subplot(len(patches), columns, row * columns + column + 1)
-            show_picture(axes, patch.rig[name].hw, image.expand(3, -1, -1).clamp(0, 1))
+            show_image(axes, patch.rig[name].hw, image.expand(3, -1, -1).clamp(0, 1))
             axes.set_title(f"{name} (alpha)" if column == 0 else name, fontsize=8)
             if column == 0:
                 axes.scatter(*numpy(x).T, c=COLOURS[: len(x)], s=18, edgecolors="white", linewidths=0.6)
             else:
                 pair = patch.rig.pair(patch.alpha, name)
                 draw_look(axes, field or suitable_field(pair), pair, x)
-        for column, (title, image) in enumerate({"truth": patch.truth, "depth": colour_depth(patch.depth)}.items()):
+        for column, (title, image) in enumerate(
+            {"truth": patch.ground_truth, "depth": colour_depth(patch.depth)}.items()
+        ):
             axes = figure.add_subplot(len(patches), columns, row * columns + columns - 1 + column)
-            show_picture(axes, (image.shape[-2], image.shape[-1]), image)
+            show_image(axes, (image.shape[-2], image.shape[-1]), image)
             axes.set_title(title, fontsize=8)
     return figure
 
 
 def _spots(hw: tuple[int, int]) -> Float[Tensor, "n 2"]:
-    """A few pixels spread over a picture, in a zigzag."""
+    """A few pixels spread over an image, in a zigzag."""
     across = (torch.arange(LOOKS) + 0.5) / LOOKS * hw[1]
     down = torch.tensor([0.25, 0.75]).repeat(LOOKS)[:LOOKS] * hw[0]
     return torch.stack([across, down], -1).floor()

@@ -46,7 +46,7 @@ from arraygeom import (
 from arraygeom.atomic import write_text
 from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
-from arraygeom.segments import clip_to_picture
+from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
 from ..fusion.results import save_figure
@@ -66,21 +66,21 @@ ALPHA, BETA = "alpha", "beta"
 RIGS = RigDistribution(
     mode="general", parallax=(8.0, 60.0), focal_ratio=(1 / 3, 1.0), resolutions=(1.0,), rotation=3.0, decentring=0.05
 )
-"""Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, in pictures of equal sizes."""
+"""Rigs of the layered scenes: beta's focal length is 1/3 to 1 of alpha's, in images of equal sizes."""
 DENSE_LIMIT = 2**31
-"""Bytes that explicit positions may take; the dense field of larger pictures is left out."""
+"""Bytes that explicit positions may take; the dense field of larger images is left out."""
 RATIOS = (1.0, 1.5, 2.0, 3.0)
 """Groups of focal ratios in the table."""
 CROP = 96
 
 
 class Case(NamedTuple):
-    """One scene: the rig, the recorded pictures, alpha's view in true colour, and its depth in metres."""
+    """One scene: the rig, the recorded images, alpha's view in true colour, and its depth in metres."""
 
     name: str
     rig: Rig
     images: dict[str, Tensor]
-    truth: Tensor
+    ground_truth: Tensor
     depth: Tensor
 
     @property
@@ -100,7 +100,7 @@ class Family:
 
 @dataclass(frozen=True)
 class Row:
-    """One family on one scene: the picture, and how far off in beta the depth puts alpha's pixels.
+    """One family on one scene: the image, and how far off in beta the depth puts alpha's pixels.
 
     `within_one` is the share of pixels that are within one pixel of beta of where they should be. `note` says why
     there are no figures, where there are none.
@@ -123,33 +123,33 @@ class Horizontal:
     The run is +-`reach` pixels along x around H x.
     """
 
-    reach: float
+    disparity: float
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
         """Horizontal segments of beta around H x."""
         centre, placed = apply_homography(pair.homography, x)
-        step = centre.new_tensor([self.reach, 0.0])
-        found = clip_to_picture(centre + step, centre - step, pair.beta.hw)
+        step = centre.new_tensor([self.disparity, 0.0])
+        found = clip_to_image(centre + step, centre - step, pair.beta.hw)
         return Segments(found.start, found.end, found.valid & placed)
 
 
 def families() -> dict[str, Family]:
     """Every family by name, `calibrated` first."""
     exact = {
-        "calibrated": Family(lambda reach: Epipolar()),
-        "rectified assumption": Family(lambda reach: Rectified(2 * reach, alpha_is="either")),
+        "calibrated": Family(lambda disparity: Epipolar()),
+        "rectified assumption": Family(lambda disparity: Rectified(2 * disparity, alpha_is="either")),
         "rows around H x": Family(Horizontal),
         "homography + displacement": Family(HomographyDisplacement),
-        "nearest voxels": Family(lambda reach: NearestVoxels()),
-        "local 5x5": Family(lambda reach: Local()),
-        "dense": Family(lambda reach: Dense()),
+        "nearest voxels": Family(lambda disparity: NearestVoxels()),
+        "local 5x5": Family(lambda disparity: Local()),
+        "dense": Family(lambda disparity: Dense()),
     }
-    turned = {f"turned by {a:g} deg": Family(lambda reach: Epipolar(), _turned(a)) for a in (0.1, 0.3, 1.0)}
-    moved = {f"centre off by {p:g} px": Family(lambda reach: Epipolar(), _decentred(p)) for p in (1.0, 3.0, 10.0)}
+    turned = {f"turned by {a:g} deg": Family(lambda disparity: Epipolar(), _turned(a)) for a in (0.1, 0.3, 1.0)}
+    moved = {f"centre off by {p:g} px": Family(lambda disparity: Epipolar(), _decentred(p)) for p in (1.0, 3.0, 10.0)}
     return exact | turned | moved
 
 
-def reach(network: FusionNetwork, pair: Pair) -> float:
+def disparity(network: FusionNetwork, pair: Pair) -> float:
     """How far from H x points can be, pixels of beta as the network gets it."""
     scale = pitch_ratio(pair)
     resized = network.equal_pitch and not 0.8 < scale < 1.25
@@ -164,9 +164,9 @@ def layered_cases(
     scenes, g = LayeredScenes(bank, rigs, hw=hw, seed=seed), Generator().manual_seed(seed)
     for number in range(count):
         made = scenes.sample(1, g)
-        truth, seen = (image[0] for image in made.images)
+        ground_truth, seen = (image[0] for image in made.images)
         cameras = {name: _single(camera) for name, camera in zip((ALPHA, BETA), made.cameras)}
-        yield _recorded(f"scene {number}", Rig(cameras), truth, seen, made.depth[0][0], g)
+        yield _recorded(f"scene {number}", Rig(cameras), ground_truth, seen, made.depth[0][0], g)
 
 
 def rendered_cases(folder: Path, *, alpha: str | None = None, beta: str | None = None, seed: int = 0) -> Iterator[Case]:
@@ -185,21 +185,23 @@ def rendered_cases(folder: Path, *, alpha: str | None = None, beta: str | None =
 
 def _rendered_case(name: str, folder: Path, alpha: str | None, beta: str | None, g: Generator) -> Case:
     scene = Rendered(folder)
-    first = scene.rig.known(alpha or scene.rig.names[0])
-    second = scene.rig.known(beta or next(n for n in scene.rig.names if n != first))
+    first = scene.rig.require(alpha or scene.rig.names[0])
+    second = scene.rig.require(beta or next(n for n in scene.rig.names if n != first))
     frames = [scene.frame(name) for name in (first, second)]
-    truth, seen = (record(f.rgb[None], [Clip(), Coded()], g).image[0] for f in frames)
+    ground_truth, seen = (record(f.rgb[None], [Clip(), Coded()], g).image[0] for f in frames)
     rig = Rig({ALPHA: scene.rig[first], BETA: scene.rig[second]})
-    return _recorded(name, rig, truth, seen, frames[0].depth, g)
+    return _recorded(name, rig, ground_truth, seen, frames[0].depth, g)
 
 
-def _recorded(name: str, rig: Rig, truth: Tensor, seen: Tensor, depth: Tensor, g: Generator) -> Case:
-    """The case of two ideal pictures: some noise, a depth range a little wider than the scene's."""
+def _recorded(name: str, rig: Rig, ground_truth: Tensor, seen: Tensor, depth: Tensor, g: Generator) -> Case:
+    """The case of two ideal images: some noise, a depth range a little wider than the scene's."""
     known = depth[depth.isfinite()]
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
-    pictures = {ALPHA: luminance(truth), BETA: seen}
-    images = {name: record(picture[None], steps, g).image[0] for name, picture in pictures.items()}
-    return Case(name, rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1)), images, truth, depth)
+    ideal = {ALPHA: luminance(ground_truth), BETA: seen}
+    images = {name: record(scene[None], steps, g).image[0] for name, scene in ideal.items()}
+    return Case(
+        name, rig.replace(depth=(float(known.min()) / 1.1, float(known.max()) * 1.1)), images, ground_truth, depth
+    )
 
 
 def sample_photographs() -> PhotoBank:
@@ -207,8 +209,8 @@ def sample_photographs() -> PhotoBank:
     from ..data.make_sample import photographs
     from ..synthesis.patterns import patterns
 
-    pictures = photographs()
-    return PhotoBank(pictures + patterns(np.random.default_rng(0), 12), photos=len(pictures))
+    images = photographs()
+    return PhotoBank(images + patterns(np.random.default_rng(0), 12), photos=len(images))
 
 
 def ablate(
@@ -223,10 +225,10 @@ def ablate(
     rows: list[Row] = []
     crops: list[Any] = []
     for case in track(cases, "ablating", disable=not sys.stderr.isatty()):
-        found, pictures = _case(network, case, chosen or families())
+        found, images = _case(network, case, chosen or families())
         rows += found
         if len(crops) < shown:
-            crops.append((case, pictures, {row.family: row.psnr for row in found}))
+            crops.append((case, images, {row.family: row.psnr for row in found}))
     write_text(out / "ablation.md", markdown(rows))
     write_csv(out / "ablation.csv", rows)
     save_figure(figure(crops), out / "ablation.png", dpi=80)
@@ -234,11 +236,11 @@ def ablate(
 
 
 def _case(network: FusionNetwork, case: Case, chosen: Mapping[str, Family]) -> tuple[list[Row], dict[str, Tensor]]:
-    """Rows of a case, and the pictures of those families that can be served."""
-    pictures = {"alpha alone": case.images[ALPHA].expand(3, -1, -1)}
-    notes, errors, far = {}, {}, reach(network, case.rig.pair(ALPHA, BETA))
+    """Rows of a case, and the images of those families that can be served."""
+    images = {"alpha alone": case.images[ALPHA].expand(3, -1, -1)}
+    notes, errors, far = {}, {}, disparity(network, case.rig.pair(ALPHA, BETA))
     try:
-        pictures["classical"] = classical(case.rig, case.images, ALPHA, BETA)
+        images["classical"] = classical(case.rig, case.images, ALPHA, BETA)
     except ValueError as error:
         notes["classical"] = str(error)
     for name, family in chosen.items():
@@ -247,11 +249,11 @@ def _case(network: FusionNetwork, case: Case, chosen: Mapping[str, Family]) -> t
         notes[name] = cannot(network, field, rig)
         if not notes[name]:
             frame = fuse(network, rig, case.images, alpha=ALPHA, field=field)
-            pictures[name], errors[name] = frame.image.clamp(0, 1), point_errors(case, frame.depth)
+            images[name], errors[name] = frame.image.clamp(0, 1), point_errors(case, frame.depth)
     names, none = ["alpha alone", "classical", *chosen], (math.nan, math.nan)
-    scores = {name: score(picture, case.truth) for name, picture in pictures.items()}
+    scores = {name: score(image, case.ground_truth) for name, image in images.items()}
     figures = {name: (*scores.get(name, none), *errors.get(name, none)) for name in names}
-    return [Row(case.name, case.ratio, n, *figures[n], notes.get(n, "")) for n in names], pictures
+    return [Row(case.name, case.ratio, n, *figures[n], notes.get(n, "")) for n in names], images
 
 
 def point_errors(case: Case, depth: Float[Tensor, "h w"]) -> tuple[float, float]:
@@ -292,7 +294,7 @@ def markdown(rows: Sequence[Row]) -> str:
     scenes = len({row.scene for row in rows})
     note = (
         f"{scenes} scenes; the focal ratio is alpha's focal length over beta's. PSNR in dB, behind it a 95% interval.\n"
-        "The rectified assumption takes lines for rows, and both pictures for the same field of view; 'rows around\n"
+        "The rectified assumption takes lines for rows, and both images for the same field of view; 'rows around\n"
         "H x' is told place and scale, and takes only the lines for rows. Off: how far the depth found puts points in\n"
         "beta.\n\n"
     )
@@ -312,8 +314,8 @@ def _cells(rows: Sequence[Row], every: Sequence[Row]) -> list[str]:
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes left out"
     error, within = (np.mean([getattr(row, name) for row in served]) for name in ("end_point_error", "within_one"))
     off = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
-    picture = [f"{np.mean(psnr):.2f} ({low:.2f} to {high:.2f})", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
-    return [*picture, *means, *off, note]
+    image = [f"{np.mean(psnr):.2f} ({low:.2f} to {high:.2f})", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
+    return [*image, *means, *off, note]
 
 
 def write_csv(path: Path, rows: Sequence[Row]) -> None:
@@ -326,30 +328,30 @@ def write_csv(path: Path, rows: Sequence[Row]) -> None:
 
 
 def figure(shown: Sequence[tuple[Case, Mapping[str, Tensor], Mapping[str, float]]]) -> Figure:
-    """A row of crops for each case, where calibrated and rectified differ most; PSNR of the whole picture above."""
-    names = list(dict.fromkeys(name for _, pictures, _ in shown for name in pictures))
+    """A row of crops for each case, where calibrated and rectified differ most; PSNR of the whole image above."""
+    names = list(dict.fromkeys(name for _, images, _ in shown for name in images))
     columns = ["truth", *names]
     drawn = Figure(figsize=(2.2 * len(columns), 2.6 * len(shown)), layout="constrained")
-    for i, (case, pictures, psnr) in enumerate(shown):
-        where = _where(pictures, case.truth)
+    for i, (case, images, psnr) in enumerate(shown):
+        where = _where(images, case.ground_truth)
         for j, name in enumerate(columns):
             axes = drawn.add_subplot(len(shown), len(columns), i * len(columns) + j + 1)
             axes.set_axis_off()
             value = f"\nfocal ratio {case.ratio:.1f}" if name == "truth" else f"\n{psnr.get(name, math.nan):.1f} dB"
             axes.set_title(name + value, fontsize=9)
-            picture = case.truth if name == "truth" else pictures.get(name)
-            if picture is not None:
-                axes.imshow(picture[(slice(None), *where)].clamp(0, 1).movedim(0, -1).numpy())
+            image = case.ground_truth if name == "truth" else images.get(name)
+            if image is not None:
+                axes.imshow(image[(slice(None), *where)].clamp(0, 1).movedim(0, -1).numpy())
     return drawn
 
 
-def _where(pictures: Mapping[str, Tensor], truth: Tensor) -> tuple[slice, slice]:
+def _where(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple[slice, slice]:
     """The square where the rectified assumption is worse than calibrated by most."""
-    h, w = truth.shape[1:]
+    h, w = ground_truth.shape[1:]
     side = min(CROP, h, w)
-    names = [n for n in ("rectified assumption", "calibrated") if n in pictures]
-    errors = [(pictures[n] - truth).square().mean(0) for n in names]
-    worse = errors[0] - errors[1] if len(errors) == 2 else truth[0] * 0
+    names = [n for n in ("rectified assumption", "calibrated") if n in images]
+    errors = [(images[n] - ground_truth).square().mean(0) for n in names]
+    worse = errors[0] - errors[1] if len(errors) == 2 else ground_truth[0] * 0
     lost = avg_pool2d(worse[None, None], side, stride=1)[0, 0]
     top, left = divmod(int(lost.argmax()), lost.shape[1])
     return slice(top, top + side), slice(left, left + side)

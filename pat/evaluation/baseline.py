@@ -24,12 +24,12 @@ from torch import Tensor
 from arraygeom import Rig
 from pat.media.colour import from_luma_chroma, luminance, luminance_of
 
-Picture = NDArray[Any]
+Image = NDArray[Any]
 
 BLOCK = 5
 """Side of the matched block in pixels."""
 CHECK = 1.0
-"""Disparities of the two pictures that differ by more than this many pixels are not trusted."""
+"""Disparities of the two images that differ by more than this many pixels are not trusted."""
 LIKENESS = 0.08
 """Difference of luminances at which the trust in a match falls to 1 / e."""
 DOUBT = 0.5
@@ -54,7 +54,7 @@ UNRECTIFIABLE = "the cameras look along the line between them: such a pair canno
 class _Match(NamedTuple):
     """Disparity of alpha in pixels, >= 0, and where the left-right check holds."""
 
-    disparity: Picture
+    disparity: Image
     consistent: NDArray[np.bool_]
 
 
@@ -87,7 +87,7 @@ def classical_fusion_calibrated(
 ) -> Float[Tensor, "3 h w"]:
     """Alpha in beta's colours, for two pinhole cameras anywhere: X_beta = R X_alpha + t, in units of `depth`.
 
-    Both are rectified to one picture plane with about alpha's resolution, fused there for depths near to far,
+    Both are rectified to one image plane with about alpha's resolution, fused there for depths near to far,
     and the colours taken back to alpha. Raises ValueError if 0 < near < far does not hold, and for cameras
     that look along the line between them (nothing rectifies those).
     """
@@ -119,7 +119,7 @@ def classical_band_calibrated(
 
 
 class _Plane(NamedTuple):
-    """A common picture plane: where alpha's and beta's pixels are in it, its size, its disparities."""
+    """A common image plane: where alpha's and beta's pixels are in it, its size, its disparities."""
 
     from_alpha: NDArray[np.float64]
     from_beta: NDArray[np.float64]
@@ -129,8 +129,8 @@ class _Plane(NamedTuple):
 
 def _on_one_plane(
     alpha: Tensor, beta: Tensor, cameras: tuple[Tensor, ...], depth: tuple[float, float]
-) -> tuple[_Plane, Picture, Picture, Picture]:
-    """The common plane of two cameras (K_alpha, K_beta, R, t), both pictures on it, and where beta has content."""
+) -> tuple[_Plane, Image, Image, Image]:
+    """The common plane of two cameras (K_alpha, K_beta, R, t), both images on it, and where beta has content."""
     near, far = depth
     if not 0 < near < far:
         raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
@@ -144,7 +144,7 @@ def _on_one_plane(
 def _rectified_plane(K_alpha, K_beta, R, t, *, hw: tuple[int, int], depth: tuple[float, float]) -> _Plane:
     """Both cameras turned so that x runs along the baseline (Fusiello et al. 2000).
 
-    cv2.stereoRectify takes one size for both pictures, hence this. beta's principal point is moved so that
+    cv2.stereoRectify takes one size for both images, hence this. beta's principal point is moved so that
     disparities start at 0 whichever camera is on the left.
     """
     turn = _rectifying_rotation(R, t)
@@ -180,21 +180,19 @@ def _corners(hw: tuple[int, int]) -> NDArray[np.float64]:
 
 
 def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    mapped = points @ H.T
-    if (mapped[:, 2] <= 1e-6).any():
+    transformed = points @ H.T
+    if (transformed[:, 2] <= 1e-6).any():
         raise ValueError(UNRECTIFIABLE)
-    return mapped[:, :2] / mapped[:, 2:], mapped[:, 2]
+    return transformed[:, :2] / transformed[:, 2:], transformed[:, 2]
 
 
-def _carried_chroma(
-    mono: Picture, colours: Picture, inside: Picture, max_disparity: float, sharpness: float
-) -> Picture:
+def _carried_chroma(mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
     """Colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified grid.
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
     """
     soft = _softened(mono, sharpness)
-    match = _matched(soft, _levelled(_luma(colours), mono, inside), max_disparity)
+    match = _matched(soft, _normalised(_luma(colours), mono, inside), max_disparity)
     guide = _bytes(mono)
     disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
     columns, rows = _grid(mono.shape)
@@ -202,17 +200,17 @@ def _carried_chroma(
     warped = _looked_up(colours, columns, rows)
     seen = _looked_up(inside, columns, rows) * (columns >= -0.5)
     warped_luma = _luma(warped)
-    levelled = _levelled(warped_luma, mono, seen)
-    chroma = _regressed(warped[..., [0, 2]] - warped_luma[..., None], warped_luma, mono - levelled)
-    likeness = np.exp(-np.square(cv2.GaussianBlur(np.abs(soft - levelled), (0, 0), 1) / LIKENESS))
+    normalised = _normalised(warped_luma, mono, seen)
+    chroma = _regressed(warped[..., [0, 2]] - warped_luma[..., None], warped_luma, mono - normalised)
+    likeness = np.exp(-np.square(cv2.GaussianBlur(np.abs(soft - normalised), (0, 0), 1) / LIKENESS))
     trust = np.maximum(match.consistent, DOUBT) * seen * likeness
     return _blended(chroma, _filled(chroma, trust + 1e-4, guide, COLOUR_FILL), trust)
 
 
-def _carried_band(mono: Picture, band: Picture, inside: Picture, max_disparity: float, sharpness: float) -> Picture:
+def _carried_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
     """What `band` has more than `mono`, at `mono`'s pixels; both (h, w) on one rectified grid."""
     soft, guide = _softened(mono, sharpness), _bytes(mono)
-    match = _matched(soft, _levelled(band, mono, inside), max_disparity)
+    match = _matched(soft, _normalised(band, mono, inside), max_disparity)
     disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
     columns, rows = _grid(mono.shape)
     columns = columns - np.where(match.consistent, match.disparity, disparity)
@@ -222,8 +220,8 @@ def _carried_band(mono: Picture, band: Picture, inside: Picture, max_disparity: 
     return _blended(difference, _filled(difference, trust + 1e-4, guide, COLOUR_FILL), trust)[..., 0]
 
 
-def _softened(mono: Picture, sharpness: float) -> Picture:
-    """`mono` as sharp as a picture of `sharpness` times its resolution enlarged to its size."""
+def _softened(mono: Image, sharpness: float) -> Image:
+    """`mono` as sharp as an image of `sharpness` times its resolution enlarged to its size."""
     if sharpness >= 1:
         return mono
     height, width = (max(1, round(side * sharpness)) for side in mono.shape)
@@ -231,7 +229,7 @@ def _softened(mono: Picture, sharpness: float) -> Picture:
     return cv2.resize(small, mono.shape[::-1], interpolation=cv2.INTER_CUBIC)
 
 
-def _matched(mono: Picture, luma: Picture, max_disparity: float) -> _Match:
+def _matched(mono: Image, luma: Image, max_disparity: float) -> _Match:
     columns, rows = _grid(mono.shape)
     ours = _disparity(_bytes(mono), _bytes(luma), max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
@@ -240,7 +238,7 @@ def _matched(mono: Picture, luma: Picture, max_disparity: float) -> _Match:
     return _Match(ours, (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5))
 
 
-def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Picture:
+def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
     """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
     matcher = cv2.StereoSGBM.create(
@@ -256,7 +254,7 @@ def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity:
     return matcher.compute(*padded)[:, count:-count].astype(np.float32) / 16
 
 
-def _levelled(luma: Picture, mono: Picture, weight: Picture) -> Picture:
+def _normalised(luma: Image, mono: Image, weight: Image) -> Image:
     """`luma` with mono's mean and spread, so that cameras of unlike exposure can be compared."""
     mean, spread = _mean_and_spread(luma, weight)
     wanted_mean, wanted_spread = _mean_and_spread(mono, weight)
@@ -264,28 +262,28 @@ def _levelled(luma: Picture, mono: Picture, weight: Picture) -> Picture:
     return ((luma - mean) * gain + wanted_mean).astype(np.float32)
 
 
-def _mean_and_spread(plane: Picture, weight: Picture) -> tuple[float, float]:
+def _mean_and_spread(plane: Image, weight: Image) -> tuple[float, float]:
     total = max(float(weight.sum()), 1.0)
     mean = float((plane * weight).sum()) / total
     return mean, float((np.square(plane - mean) * weight).sum() / total) ** 0.5
 
 
-def _regressed(chroma: Picture, luma: Picture, residual: Picture) -> Picture:
+def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
     """Chroma moved along its local regression on luminance by what alpha's luminance has beyond beta's.
 
     This is the guided filter's linear model; it gives back the detail that beta lost by its resolution.
     """
     mean = _box(luma)
-    variance: Picture = _box(luma * luma) - mean * mean
+    variance: Image = _box(luma * luma) - mean * mean
     covariance = _box(chroma * luma[..., None]) - _box(chroma) * mean[..., None]
     slope = covariance / (np.maximum(variance, 0) + REGRESSION_FLOOR)[..., None]
     return chroma + slope * np.clip(residual, -0.2, 0.2)[..., None]
 
 
-def _filled(values: Picture, weight: Picture, guide: NDArray[np.uint8], how: _Smoothing) -> Picture:
+def _filled(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
     """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
 
-    def smooth(plane: Picture) -> Picture:
+    def smooth(plane: Image) -> Image:
         return cv2.ximgproc.fastGlobalSmootherFilter(guide, plane.astype(np.float32), how.strength, how.edge)
 
     total = smooth(weight)
@@ -293,54 +291,54 @@ def _filled(values: Picture, weight: Picture, guide: NDArray[np.uint8], how: _Sm
     return np.stack([smooth(plane * weight) / total for plane in planes], -1).reshape(values.shape)
 
 
-def _blended(values: Picture, filled: Picture, trust: Picture) -> Picture:
+def _blended(values: Image, filled: Image, trust: Image) -> Image:
     return (trust[..., None] * values + (1 - trust[..., None]) * filled).astype(np.float32)
 
 
-def _recoloured(alpha: Float[Tensor, "1 h w"], chroma: Picture) -> Float[Tensor, "3 h w"]:
+def _recoloured(alpha: Float[Tensor, "1 h w"], chroma: Image) -> Float[Tensor, "3 h w"]:
     planes = torch.from_numpy(np.ascontiguousarray(chroma.transpose(2, 0, 1)))
     return from_luma_chroma(alpha, planes.to(alpha)).clamp(0, 1)
 
 
-def _planes(image: Float[Tensor, "c h w"]) -> Picture:
+def _planes(image: Float[Tensor, "c h w"]) -> Image:
     """(H, W, C) for OpenCV."""
     return np.ascontiguousarray(image.detach().cpu().float().numpy().transpose(1, 2, 0))
 
 
-def _luma(colours: Picture) -> Picture:
+def _luma(colours: Image) -> Image:
     return luminance(torch.from_numpy(colours).permute(2, 0, 1))[0].numpy()
 
 
-def _bytes(plane: Picture) -> NDArray[np.uint8]:
+def _bytes(plane: Image) -> NDArray[np.uint8]:
     return np.rint(np.clip(plane, 0, 1) * 255).astype(np.uint8)
 
 
-def _grid(shape: tuple[int, ...]) -> tuple[Picture, Picture]:
+def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     return columns, rows
 
 
-def _resized(colours: Picture, hw: torch.Size) -> Picture:
+def _resized(colours: Image, hw: torch.Size) -> Image:
     """OpenCV's resize obeys c' = (c + 0.5) s - 0.5."""
     smaller = colours.shape[0] > hw[0]
     return cv2.resize(colours, (hw[1], hw[0]), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
 
-def _looked_up(picture: Picture, columns: Picture, rows: Picture, how: int = cv2.INTER_CUBIC) -> Picture:
-    return cv2.remap(picture, columns, rows, how, borderMode=cv2.BORDER_REPLICATE)
+def _looked_up(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUBIC) -> Image:
+    return cv2.remap(image, columns, rows, how, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _warped(picture: Picture, H: NDArray, wh: tuple[int, int]) -> Picture:
-    """The picture moved by x' ~ H x; beyond its border it repeats the border."""
-    return cv2.warpPerspective(picture, H, wh, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+def _warped(image: Image, H: NDArray, wh: tuple[int, int]) -> Image:
+    """The image moved by x' ~ H x; beyond its border it repeats the border."""
+    return cv2.warpPerspective(image, H, wh, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
-def _covered(hw: tuple[int, int], H: NDArray, wh: tuple[int, int]) -> Picture:
-    """1 where a picture of height and width `hw`, moved by H, has content."""
+def _covered(hw: tuple[int, int], H: NDArray, wh: tuple[int, int]) -> Image:
+    """1 where an image of height and width `hw`, moved by H, has content."""
     return cv2.warpPerspective(np.ones(hw, np.float32), H, wh, flags=cv2.INTER_NEAREST)
 
 
-def _box(planes: Picture) -> Picture:
+def _box(planes: Image) -> Image:
     return cv2.boxFilter(planes, -1, (2 * REGRESSION_RADIUS + 1,) * 2, borderType=cv2.BORDER_REFLECT)
 
 

@@ -1,4 +1,4 @@
-"""How good a picture or a disparity is: PSNR, SSIM, end-point error, and how sure a mean is."""
+"""How good an image or a disparity is: PSNR, SSIM, end-point error, and how sure a mean is."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SSIM_WINDOW = 11
 
 
 class Score(NamedTuple):
-    """PSNR in dB (infinite for equal pictures) and SSIM (1 for equal pictures)."""
+    """PSNR in dB (infinite for equal images) and SSIM (1 for equal images)."""
 
     psnr: float
     ssim: float
@@ -29,18 +29,20 @@ class DisparityScore(NamedTuple):
     within_one: float
 
 
-def score(image: Float[Tensor, "_ _ _"], truth: Float[Tensor, "_ _ _"]) -> Score:
+def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -> Score:
     """PSNR over all channels, and the mean SSIM of the channels, by scikit-image; values 0..1.
 
     SSIM as in Wang et al. 2004: Gaussian window of sigma 1.5 (11 x 11), K1 = 0.01, K2 = 0.03, population
     covariance. Nothing is cut or rounded here. Raises ValueError if the shapes differ or a side is under 11
     pixels.
     """
-    if image.shape != truth.shape:
-        raise ValueError(f"the picture is {tuple(image.shape)} and the truth {tuple(truth.shape)}: give equal shapes")
+    if image.shape != ground_truth.shape:
+        raise ValueError(
+            f"the image is {tuple(image.shape)} and the truth {tuple(ground_truth.shape)}: give equal shapes"
+        )
     if min(image.shape[-2:]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs sides of {SSIM_WINDOW} pixels or more, got {tuple(image.shape[-2:])}")
-    ours, theirs = (x.detach().cpu().double().numpy() for x in (image, truth))
+    ours, theirs = (x.detach().cpu().double().numpy() for x in (image, ground_truth))
     with np.errstate(divide="ignore"):
         psnr = peak_signal_noise_ratio(theirs, ours, data_range=1)
     ssim = structural_similarity(
@@ -56,12 +58,12 @@ def score(image: Float[Tensor, "_ _ _"], truth: Float[Tensor, "_ _ _"]) -> Score
 
 
 def disparity_score(
-    disparity: Float[Tensor, "h w"], truth: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
+    disparity: Float[Tensor, "h w"], ground_truth: Float[Tensor, "h w"], valid: Bool[Tensor, "h w"]
 ) -> DisparityScore:
     """Errors of a disparity, in pixels, where `valid`. Raises ValueError if no pixel is valid."""
     if not valid.any():
         raise ValueError("no pixel has a true disparity: nothing to compare with")
-    error = (disparity - truth)[valid].abs().double()
+    error = (disparity - ground_truth)[valid].abs().double()
     return DisparityScore(float(error.mean()), float((error <= 1).double().mean()))
 
 

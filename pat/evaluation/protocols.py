@@ -16,29 +16,29 @@ class MonoColourTask(NamedTuple):
     """What a fusion gets (`alpha`, `beta`) and what it should return (`truth`).
 
     alpha is grey and sharp. beta is in colour and `rate` times smaller: the pixel at x in the whole right
-    picture is at (x + 0.5) / rate - 0.5 in it.
+    image is at (x + 0.5) / rate - 0.5 in it.
     """
 
     alpha: Float[Tensor, "1 h w"]
     beta: Float[Tensor, "3 hb wb"]
-    truth: Float[Tensor, "3 h w"]
+    ground_truth: Float[Tensor, "3 h w"]
 
 
 def mono_colour_task(pair: StereoPair, rate: int) -> MonoColourTask:
     """Left as the grey alpha (Rec. 601) and as the truth in colour; right, reduced `rate` times, as beta.
 
     Rows and columns beyond the last multiple of `rate` are cut from the bottom and the right. Raises
-    ValueError for a grey pair, and for pictures of unequal sizes.
+    ValueError for a grey pair, and for images of unequal sizes.
     """
     if pair.left.shape[0] != 3 or pair.right.shape[0] != 3:
-        raise ValueError(f"{pair.name}: the mono + colour protocol needs colour pictures, and these are grey")
+        raise ValueError(f"{pair.name}: the mono + colour protocol needs colour images, and these are grey")
     if pair.left.shape != pair.right.shape:
         raise ValueError(
             f"{pair.name}: left is {tuple(pair.left.shape[1:])} and right {tuple(pair.right.shape[1:])}: "
             "the mono + colour protocol needs equal sizes"
         )
-    truth = _cut_to_multiple(pair.left, rate)
-    return MonoColourTask(luminance(truth), reduce_by(_cut_to_multiple(pair.right, rate), rate), truth)
+    ground_truth = _cut_to_multiple(pair.left, rate)
+    return MonoColourTask(luminance(ground_truth), reduce_by(_cut_to_multiple(pair.right, rate), rate), ground_truth)
 
 
 def reduce_by(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, "c hr wr"]:

@@ -1,4 +1,4 @@
-"""Fusions compared on stereo pairs by the paper's protocols: scores, controls, tables, pictures.
+"""Fusions compared on stereo pairs by the paper's protocols: scores, controls, tables, images.
 
 The protocol `table1` is the paper's mono + colour (its Table 1): left made grey is alpha, right, reduced, is beta.
 `table2` is mono + three bands (its Table 2): the bands of right are three cameras, each of one channel.
@@ -47,14 +47,14 @@ T = TypeVar("T")
 
 
 class Answer(NamedTuple):
-    """A colour picture (3, H, W), 0..1, and the disparity (H, W) that it was found at, pixels of alpha; NaN unknown."""
+    """A colour image (3, H, W), 0..1, and the disparity (H, W) that it was found at, pixels of alpha; NaN unknown."""
 
     image: Tensor
     disparity: Tensor | None = None
 
 
 Fusion = Callable[[Tensor, Tensor, float], Tensor | Answer]
-"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour picture (3, H, W), 0..1, or more."""
+"""(alpha (1, H, W), beta (3, Hb, Wb), max_disparity in alpha pixels) -> a colour image (3, H, W), 0..1, or more."""
 
 
 class Row(NamedTuple):
@@ -74,12 +74,12 @@ class Row(NamedTuple):
 
 
 def alpha_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-    """The grey picture three times: what no colour at all scores."""
+    """The grey image three times: what no colour at all scores."""
     return alpha.expand(3, -1, -1)
 
 
 def beta_alone(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
-    """The colour picture enlarged (bicubic) and left where it is: what no matching at all scores."""
+    """The colour image enlarged (bicubic) and left where it is: what no matching at all scores."""
     return interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0]
 
 
@@ -102,8 +102,8 @@ def rectified_fusion(
     """
 
     def fused(alpha: Tensor, given: Tensor, max_disparity: float) -> Answer:
-        picture = beta(given)
-        betas = dict(zip("rgb", picture.split(1))) if bands else {"beta": picture}
+        image = beta(given)
+        betas = dict(zip("rgb", image.split(1))) if bands else {"beta": image}
         rig = rectified_rig(_hw(alpha), {name: _hw(band) for name, band in betas.items()}, max_disparity)
         field: ReceptiveField = Rectified(max_disparity, alpha_is="left")
         field = Shuffled(field) if shuffled else field
@@ -162,7 +162,7 @@ PRINTED = {
     ("table2", "flickr1024"): {2: (25.55, 0.8714), 4: (24.00, 0.8493)},
     ("table2", "kitti"): {2: (28.77, 0.8955), 4: (28.13, 0.8903)},
 }
-"""PSNR and SSIM of fusion as the paper prints them, by protocol, data set and rate; on its own choice of pictures."""
+"""PSNR and SSIM of fusion as the paper prints them, by protocol, data set and rate; on its own choice of images."""
 
 BASELINES: dict[str, Fusion] = {"alpha": alpha_alone, "beta": beta_alone, "classical": classical}
 """What a fusion can be compared with."""
@@ -182,12 +182,12 @@ DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
 def evaluate_sets(
     folders: Mapping[str, Path], methods: Mapping[str, Fusion], rates: Sequence[int], *, out: Path
 ) -> dict[str, list[Row]]:
-    """`evaluate_pairs` on data sets by name (see `DATA_SETS`): rows by set, a strip of pictures a pair in out/set.
+    """`evaluate_pairs` on data sets by name (see `DATA_SETS`): rows by set, a strip of images a pair in out/set.
 
     All folders are looked into before the work begins: a missing one raises FileNotFoundError or ValueError.
     """
     pairs = {name: DATA_SETS[name](folder) for name, folder in folders.items()}
-    return {name: evaluate_pairs(found, methods, rates, pictures=out / name) for name, found in pairs.items()}
+    return {name: evaluate_pairs(found, methods, rates, images=out / name) for name, found in pairs.items()}
 
 
 def evaluate_pairs(
@@ -196,12 +196,12 @@ def evaluate_pairs(
     rates: Sequence[int] = (2, 4),
     *,
     max_disparity: float = PAPER_DISPARITY,
-    pictures: str | Path | None = None,
+    images: str | Path | None = None,
 ) -> list[Row]:
     """Each method's scores on each pair at each rate: whole frames, values cut to 0..1 and not rounded.
 
     `max_disparity`, in alpha's pixels, is the same for all (the paper's: 120 / rate pixels of beta). With
-    `pictures`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the truth.
+    `images`, a folder, a strip for each pair and rate goes there: beta enlarged, each method, the truth.
     Raises ValueError naming the method and the pair if a result has another shape than the truth or is not
     finite.
     """
@@ -210,10 +210,10 @@ def evaluate_pairs(
         for rate in rates:
             task = mono_colour_task(pair, rate)
             answers = {name: _fused(name, fuse, pair, task, max_disparity) for name, fuse in methods.items()}
-            rows += [_row(pair, rate, name, answer, task.truth) for name, answer in answers.items()]
-            if pictures:
-                images = {name: answer.image for name, answer in answers.items()}
-                write_image(Path(pictures) / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, images))
+            rows += [_row(pair, rate, name, answer, task.ground_truth) for name, answer in answers.items()]
+            if images:
+                fused = {name: answer.image for name, answer in answers.items()}
+                write_image(Path(images) / f"{pair.name.replace('/', '-')}_x{rate}.png", _strip(task, fused))
     return rows
 
 
@@ -281,7 +281,7 @@ def depth_markdown(rows: Sequence[Row]) -> str:
 
 
 def falls(rows: Sequence[Row], *, method: str = "fusion", names: Iterable[str]) -> str:
-    """One line for each control: by how much mean PSNR is below that of `method`, and the least of any picture."""
+    """One line for each control: by how much mean PSNR is below that of `method`, and the least of any image."""
     psnr = {(row.pair, row.rate, row.method): row.psnr for row in rows}
     lines = []
     for name in names:
@@ -321,29 +321,29 @@ def _fused(name: str, fuse: Fusion, pair: StereoPair, task: MonoColourTask, max_
     given = fuse(task.alpha, task.beta, max_disparity)
     answer = given if isinstance(given, Answer) else Answer(given)
     image = answer.image.detach().cpu()
-    if image.shape != task.truth.shape:
+    if image.shape != task.ground_truth.shape:
         raise ValueError(
-            f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted a picture {tuple(task.truth.shape)}"
+            f"{name} on {pair.name}: gave {tuple(image.shape)}, wanted an image {tuple(task.ground_truth.shape)}"
         )
     if not image.isfinite().all():
         raise ValueError(f"{name} on {pair.name}: gave NaN or infinite values")
     return Answer(image.float().clamp(0, 1), answer.disparity)
 
 
-def _row(pair: StereoPair, rate: int, method: str, answer: Answer, truth: Tensor) -> Row:
+def _row(pair: StereoPair, rate: int, method: str, answer: Answer, ground_truth: Tensor) -> Row:
     errors: tuple[float | None, float | None] = (None, None)
     if answer.disparity is not None and pair.disparity is not None:
         errors = disparity_errors(answer.disparity.detach().cpu(), pair.disparity)
-    return Row(pair.name, rate, method, *score(answer.image, truth), *errors)
+    return Row(pair.name, rate, method, *score(answer.image, ground_truth), *errors)
 
 
-def disparity_errors(found: Float[Tensor, "h w"], truth: Disparity) -> tuple[float | None, float | None]:
+def disparity_errors(found: Float[Tensor, "h w"], ground_truth: Disparity) -> tuple[float | None, float | None]:
     """Mean error of `found` where it and the truth are known, and the share of known truth that is within a pixel.
 
     The truth may be larger by what was cut off at the bottom and the right.
     """
     h, w = found.shape
-    value, valid = truth.value[:h, :w], truth.valid[:h, :w]
+    value, valid = ground_truth.value[:h, :w], ground_truth.valid[:h, :w]
     told = valid & found.isfinite()
     if not told.any():
         return None, None
@@ -352,7 +352,7 @@ def disparity_errors(found: Float[Tensor, "h w"], truth: Disparity) -> tuple[flo
 
 
 def _strip(task: MonoColourTask, images: Mapping[str, Tensor]) -> Float[Tensor, "3 h w"]:
-    return torch.cat([beta_alone(task.alpha, task.beta, 0.0), *images.values(), task.truth], -1)
+    return torch.cat([beta_alone(task.alpha, task.beta, 0.0), *images.values(), task.ground_truth], -1)
 
 
 def _summary(rate: int, method: str, rows: Sequence[Row]) -> Summary:

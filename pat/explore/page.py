@@ -1,4 +1,4 @@
-"""The explorer's page: pictures, the rig and controls, drawn from `seen`. The same in a browser and in Jupyter."""
+"""The explorer's page: images, the rig and controls, drawn from `seen`. The same in a browser and in Jupyter."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from torch.nn.functional import interpolate
 from arraygeom import Camera, Rig
 from arraygeom.viz import COLOURS, calibrated, extent_of, frustum_size, interactive_rig
 
-from .seen import FAMILIES, Scene, Seen, SeenInBeta, State, look_at, numbers_of, picture_pixel
+from .seen import FAMILIES, Scene, Seen, SeenInBeta, State, image_pixel, look_at, numbers_of
 
 UNITS = {
     "rotation": (180 / math.pi, "xyz", 3.0, 0.05, "deg"),
@@ -36,7 +36,7 @@ RESTED = 150
 """Milliseconds without a change after which the rig in space is drawn anew."""
 
 SHOWN_PIXELS = 2_000_000
-"""Larger pictures are drawn reduced; what is worked out uses them as they are."""
+"""Larger images are drawn reduced; what is worked out uses them as they are."""
 
 
 class Explorer:
@@ -45,7 +45,7 @@ class Explorer:
     def __init__(self, scene: Scene, alpha: str) -> None:
         hw = scene.rig[alpha].hw
         self.scene = scene
-        self.state = State(alpha, picture_pixel(hw[1] / 2, hw[0] / 2, hw))
+        self.state = State(alpha, image_pixel(hw[1] / 2, hw[0] / 2, hw))
         self.betas = [n for n in scene.rig.betas(alpha) if n in scene.images]
         self.marker = ColumnDataSource({"x": [], "y": []}, name="pixel")
         self.sources = {name: beta_sources(name) for name in self.betas}
@@ -68,7 +68,7 @@ class Explorer:
     def tapped(self, event: Any) -> None:
         """Go to the alpha pixel that was clicked."""
         hw = self.scene.rig[self.state.alpha].hw
-        self.moved(x=picture_pixel(event.x, event.y, hw))
+        self.moved(x=image_pixel(event.x, event.y, hw))
 
     def show(self, state: State) -> Seen | None:
         """Work out a state and draw it. A state that is impossible is told, and what was drawn stays."""
@@ -117,13 +117,13 @@ class Explorer:
 
     def panel(self) -> pn.viewable.Viewable:
         """The page."""
-        pictures = pn.FlexBox(*map(pn.pane.Bokeh, (self.alpha_figure, *self.figures)))
+        images = pn.FlexBox(*map(pn.pane.Bokeh, (self.alpha_figure, *self.figures)))
         below = pn.Row(self.space, pn.pane.Bokeh(self.depth_figure))
-        return pn.Row(self.controls.panel(), pn.Column(pictures, self.facts, below), sizing_mode="stretch_width")
+        return pn.Row(self.controls.panel(), pn.Column(images, self.facts, below), sizing_mode="stretch_width")
 
     def _alpha_figure(self) -> Any:
         name = self.state.alpha
-        drawn = picture_figure(f"{name} (alpha): click a pixel", self.scene.rig[name].hw, self.scene.images[name])
+        drawn = image_figure(f"{name} (alpha): click a pixel", self.scene.rig[name].hw, self.scene.images[name])
         drawn.scatter("x", "y", source=self.marker, marker="cross", size=18, color="black", line_width=4)
         drawn.scatter("x", "y", source=self.marker, marker="cross", size=16, color="yellow", line_width=2)
         drawn.name = "alpha"
@@ -131,7 +131,7 @@ class Explorer:
         return drawn
 
     def _beta_figure(self, index: int, name: str) -> Any:
-        drawn = picture_figure(name, self.scene.rig[name].hw, self.scene.images[name])
+        drawn = image_figure(name, self.scene.rig[name].hw, self.scene.images[name])
         segment, samples, match = self.sources[name]
         colour = COLOURS[(index + 1) % len(COLOURS)]
         drawn.line("x", "y", source=segment, color="white", line_width=7, alpha=0.85)
@@ -185,7 +185,7 @@ class Controls:
 
     def _sliders_of(self, name: str) -> list[Any]:
         kind = name.rpartition(".")[2]
-        scale, parts, reach, step, unit = UNITS[kind]
+        scale, parts, disparity, step, unit = UNITS[kind]
 
         def changed(index: int, shown: float) -> None:
             self.changes[name][index] = shown / scale
@@ -194,7 +194,7 @@ class Controls:
         return [
             slider(
                 f"{name} {parts[i] if parts else i} ({unit})" if unit else f"{name} {i}",
-                (-reach, reach, step),
+                (-disparity, disparity, step),
                 0.0,
                 lambda value, i=i: changed(i, value),
             )
@@ -236,8 +236,8 @@ def beta_data(seen: SeenInBeta | None) -> tuple[dict[str, Any], dict[str, Any], 
     return {"x": ends[:, 0], "y": ends[:, 1]}, samples, {"x": where[0], "y": where[1]}
 
 
-def picture_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"]) -> Any:
-    """A picture with pixel centres at whole numbers and y downwards."""
+def image_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"]) -> Any:
+    """An image with pixel centres at whole numbers and y downwards."""
     h, w = hw
     drawn = figure(
         title=title,
@@ -255,7 +255,7 @@ def picture_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"
 
 
 def rgba(image: Float[Tensor, "c h w"]) -> np.ndarray:
-    """The picture as Bokeh wants it, (H, W) of 32 bits, reduced if it is very large."""
+    """The image as Bokeh wants it, (H, W) of 32 bits, reduced if it is very large."""
     shrink = math.sqrt(SHOWN_PIXELS / (image.shape[1] * image.shape[2]))
     if shrink < 1:
         image = interpolate(image[None], scale_factor=shrink, mode="bilinear", antialias=True)[0]
@@ -374,10 +374,10 @@ def pixel_ray(rig: Rig, state: State) -> np.ndarray | None:
 def explorer(
     rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], *, alpha: str | None = None
 ) -> pn.viewable.Viewable:
-    """The explorer of a rig and pictures (C, H, W) by camera name, to show in a cell of a notebook.
+    """The explorer of a rig and images (C, H, W) by camera name, to show in a cell of a notebook.
 
-    `alpha` is the camera to click in, by default the first with a picture. Raises ValueError for a camera the rig
-    lacks, a picture of another size, and if alpha or every beta has no picture.
+    `alpha` is the camera to click in, by default the first with an image. Raises ValueError for a camera the rig
+    lacks, an image of another size, and if alpha or every beta has no image.
     """
     return Explorer(*prepared(rig, images, alpha)).panel()
 
@@ -385,12 +385,12 @@ def explorer(
 def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple[Scene, str]:
     """The checked scene and alpha's name."""
     for name in images:
-        rig.known(name)
+        rig.require(name)
     if len(images) < 2:
-        raise ValueError("the explorer needs pictures of two cameras or more: give one of alpha and one of each beta")
-    alpha = rig.known(alpha or next(n for n in rig.names if n in images))
+        raise ValueError("the explorer needs images of two cameras or more: give one of alpha and one of each beta")
+    alpha = rig.require(alpha or next(n for n in rig.names if n in images))
     if alpha not in images:
-        raise ValueError(f"no picture of alpha, '{alpha}': give one, or choose another alpha")
+        raise ValueError(f"no image of alpha, '{alpha}': give one, or choose another alpha")
     pn.extension("plotly")
     return Scene(rig, images), alpha
 

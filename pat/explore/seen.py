@@ -1,6 +1,6 @@
 """What the explorer shows: one alpha pixel and a state of the controls in, everything that is drawn out.
 
-Only the one pixel is worked out, so that an answer takes milliseconds whatever the pictures' size. No widget is
+Only the one pixel is worked out, so that an answer takes milliseconds whatever the images' size. No widget is
 known here. The weights are those of C3 attention with the plainest features there are: luminance in a window
 around each point, its mean taken away and brought to length one, so that scores are normalised correlations. Windows
 of beta are mapped by the rough homography, so that other focal lengths and rotated cameras compare the same patch.
@@ -74,7 +74,7 @@ class SeenInBeta(NamedTuple):
 
     xy: samples in beta's pixels; `counts` says which count. ends: start and end where the field is a segment.
     weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
-    value: beta's picture there, weighted. position, spread, peak: as those of `pat.attention`.
+    value: beta's image there, weighted. position, spread, peak: as those of `pat.attention`.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -100,7 +100,7 @@ class Seen(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """A rig and its pictures (C, H, W), with the luminance that is compared made once."""
+    """A rig and its images (C, H, W), with the luminance that is compared made once."""
 
     rig: Rig
     images: Mapping[str, Tensor]
@@ -111,7 +111,7 @@ class Scene:
             hw = self.rig[name].hw
             if tuple(image.shape[1:]) != hw:
                 got, wanted = f"{image.shape[2]}x{image.shape[1]}", f"{hw[1]}x{hw[0]}"
-                raise ValueError(f"the picture of '{name}' is {got}, the rig says {wanted}: give the right picture")
+                raise ValueError(f"the image of '{name}' is {got}, the rig says {wanted}: give the right image")
             self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None]
 
 
@@ -183,7 +183,7 @@ def changed_rig(rig: Rig, state: State) -> Rig:
 
 
 def look_at(scene: Scene, state: State) -> Seen:
-    """What every beta that has a picture shows for the state's pixel.
+    """What every beta that has an image shows for the state's pixel.
 
     Raises ValueError for a rig that the state makes impossible. What one beta cannot tell stands in `problems`.
     """
@@ -192,7 +192,7 @@ def look_at(scene: Scene, state: State) -> Seen:
     problems: dict[str, str] = {}
     for name in rig.betas(state.alpha):
         if name not in scene.images:
-            problems[name] = "no picture given"
+            problems[name] = "no image given"
             continue
         try:
             betas[name] = look_in_beta(scene, rig.pair(state.alpha, name), name, state)
@@ -255,16 +255,16 @@ def correlations(
 ) -> Float[Tensor, "l"]:
     """Normalised correlations (-1 to 1) of alpha's window at x with beta's at each of xy."""
     steps = (pixel_grid((2 * RADIUS + 1, 2 * RADIUS + 1), dtype=x.dtype) - RADIUS).reshape(-1, 2)
-    mapped = steps @ jacobian(pair, x).T
+    transformed = steps @ jacobian(pair, x).T
     own = window_features(alpha, x, steps)
-    return (window_features(beta, xy, mapped) @ own.T)[:, 0]
+    return (window_features(beta, xy, transformed) @ own.T)[:, 0]
 
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
     """How steps in alpha map to steps in beta by H, at x; the identity where H maps x nowhere."""
     ends = torch.cat([x, x + x.new_tensor([[0.5, 0.0], [0.0, 0.5]]), x - x.new_tensor([[0.5, 0.0], [0.0, 0.5]])])
-    mapped, valid = apply_homography(pair.homography.to(x), ends)
-    return (mapped[1:3] - mapped[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
+    transformed, valid = apply_homography(pair.homography.to(x), ends)
+    return (transformed[1:3] - transformed[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
 
 
 def window_features(
@@ -310,9 +310,9 @@ def joint_depth(betas: Mapping[str, SeenInBeta]) -> float:
     return total / inverse if inverse > 0 else math.nan
 
 
-def sampled(picture: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"]) -> Float[Tensor, "c *l"]:
-    """The picture's values at positions, in their precision; the picture itself is not copied."""
-    return sample(picture, x[None].to(picture)).values[0].to(x)
+def sampled(image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"]) -> Float[Tensor, "c *l"]:
+    """The image's values at positions, in their precision; the image itself is not copied."""
+    return sample(image, x[None].to(image)).values[0].to(x)
 
 
 def fused_colour(scene: Scene, betas: Mapping[str, SeenInBeta], state: State) -> Float[Tensor, "c"]:
@@ -338,7 +338,7 @@ def numbers_of(rig: Rig) -> dict[str, int]:
     return {name: step.numel() for name, step in rig.parameters(free=["*.*"]).items() if not name.startswith("depth.")}
 
 
-def picture_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:
-    """The centre of the pixel that a place on the picture belongs to."""
+def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:
+    """The centre of the pixel that a place on the image belongs to."""
     h, w = hw
     return float(min(max(round(x), 0), w - 1)), float(min(max(round(y), 0), h - 1))

@@ -28,7 +28,7 @@ from pat.synthesis.generators import GENERATORS
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rendered import RENDER_FILE, Frame, frame_file, save_frame
+from pat.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, save_frame
 from pat.synthesis.rigs import RigBatch, RigDistribution
 
 FARTHEST = 50.0
@@ -48,7 +48,7 @@ class Renderer(Protocol):
 class LayeredSettings:
     """Layered scenes: the first camera of the rig is alpha.
 
-    `photos` are folders of pictures (none: patterns alone), reduced to `edge` pixels; `layers` bounds the number of
+    `photos` are folders of images (none: patterns alone), reduced to `edge` pixels; `layers` bounds the number of
     planes; `oversampling` samples a pixel along each axis.
     """
 
@@ -61,8 +61,8 @@ class LayeredSettings:
         """Raises ValueError for a rig that cannot be rendered."""
         rig_from_alpha(rig)
 
-    def pictures(self, rig: Rig) -> list[HW]:
-        """The sizes of the pictures of a scene."""
+    def images(self, rig: Rig) -> list[HW]:
+        """The sizes of the images of a scene."""
         return [camera.hw for camera in rig.cameras.values()]
 
     def renderer(self, rig: Rig, limits: Limits) -> Renderer:
@@ -74,7 +74,7 @@ class LayeredSettings:
 class BlenderSettings:
     """Blender's scenes: a generator, a preset, and settings that differ from the preset's.
 
-    `photos` is the folder of pictures for the generator "photographs".
+    `photos` is the folder of images for the generator "photographs".
     """
 
     generator: Literal["abstract", "photographs"] = "abstract"
@@ -98,8 +98,8 @@ class BlenderSettings:
         for name, camera in rig.cameras.items():
             lens_for(camera, name)
 
-    def pictures(self, rig: Rig) -> list[HW]:
-        """The sizes of the pictures of a scene, as often as they are taken."""
+    def images(self, rig: Rig) -> list[HW]:
+        """The sizes of the images of a scene, as often as they are taken."""
         settings = self.render_settings()
         rig = fitted(rig, settings)
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
@@ -174,9 +174,9 @@ def _bank(settings: LayeredSettings) -> PhotoBank:
     return PhotoBank(patterns(np.random.default_rng(0), 60))
 
 
-def _frames(batch: ArrayBatch) -> list[Frame]:
+def _frames(batch: ArrayBatch) -> list[RenderedFrame]:
     return [
-        Frame(time=0.0, rgb=_linear(image)[0], depth=depth[0], index=index[0])
+        RenderedFrame(time=0.0, rgb=_linear(image)[0], depth=depth[0], index=index[0])
         for image, depth, index in zip(batch.images, batch.depth, batch.index)
     ]
 

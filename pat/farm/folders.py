@@ -153,7 +153,7 @@ def publish(partial: Path, final: Path) -> bool:
     return True
 
 
-def write_whole(path: Path, text: str) -> None:
+def write_atomic(path: Path, text: str) -> None:
     """A file that appears whole or not at all."""
     temporary = path.with_name(f".{path.name}-{uuid4().hex[:12]}")
     try:

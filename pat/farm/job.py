@@ -17,7 +17,7 @@ from pat.support.schema import from_document, read_yaml, to_document
 from pat.synthesis.check import Limits as CheckLimits
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
-from .folders import JobFolder, write_whole
+from .folders import JobFolder, write_atomic
 from .workshop import Limits
 
 MANIFEST = "manifest.yaml"
@@ -89,7 +89,7 @@ class RenderConfig:
 
     def scene_bytes(self) -> float:
         """About how much disk a scene takes: 2 bytes a colour, 4 for depth, and what compression leaves of it."""
-        return sum(10.0 * h * w for h, w in self.settings.pictures(self.load_rig())) + 20_000
+        return sum(10.0 * h * w for h, w in self.settings.images(self.load_rig())) + 20_000
 
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""
@@ -129,7 +129,7 @@ class Job:
     def save(self) -> None:
         """Write the file for workers."""
         self.folder.work.mkdir(parents=True, exist_ok=True)
-        write_whole(
+        write_atomic(
             self.file, json.dumps({"root": str(self.root), "tag": self.tag, "config": to_document(self.config)})
         )
 
@@ -156,13 +156,13 @@ class Job:
                 )
             return
         manifest = {"format": FORMAT, "made from": json.loads(json.dumps(identity)), "versions": versions()}
-        write_whole(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
+        write_atomic(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
 
     def write_table(self, fact_file: str) -> int:
         """Write `scenes.jsonl` from what the scenes' folders say; how many there are."""
         facts = [(self.folder.scene(i) / fact_file) for i in self.folder.done()]
         lines = [json.dumps(json.loads(path.read_text(encoding="utf-8"))) for path in facts]
-        write_whole(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
+        write_atomic(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
         return len(lines)
 
 

@@ -15,7 +15,7 @@ from .worker import FACTS
 
 
 def summarise(root: Path) -> str:
-    """Scenes, pictures, disk, time and memory, refusals, and what was given up. Raises ValueError if there is none."""
+    """Scenes, images, disk, time and memory, refusals, and what was given up. Raises ValueError if there is none."""
     folders = scene_folders(root)
     rig = scene_rig(folders[0])
     size = sum(file.stat().st_size for folder in folders for file in folder.iterdir())

@@ -1,6 +1,6 @@
-"""Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one picture a camera.
+"""Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one image a camera.
 
-Every frame is a task of its own that leaves its picture last; `settings.yaml` beside the pictures says what they were
+Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they were
 made with, and a job is resumed with the same settings only. The colours of a sequence's key frames wait in `.keys`
 until all frames are there.
 """
@@ -32,11 +32,11 @@ from ..media.video import write_video
 from ..networks.weights import Network, find_weights, load_weights
 from ..support.jobs import HERE, OnError, Report, Task, Workers, run_tasks
 from .fuse import fuse
-from .results import PictureKind, save_frame, view_of
-from .sequence import KeyColour, KeyFrame, PictureFiles, SequenceFusion
+from .results import ImageFormat, save_frame, view_of
+from .sequence import ImageFiles, KeyColour, KeyFrame, SequenceFusion
 from .views import ViewFiles
 
-PICTURES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.pickle"
 
 
@@ -59,18 +59,18 @@ class Batch:
     match_levels: bool = False
     max_memory: str | None = None
     bits: int = 8
-    kind: PictureKind = "png"
+    kind: ImageFormat = "png"
     alone: bool = False
     """Of a sequence: fuse each frame by itself, without carrying colour; for comparison."""
 
     def __post_init__(self) -> None:
         for name in self.files:
-            self.rig.known(name)
+            self.rig.require(name)
         if self.alpha not in self.files:
-            raise ValueError(f"no picture of alpha, '{self.alpha}'")
+            raise ValueError(f"no image of alpha, '{self.alpha}'")
         if not self.sequence and len({len(files) for files in self.files.values()}) > 1:
             counts = ", ".join(f"{len(files)} of '{name}'" for name, files in self.files.items())
-            raise ValueError(f"frames need as many pictures of each camera, got {counts}; or is it a --sequence?")
+            raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
 
     @cached_property
     def names(self) -> list[str]:
@@ -98,7 +98,7 @@ class Batch:
         }
         return yaml.safe_dump(facts, sort_keys=False)
 
-    def picture(self, i: int) -> Path:
+    def fused_file(self, i: int) -> Path:
         """The file of a fused frame."""
         return self.out / f"{self.names[i]}_fused.{self.kind}"
 
@@ -119,13 +119,13 @@ class Batch:
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
         options: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
         if self.sequence and not self.alone:
-            missing = [i for i in many if not (resume and self.picture(i).exists())]
+            missing = [i for i in many if not (resume and self.fused_file(i).exists())]
             keys = self._fusion().keys_of(missing)
             run_tasks([Task(self._key_file(k), fuse_key, (plan, k)) for k in keys], title="key frames", **options)
-        tasks = [Task(self.picture(i), fuse_one, (plan, i)) for i in many]
+        tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
         report = run_tasks(tasks, title="frames", **options)
         if video is not None and (report.made or report.kept):
-            made = [p for i in many if (p := self.picture(i)).exists()]
+            made = [p for i in many if (p := self.fused_file(i)).exists()]
             write_video(self.out / "fused.mp4", (read_image(p) for p in made), rate=video)
         if not report.failed:
             shutil.rmtree(self.out / KEYS)
@@ -139,7 +139,7 @@ class Batch:
         if not resume:
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
             for i in range(len(self.names)):
-                self.picture(i).unlink(missing_ok=True)
+                self.fused_file(i).unlink(missing_ok=True)
         for folder in (self.out, self.out / KEYS):
             sweep(folder)
         write_text(file, text)
@@ -147,7 +147,7 @@ class Batch:
             temporary.write_bytes(pickle.dumps(self))
 
     def _fusion(self) -> SequenceFusion:
-        frames = {n: PictureFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
+        frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
         options = {"max_memory": self.max_memory}
         return SequenceFusion(
             _network(self.weights),
@@ -216,21 +216,21 @@ def _network(weights: str) -> Network:
     return load_weights(weights)
 
 
-def find_pictures(text: str | Path, *, name: str = "") -> list[Path]:
-    """The pictures of a folder, of a pattern such as "a/mono_*.png", or one file; numbers in names count as numbers.
+def find_images(text: str | Path, *, name: str = "") -> list[Path]:
+    """The images of a folder, of a pattern such as "a/mono_*.png", or one file; numbers in names count as numbers.
 
     Raises FileNotFoundError if there is none.
     """
     path = Path(text)
     label = f"{name}: " if name else ""
     if path.is_dir():
-        found = [p for p in path.iterdir() if p.suffix.lower() in PICTURES and not p.name.startswith(".")]
+        found = [p for p in path.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]
     elif any(c in path.name for c in "*?["):
         found = list(path.parent.glob(path.name))
     else:
         found = [path]
     if not found:
-        raise FileNotFoundError(f"{label}{path}: no pictures there: check the path")
+        raise FileNotFoundError(f"{label}{path}: no images there: check the path")
     return sorted(found, key=_natural)
 
 

@@ -1,4 +1,4 @@
-"""Motion between frames of one camera: optical flow, how far it can be trusted, and pictures carried along it."""
+"""Motion between frames of one camera: optical flow, how far it can be trusted, and images carried along it."""
 
 from __future__ import annotations
 
@@ -40,12 +40,12 @@ def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     return Flow(there, trust * _inside(there))
 
 
-def carried(picture: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
-    """The picture looked up where each pixel goes, bilinearly; outside the frame its nearest pixel."""
-    h, w = picture.shape[-2:]
+def carried(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
+    """The image looked up where each pixel goes, bilinearly; outside the frame its nearest pixel."""
+    h, w = image.shape[-2:]
     x = pixel_grid((h, w)) + step.movedim(0, -1)
     x = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
-    return sample(picture[None], x[None]).values[0]
+    return sample(image[None], x[None]).values[0]
 
 
 def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, "h w"]:
@@ -60,8 +60,8 @@ def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
     return torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))
 
 
-def _bytes(picture: Tensor) -> np.ndarray:
-    return np.rint(picture[0].clamp(0, 1).numpy() * 255).astype(np.uint8)
+def _bytes(image: Tensor) -> np.ndarray:
+    return np.rint(image[0].clamp(0, 1).numpy() * 255).astype(np.uint8)
 
 
 def _inside(step: Tensor) -> Tensor:

@@ -24,28 +24,28 @@ from ..media.colour import linear_from_srgb
 from ..media.images import write_image
 from ..media.raw import developed
 
-PictureKind = Literal["png", "tif", "exr"]
+ImageFormat = Literal["png", "tif", "exr"]
 
 
 def save_frame(
-    frame: FusedFrame,
+    frame: Frame,
     out: Path,
     *,
     bits: int = 8,
-    kind: PictureKind = "png",
+    kind: ImageFormat = "png",
     view: Rig | None = None,
     name: str = "",
 ) -> list[Path]:
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN as 0) and depth.png (near is bright).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The picture
+    rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The image
     is written last: where it is, the others are. Each appears whole or not at all. Without any known depth there are
     no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on, their mean to fused.png.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""
-    picture, confidence = out / f"{prefix}fused.{kind}", out / f"{prefix}confidence.png"
+    fused, confidence = out / f"{prefix}fused.{kind}", out / f"{prefix}confidence.png"
     write_image(confidence, frame.confidence[None])
     written = [confidence]
     if frame.depth.isfinite().any():
@@ -62,12 +62,12 @@ def save_frame(
         for file, band in bands.items():
             write_image(file, band, bits=bits)
         written, image = [*bands, *written], image.mean(0, keepdim=True)
-    write_image(picture, image, bits=bits)
-    return [picture, *written]
+    write_image(fused, image, bits=bits)
+    return [fused, *written]
 
 
 def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
-    """The rig of fused pictures: alpha's camera alone, its values coded as `save_frame` writes them."""
+    """The rig of fused images: alpha's camera alone, its values coded as `save_frame` writes them."""
     coding = "linear" if bits == 32 else "srgb"
     response = "rgb" if bands == 3 else rig[alpha].sensor.response
     sensor = dataclasses.replace(developed(rig[alpha].sensor), coding=coding, response=response)
@@ -95,13 +95,13 @@ def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
 
 
 def draw_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0) -> Figure:
-    """One figure, `width` inches wide, of pictures by title, row by row."""
+    """One figure, `width` inches wide, of images by title, row by row."""
     rows = -(-len(panels) // columns)
     h, w = next(iter(panels.values())).shape[-2:]
     figure = Figure(figsize=(width, (width / columns * h / w + 0.3) * rows), layout="constrained")
-    for i, (title, picture) in enumerate(panels.items()):
+    for i, (title, image) in enumerate(panels.items()):
         axes = figure.add_subplot(rows, columns, i + 1, title=title)
-        axes.imshow(picture.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
+        axes.imshow(image.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
         axes.set_axis_off()
     return figure
 
@@ -111,7 +111,7 @@ def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, col
     save_figure(draw_panels(panels, columns=columns, width=16), path)
 
 
-class FusedFrame(NamedTuple):
+class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.

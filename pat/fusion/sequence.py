@@ -4,7 +4,7 @@ Colour is fused at key frames, those of alpha nearest in time to what a beta rec
 where the points of alpha were at its own time (`Moved`), with room for what is not known of that (`Widened`). From
 the key frames before and after, it is carried to each frame along the motion between alpha's own frames, and mixed
 by time, confidence, and trust in the motion. So colour does not flicker from frame to frame as single fusions do,
-and a frame depends on nothing but pictures: any one can be made alone, in any order, with the same result.
+and a frame depends on nothing but images: any one can be made alone, in any order, with the same result.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from ..media.raw import develop
 from ..networks.protocol import FusionNetwork
 from .fuse import fuse
 from .optical_flow import carried, flow_between, still
-from .results import FusedFrame
+from .results import Frame
 
 
 @runtime_checkable
 class Frames(Protocol):
-    """Pictures (C, H, W) of one camera in the order of time: a list, or read when asked for (`PictureFiles`)."""
+    """Images (C, H, W) of one camera in the order of time: a list, or read when asked for (`ImageFiles`)."""
 
     def __len__(self) -> int:
         """How many."""
@@ -55,10 +55,10 @@ NEIGHBOURS = 4
 """Levels are matched over this many key frames before and after."""
 
 
-class PictureFiles:
-    """Picture files of one camera, read and developed (`pat.media.raw`) when asked for.
+class ImageFiles:
+    """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
 
-    `like` is the sensor of alpha, whose scale of light the pictures are brought to.
+    `like` is the sensor of alpha, whose scale of light the images are brought to.
     """
 
     def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
@@ -71,9 +71,9 @@ class PictureFiles:
     def __getitem__(self, i: int, /) -> Tensor:
         """Raises FileNotFoundError or ValueError naming camera and file."""
         path = self.paths[i]
-        picture = read_image(path, name=self.name, bits=self.view.sensor.bits)
-        check_size(picture, self.view.hw, f"{self.name}: {path}")
-        return develop(picture, self.view.sensor, like=self.like)
+        image = read_image(path, name=self.name, bits=self.view.sensor.bits)
+        check_size(image, self.view.hw, f"{self.name}: {path}")
+        return develop(image, self.view.sensor, like=self.like)
 
 
 class KeyFrame(NamedTuple):
@@ -181,10 +181,10 @@ class SequenceFusion:
 
     def grey(self, i: int) -> Float[Tensor, "1 h w"]:
         """Alpha's frame."""
-        picture = self.frames[self.alpha][i]
-        return luminance(picture) if picture.shape[0] == 3 else picture
+        image = self.frames[self.alpha][i]
+        return luminance(image) if image.shape[0] == 3 else image
 
-    def alone(self, i: int) -> FusedFrame:
+    def alone(self, i: int) -> Frame:
         """The frame fused by itself with the betas nearest in time, motion or not: what carrying is compared with."""
         return self._fused(i, self.timeline.at(i), {}, self.match_levels)
 
@@ -198,7 +198,7 @@ class SequenceFusion:
         inverse = (1 / frame.depth).nan_to_num(0.0)
         return KeyColour(frame.image - self.grey(key.alpha), frame.confidence * trust, inverse)
 
-    def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> FusedFrame:
+    def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> Frame:
         """Any frame, its colour carried from the key frames around it.
 
         `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none could.
@@ -218,8 +218,8 @@ class SequenceFusion:
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
-        reach = max(REACH * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
-        return [k for k in keys if gaps[k.alpha] <= reach]
+        disparity = max(REACH * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
+        return [k for k in keys if gaps[k.alpha] <= disparity]
 
     def _carried(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> Source:
         gap = abs(self._time(key.alpha) - self._time(i))
@@ -252,10 +252,10 @@ class SequenceFusion:
             return self.speed * abs(gap)
         return UNKNOWN_MOTION * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
 
-    def _fused(self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], alone: bool) -> FusedFrame:
+    def _fused(self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], alone: bool) -> Frame:
         images = {name: self.frames[name][j] for name, j in betas.items()}
         if self.match_levels and not alone:
-            images = {name: self._levelled(name, image, i) for name, image in images.items()}
+            images = {name: self._normalised(name, image, i) for name, image in images.items()}
         looks = dict.fromkeys(betas, self.looks) if self.looks else {}
         return fuse(
             self.network,
@@ -267,8 +267,8 @@ class SequenceFusion:
             **self.options,
         )
 
-    def _levelled(self, name: str, image: Tensor, i: int) -> Tensor:
-        """Beta's picture with alpha's mean and spread, both over several key frames so that they do not flicker."""
+    def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
+        """Beta's image with alpha's mean and spread, both over several key frames so that they do not flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - NEIGHBOURS, 0) : nearest + NEIGHBOURS + 1]
@@ -292,7 +292,7 @@ DISAGREEMENT = 0.1
 """Where sources' colours are this far apart, confidence falls to 1 / e."""
 
 
-def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[Source]) -> FusedFrame:
+def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[Source]) -> Frame:
     """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
 
     Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same disagree.
@@ -307,7 +307,7 @@ def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[Source]) -> FusedFrame:
     weights = torch.where(known, weights, 0.0)
     inverse = (weights * torch.stack([s.inverse_depth for s in sources])).sum(0) / weights.sum(0).clamp(min=1e-12)
     depth = torch.where(known.any(0), 1 / torch.where(known.any(0), inverse, 1.0), torch.nan)
-    return FusedFrame(own + colour, depth, confidence * torch.exp(-apart / DISAGREEMENT**2))
+    return Frame(own + colour, depth, confidence * torch.exp(-apart / DISAGREEMENT**2))
 
 
 def fuse_sequence(
@@ -320,7 +320,7 @@ def fuse_sequence(
     field: ReceptiveField | None = None,
     match_levels: bool = False,
     **options: Any,
-) -> Iterator[FusedFrame]:
+) -> Iterator[Frame]:
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
@@ -359,6 +359,6 @@ def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tens
     return sum(changes) / len(changes)
 
 
-def _levels(picture: Tensor) -> tuple[float, float]:
+def _levels(image: Tensor) -> tuple[float, float]:
     """Mean and standard deviation."""
-    return float(picture.mean()), float(picture.std())
+    return float(image.mean()), float(image.std())

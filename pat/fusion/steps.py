@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from arraygeom import ReceptiveField
 from arraygeom.fields.default import default_field
 
-from .results import FusedFrame
+from .results import Frame
 
 Fields = Mapping[str, ReceptiveField | None]
 
@@ -36,13 +36,13 @@ from arraygeom import (
     apply_homography,
     pinhole_view,
     pixel_grid,
-    retaken,
+    resampled,
 )
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
 from ..media.colour import luminance
-from ..media.images import Pictures
+from ..media.images import Images
 from ..networks.protocol import FusionNetwork, Look
 from .tiles import (
     touched,
@@ -89,15 +89,15 @@ def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Ma
     return [joined.index((name, band)) for name in names for band in range(bands[name])]
 
 
-def without_lenses(rig: Rig, images: Pictures) -> tuple[Rig, dict[str, Tensor]]:
-    """The rig and its pictures with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
+def without_lenses(rig: Rig, images: Images) -> tuple[Rig, dict[str, Tensor]]:
+    """The rig and its images with pinhole views in place of cameras with lenses; see `arraygeom.pinhole_view`."""
     straight = dict(images)
     for name, image in images.items():
         camera = rig[name]
         if isinstance(camera, LensView) and camera.distortion is not None:
             view = pinhole_view(camera)
-            rig = rig.mapped(name, view.K @ torch.linalg.inv(camera.K), view.hw).with_camera(name, view)
-            straight[name] = retaken(image, camera, view, extended=True).values[0].clamp(min=0)
+            rig = rig.transformed(name, view.K @ torch.linalg.inv(camera.K), view.hw).with_camera(name, view)
+            straight[name] = resampled(image, camera, view, extended=True).values[0].clamp(min=0)
     return rig, straight
 
 
@@ -125,53 +125,53 @@ def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> Re
     return Moved(field.field, step.movedim(-1, 0).to(field.displacement))
 
 
-def _bent(frame: FusedFrame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> FusedFrame:
-    """The frame at the pixels of alpha's own picture."""
+def _bent(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:
+    """The frame at the pixels of alpha's own image."""
     if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
         return frame
     added = frame.image - _grey(straight)
     inverse = (1 / frame.depth).nan_to_num(0.0)
-    back = retaken(torch.cat([added, frame.confidence[None]]), pinhole, lens, interpolation="bilinear").values[0]
-    depth = 1 / retaken(inverse[None], pinhole, lens, interpolation="nearest").values[0, 0]
-    return FusedFrame(_grey(own) + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
+    back = resampled(torch.cat([added, frame.confidence[None]]), pinhole, lens, interpolation="bilinear").values[0]
+    depth = 1 / resampled(inverse[None], pinhole, lens, interpolation="nearest").values[0, 0]
+    return Frame(_grey(own) + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
 
 
-def levelled(picture: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
-    """The picture with the mean and the standard deviation of another; not cut to 0..1."""
-    return (picture - picture.mean()) / picture.std().clamp(min=1e-6) * like.std() + like.mean()
+def normalised(image: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
+    """The image with the mean and the standard deviation of another; not cut to 0..1."""
+    return (image - image.mean()) / image.std().clamp(min=1e-6) * like.std() + like.mean()
 
 
-def _grey(picture: Tensor) -> Tensor:
-    return luminance(picture) if picture.shape[0] == 3 else picture
+def _grey(image: Tensor) -> Tensor:
+    return luminance(image) if image.shape[0] == 3 else image
 
 
 def _common_part(
-    pair: Pair, picture: Tensor, field: ReceptiveField | None, network: FusionNetwork
+    pair: Pair, image: Tensor, field: ReceptiveField | None, network: FusionNetwork
 ) -> tuple[Pair, Tensor]:
     """A calibrated beta without what alpha never looks at, if that is much: it would be enlarged for nothing.
 
-    Not where the field may go by the pictures' sizes.
+    Not where the field may go by the images' sizes.
     """
     h, w = pair.beta.hw
     follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
     if not follows or pair.link is not None or not pair.calibrated or pitch_ratio(pair) > 0.8:
-        return pair, picture
+        return pair, image
     found = Look.along(field or default_field(pair), pair).at(coarse_grid(pair.alpha.hw).reshape(-1, 2))
     top, bottom, left, right = touched(found, (h, w), network)
     if (bottom - top) * (right - left) > 0.75 * h * w:
-        return pair, picture
-    part = pair.map_beta(shift_matrix(left, top), (bottom - top, right - left))
-    return part, picture[..., top:bottom, left:right]
+        return pair, image
+    part = pair.transform_beta(shift_matrix(left, top), (bottom - top, right - left))
+    return part, image[..., top:bottom, left:right]
 
 
-def _at_equal_pitch(pair: Pair, picture: Tensor) -> tuple[Pair, Tensor]:
+def _at_equal_pitch(pair: Pair, image: Tensor) -> tuple[Pair, Tensor]:
     """Beta resized so that where the views meet its pixels are about the size of alpha's."""
     scale = pitch_ratio(pair)
     if 0.8 < scale < 1.25:
-        return pair, picture
+        return pair, image
     hw = (max(round(pair.beta.hw[0] / scale), 16), max(round(pair.beta.hw[1] / scale), 16))
-    picture = interpolate(picture, size=hw, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
-    return pair.resize_beta(hw), picture
+    image = interpolate(image, size=hw, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
+    return pair.resize_beta(hw), image
 
 
 def pitch_ratio(pair: Pair) -> float:
@@ -182,7 +182,7 @@ def pitch_ratio(pair: Pair) -> float:
 
 
 def quarter_turns(pair: Pair) -> int:
-    """How often beta's picture must be turned (see `Camera.turn`) to be upright as alpha's is, 0 to 3."""
+    """How often beta's image must be turned (see `Camera.turn`) to be upright as alpha's is, 0 to 3."""
     steps = _steps_in_beta(pair)
     if steps is None:
         return 0

@@ -25,12 +25,12 @@ from arraygeom.atomic import write_atomically
 from arraygeom.pixels import HW
 
 from ..networks.protocol import FusionNetwork, Look
-from ..networks.semi_global import Consensus
+from ..networks.semi_global import SemiGlobalMatches
 from ..support.memory import give_back
-from .results import FusedFrame
+from .results import Frame
 
 REACH = 224
-"""The widest halo, pixels: what is farther off changes pictures by at most 2.2e-6 with trained weights (at 192 pixels
+"""The widest halo, pixels: what is farther off changes images by at most 2.2e-6 with trained weights (at 192 pixels
 3e-5, at 160 2e-4; measured on three scenes), whatever their convolutions could carry."""
 SURVEY_REACH = 256
 """The halo of the pieces of a survey, pixels."""
@@ -49,19 +49,19 @@ FRAME_BYTES = 20.0
 
 @dataclass(frozen=True)
 class Beta:
-    """One beta, ready for the network: its picture (1, C, H, W), its pair with alpha, where to look.
+    """One beta, ready for the network: its image (1, C, H, W), its pair with alpha, where to look.
 
     `points` says where alpha's pixels are when beta records: elsewhere only if they move (`Moved`).
     """
 
-    picture: Tensor
+    image: Tensor
     pair: Pair
     look: Look
     points: Callable[[Tensor], Tensor]
 
 
 class Tile(NamedTuple):
-    """Rows and columns of the output, and of alpha's picture that they need: (top, bottom, left, right)."""
+    """Rows and columns of the output, and of alpha's image that they need: (top, bottom, left, right)."""
 
     inner: tuple[int, int, int, int]
     outer: tuple[int, int, int, int]
@@ -198,7 +198,12 @@ class Probe(NamedTuple):
             middle = time.perf_counter()
             fuse_tile(betas, piece)
             end = time.perf_counter()
-        known = sum(part.nbytes for consensus in found if consensus is not None for part in consensus)
+        known = sum(
+            part.nbytes
+            for semi_global_matching in found
+            if semi_global_matching is not None
+            for part in semi_global_matching
+        )
         surveying, pixels = middle - begin, _area(piece.outer)
         again = surveying if known else 0.0
         return cls(known / pixels, surveying / pixels, max(end - middle - again, 0.0) / pixels)
@@ -216,10 +221,10 @@ def _middle(hw: HW, side: int, multiple: int) -> Tile:
 
 
 def held_memory(own: Tensor, betas: list[Beta], known: float, *, frame: bool) -> float:
-    """Bytes of the process that do not depend on the tiles: libraries, pictures, survey, and the frame if kept."""
+    """Bytes of the process that do not depend on the tiles: libraries, images, survey, and the frame if kept."""
     pixels = own.shape[-2] * own.shape[-1]
-    pictures = own.nbytes + sum(beta.picture.nbytes for beta in betas)
-    return LIBRARIES + pictures + pixels * (known + (FRAME_BYTES if frame else 0.0))
+    images = own.nbytes + sum(beta.image.nbytes for beta in betas)
+    return LIBRARIES + images + pixels * (known + (FRAME_BYTES if frame else 0.0))
 
 
 def survey_tiles(network: FusionNetwork, hw: HW) -> list[Tile]:
@@ -233,23 +238,25 @@ def surveyed(network: FusionNetwork, alpha: Tensor, beta: Beta, pieces: list[Til
     """The beta with what the network wants to know before it fuses pieces of a frame."""
     m = network.multiple
     with torch.no_grad():
-        told = replace(beta, look=network.balance(padded(alpha, m), padded(beta.picture, m), beta.look))
+        told = replace(beta, look=network.normalisation(padded(alpha, m), padded(beta.image, m), beta.look))
         if len(pieces) == 1:
-            known = network.survey(padded(alpha, m), padded(beta.picture, m), told.look)
+            known = network.survey(padded(alpha, m), padded(beta.image, m), told.look)
         else:
             known = _joined(((p, survey_piece(network, alpha, told, p)) for p in pieces), network, alpha)
     return replace(told, look=replace(told.look, known=known))
 
 
-def survey_piece(network: FusionNetwork, alpha: Tensor, beta: Beta, tile: Tile) -> Consensus | None:
+def survey_piece(network: FusionNetwork, alpha: Tensor, beta: Beta, tile: Tile) -> SemiGlobalMatches | None:
     """The survey of a piece of alpha with the strip of beta that it looks at."""
     top, bottom, left, right = tile.outer
     part, m = strip(beta, tile.outer, network), network.multiple
     with torch.no_grad():
-        return network.survey(padded(alpha[..., top:bottom, left:right], m), padded(part.picture, m), part.look)
+        return network.survey(padded(alpha[..., top:bottom, left:right], m), padded(part.image, m), part.look)
 
 
-def _joined(pieces: Iterator[tuple[Tile, Consensus | None]], network: FusionNetwork, alpha: Tensor) -> Consensus | None:
+def _joined(
+    pieces: Iterator[tuple[Tile, SemiGlobalMatches | None]], network: FusionNetwork, alpha: Tensor
+) -> SemiGlobalMatches | None:
     """The survey of a whole frame (to whole multiples) from the inner parts of its pieces."""
     hw = [-(-n // network.multiple) * network.multiple for n in alpha.shape[-2:]]
     whole: list[Tensor] = []
@@ -265,14 +272,14 @@ def _joined(pieces: Iterator[tuple[Tile, Consensus | None]], network: FusionNetw
             target[..., box[0] // s : box[1] // s, box[2] // s : box[3] // s] = p
         del found, part, p
         give_back()
-    return Consensus(*whole)
+    return SemiGlobalMatches(*whole)
 
 
 @dataclass(frozen=True)
 class Strip:
     """The part of a beta that a tile needs. `look` maps the tile's pixels to the strip's; `offset` is its corner."""
 
-    picture: Tensor
+    image: Tensor
     look: Look
     pair: Pair
     offset: tuple[int, int]
@@ -298,7 +305,7 @@ def strip(beta: Beta, outer: tuple[int, int, int, int], network: FusionNetwork) 
     if known is not None:
         known = known.cut((top, top - (top - bottom) // m * m, left, left - (left - right) // m * m))
     look = replace(beta.look, at=at, known=known)
-    return Strip(beta.picture[..., y0:y1, x0:x1], look, beta.pair, (x0, y0), beta.points)
+    return Strip(beta.image[..., y0:y1, x0:x1], look, beta.pair, (x0, y0), beta.points)
 
 
 def touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tuple[int, int, int, int]:
@@ -315,10 +322,10 @@ def touched(found: Segments | Positions, hw: HW, network: FusionNetwork) -> tupl
     return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
 
 
-def padded(picture: Tensor, multiple: int) -> Tensor:
-    """The picture continued at the bottom and the right to whole multiples."""
-    h, w = picture.shape[-2:]
-    return pad(picture, (0, -w % multiple, 0, -h % multiple), mode="replicate")
+def padded(image: Tensor, multiple: int) -> Tensor:
+    """The image continued at the bottom and the right to whole multiples."""
+    h, w = image.shape[-2:]
+    return pad(image, (0, -w % multiple, 0, -h % multiple), mode="replicate")
 
 
 class TileStore(NamedTuple):
@@ -332,14 +339,14 @@ class TileStore(NamedTuple):
         """The store for one frame's tiles."""
         digest = hashlib.sha256(type(network).__name__.encode())
         parameters = network.state_dict().values() if isinstance(network, nn.Module) else ()
-        for tensor in (*parameters, own, *(b.picture for b in betas)):
+        for tensor in (*parameters, own, *(b.image for b in betas)):
             digest.update(tensor.detach().cpu().contiguous().numpy())
         x = pixel_grid((own.shape[-2], own.shape[-1]), dtype=torch.float64)[::64, ::64].reshape(-1, 2)
         for beta in betas:
             digest.update(b"".join(part.numpy().tobytes() for part in vars(beta.look.at(x)).values()))
         return cls(folder, digest.hexdigest()[:16])
 
-    def keep(self, tile: Tile, make: Callable[[Tile], FusedFrame]) -> None:
+    def keep(self, tile: Tile, make: Callable[[Tile], Frame]) -> None:
         """Make a tile, unless it is there."""
         file = self._file(tile)
         if file.exists():
@@ -348,9 +355,9 @@ class TileStore(NamedTuple):
         with write_atomically(file) as temporary:
             save_file({name: part.contiguous() for name, part in frame._asdict().items()}, temporary)
 
-    def fetch(self, tile: Tile) -> FusedFrame:
+    def fetch(self, tile: Tile) -> Frame:
         """A tile that was kept."""
-        return FusedFrame(**load_file(self._file(tile)))
+        return Frame(**load_file(self._file(tile)))
 
     def _file(self, tile: Tile) -> Path:
         return self.folder / f"{self.digest}_{'_'.join(map(str, (*tile.inner, *tile.outer)))}.safetensors"

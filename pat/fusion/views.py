@@ -15,14 +15,14 @@ from ..media.raw import develop, developed_rig
 
 
 class Views(NamedTuple):
-    """Pictures ready to fuse, and the rig that says so of them."""
+    """Images ready to fuse, and the rig that says so of them."""
 
     rig: Rig
     images: dict[str, Tensor]
 
 
 class ViewFiles(Mapping[str, Tensor]):
-    """A picture file of each camera, read and developed when asked for, and not kept.
+    """An image file of each camera, read and developed when asked for, and not kept.
 
     Asking raises as `read_views` does.
     """
@@ -38,20 +38,20 @@ class ViewFiles(Mapping[str, Tensor]):
 
     def __getitem__(self, name: str) -> Tensor:
         path, view = self.files[name], self.rig[name]
-        picture = read_image(path, name=name, bits=view.sensor.bits)
-        check_size(picture, view.hw, f"{name}: {path}")
-        if view.sensor.bayer and picture.shape[0] != 1:
+        image = read_image(path, name=name, bits=view.sensor.bits)
+        check_size(image, view.hw, f"{name}: {path}")
+        if view.sensor.bayer and image.shape[0] != 1:
             raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
-        return develop(picture, view.sensor, like=self.like)
+        return develop(image, view.sensor, like=self.like)
 
     @property
     def developed(self) -> Rig:
-        """The rig that says of the pictures what they are now."""
+        """The rig that says of the images what they are now."""
         return developed_rig(self.rig, self.files)
 
 
 def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> Views:
-    """Read one picture of each camera and develop it.
+    """Read one image of each camera and develop it.
 
     Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another size
     than the rig says, or is in colour where the rig says raw.

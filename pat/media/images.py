@@ -1,7 +1,7 @@
-"""Pictures on disk and their colours.
+"""Images on disk and their colours.
 
-A picture in memory is a float tensor (C, H, W), 0..1, in the coding the file has (sRGB for ordinary
-pictures), colours in the order red, green, blue. Files appear whole or not at all.
+An image in memory is a float tensor (C, H, W), 0..1, in the coding the file has (sRGB for ordinary
+images), colours in the order red, green, blue. Files appear whole or not at all.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from torch import Tensor
 from arraygeom.atomic import write_atomically
 
 _ROWS = 256
-"""Worked off at once, where copies of a whole picture would take much memory."""
+"""Worked off at once, where copies of a whole image would take much memory."""
 
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
 
 @runtime_checkable
-class Pictures(Protocol):
-    """Pictures (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`)."""
+class Images(Protocol):
+    """Images (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`)."""
 
     def __getitem__(self, name: str, /) -> Tensor:
         """One of them."""
@@ -47,19 +47,19 @@ class Pictures(Protocol):
         ...
 
     def items(self) -> ItemsView[str, Tensor]:
-        """Cameras with their pictures."""
+        """Cameras with their images."""
         ...
 
 
 def read_image(path: str | Path, *, name: str | None = None, bits: int | None = None) -> Float[Tensor, "c h w"]:
-    """The picture in a PNG, TIFF, JPEG or PNM file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+    """The image in a PNG, TIFF, JPEG or PNM file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
     must hold 0..1. A wholly opaque alpha channel is dropped. Rotation tags (EXIF) are ignored: pixels are where the
     sensor, hence its calibration, has them. `name` (such as a camera's) goes in front of error messages.
 
-    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable picture.
+    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image.
     """
     path = Path(path)
     label = f"{name}: {path}" if name else f"{path}"
@@ -70,18 +70,18 @@ def read_image(path: str | Path, *, name: str | None = None, bits: int | None = 
 
 
 def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
-    """Write a grey or RGB picture, whole or not at all, in the format its name ends in (.png, .tif, .jpg, .exr).
+    """Write a grey or RGB image, whole or not at all, in the format its name ends in (.png, .tif, .jpg, .exr).
 
     8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif and .exr only) keep
-    floats as they are. An .exr file needs the extra `synthesis`. Raises ValueError for a picture with NaN or another
+    floats as they are. An .exr file needs the extra `synthesis`. Raises ValueError for an image with NaN or another
     number of channels, and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
-        raise ValueError(f"{path}: a picture has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
+        raise ValueError(f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
     if not np.isfinite(planes).all():
-        raise ValueError(f"{path}: the picture to write has NaN or infinite values")
+        raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
     content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
@@ -92,11 +92,11 @@ def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 
 def _decode(path: Path, label: str) -> tuple[NDArray, int]:
     """The values, and how many bits a value has in a TIFF file that packs them into less than 16; 0 if none does."""
     if not path.is_file():
-        raise FileNotFoundError(f"{label}: no such picture: check the path")
+        raise FileNotFoundError(f"{label}: no such image: check the path")
     content = np.frombuffer(path.read_bytes(), np.uint8)
     coded = _decode_bytes(content)
     if coded is None:
-        raise ValueError(f"{label}: not a picture that can be read: give a whole PNG, TIFF or JPEG file")
+        raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
     return coded, _packed_bits(path) if coded.dtype == np.uint16 and path.suffix.lower() in (".tif", ".tiff") else 0
 
 
@@ -128,7 +128,7 @@ def _opaque(coded: NDArray, label: str) -> NDArray:
     if coded.ndim == 2 or coded.shape[2] == 3:
         return coded
     if coded.shape[2] != 4:
-        raise ValueError(f"{label}: has {coded.shape[2]} channels: give a grey (1) or RGB (3) picture")
+        raise ValueError(f"{label}: has {coded.shape[2]} channels: give a grey (1) or RGB (3) image")
     full = np.iinfo(coded.dtype).max if np.issubdtype(coded.dtype, np.integer) else 1.0
     if (coded[..., 3] != full).any():
         raise ValueError(f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha")
@@ -192,7 +192,7 @@ def _encode(path: Path, colours: NDArray, bits: int) -> bytes:
     except cv2.error:
         done = False
     if not done:
-        raise ValueError(f"{path}: cannot write a picture named so: end the name in .png, .tif or .jpg")
+        raise ValueError(f"{path}: cannot write an image named so: end the name in .png, .tif or .jpg")
     return content.tobytes()
 
 
@@ -209,8 +209,8 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
     return counts
 
 
-def check_size(picture: Float[Tensor, "c h w"], hw: tuple[int, int], label: str) -> None:
-    """Raises ValueError unless the picture has this height and width."""
-    if tuple(picture.shape[1:]) != hw:
-        got, wanted = (f"{w}x{h}" for h, w in (picture.shape[1:], hw))
-        raise ValueError(f"{label}: is {got}, the rig says {wanted}: resize the rig, or give the right picture")
+def check_size(image: Float[Tensor, "c h w"], hw: tuple[int, int], label: str) -> None:
+    """Raises ValueError unless the image has this height and width."""
+    if tuple(image.shape[1:]) != hw:
+        got, wanted = (f"{w}x{h}" for h, w in (image.shape[1:], hw))
+        raise ValueError(f"{label}: is {got}, the rig says {wanted}: resize the rig, or give the right image")

@@ -1,7 +1,7 @@
-"""Pictures as cameras record them -> pictures to fuse: what the rig says of counts, filters, exposure and coding.
+"""Images as cameras record them -> images to fuse: what the rig says of counts, filters, exposure and coding.
 
-Pictures to fuse are coded as sRGB, on alpha's scale of light: where exposures and gains are known, a surface has one
-value in all of them. Ordinary pictures, of which the rig says nothing, pass as they are.
+Images to fuse are coded as sRGB, on alpha's scale of light: where exposures and gains are known, a surface has one
+value in all of them. Ordinary images, of which the rig says nothing, pass as they are.
 """
 
 from __future__ import annotations
@@ -20,53 +20,53 @@ from arraygeom import Rig, Sensor
 from .colour import linear_from_srgb, luminance, srgb_from_linear
 
 _ROWS = 256
-"""Worked off at once, where copies of a whole picture would take much memory."""
+"""Worked off at once, where copies of a whole image would take much memory."""
 
 
-def develop(picture: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None) -> Float[Tensor, "c2 h w"]:
-    """The picture coded as sRGB: black level off, colours from the filter pattern, light on `like`'s scale.
+def develop(image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None) -> Float[Tensor, "c2 h w"]:
+    """The image coded as sRGB: black level off, colours from the filter pattern, light on `like`'s scale.
 
-    `picture` holds counts over 2^bits - 1. Values stay above 0, and exceed 1 where `sensor` saw more light than white
+    `image` holds counts over 2^bits - 1. Values stay above 0, and exceed 1 where `sensor` saw more light than white
     is on `like`'s scale. The exposure counts only where both are known.
     """
     factor = _light(sensor, like or sensor)
     if sensor.black_level:
         black = sensor.black_level / (2.0 ** (sensor.bits or 16) - 1)
-        picture = ((picture - black) / (1 - black)).clamp(min=0)
+        image = ((image - black) / (1 - black)).clamp(min=0)
     if sensor.bayer:
-        picture = demosaiced(picture, sensor.bayer)
+        image = demosaiced(image, sensor.bayer)
     if factor == (1.0, 1.0, 1.0):
-        return srgb_from_linear(picture) if sensor.coding == "linear" else picture
-    linear = picture if sensor.coding == "linear" else linear_from_srgb(picture)
+        return srgb_from_linear(image) if sensor.coding == "linear" else image
+    linear = image if sensor.coding == "linear" else linear_from_srgb(image)
     scale = linear.new_tensor(factor if len(linear) == 3 else factor[1:2])
     return srgb_from_linear(linear * scale[:, None, None])
 
 
 LIGHT = "luminance of light"
-"""The response of developed pictures of which it is known that they are the luminance of linear light, coded as sRGB.
+"""The response of developed images of which it is known that they are the luminance of linear light, coded as sRGB.
 
-Of ordinary grey pictures it is not known: many are the luminance of coded values, which is another where colours are
+Of ordinary grey images it is not known: many are the luminance of coded values, which is another where colours are
 strong."""
 
 
 def developed(sensor: Sensor) -> Sensor:
-    """What is true of a camera's pictures once they are developed: values are sRGB, counts and filters are gone."""
+    """What is true of a camera's images once they are developed: values are sRGB, counts and filters are gone."""
     measured = sensor.response == "mono" and sensor.coding == "linear"
     plain = dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
     return dataclasses.replace(plain, response=LIGHT) if measured else plain
 
 
 def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
-    """The rig that says of the developed pictures of these cameras what they are."""
+    """The rig that says of the developed images of these cameras what they are."""
     for name in names:
         rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
     return rig
 
 
 def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
-    """The fused picture as bright as alpha's camera saw it, if that measured the luminance of light (`LIGHT`).
+    """The fused image as bright as alpha's camera saw it, if that measured the luminance of light (`LIGHT`).
 
-    Fusion gives a picture whose coded values have alpha's as their luminance. Here all three are moved by the same
+    Fusion gives an image whose coded values have alpha's as their luminance. Here all three are moved by the same
     amount until the luminance of their light is that of alpha's: by 0.045 for saturated purple of middle brightness.
     """
     if sensor.response != LIGHT:
@@ -86,7 +86,7 @@ def _missing(image: Tensor, light: Tensor) -> Tensor:
 
 
 def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h w"]:
-    """Colours of a raw picture behind a colour filter mosaic, interpolated along edges (OpenCV, in 16 bits).
+    """Colours of a raw image behind a colour filter mosaic, interpolated along edges (OpenCV, in 16 bits).
 
     Red and blue are green plus the median of their differences from it over 3x3 pixels (Freeman, US patent 4,724,395):
     fringes of false colour at fine detail would be carried to where alpha sees it sharp.
@@ -106,7 +106,7 @@ def light_of(sensor: Sensor, like: Sensor) -> float:
 
 
 def _light(sensor: Sensor, like: Sensor) -> tuple[float, float, float]:
-    """What to multiply linear red, green and blue with; a grey picture takes the middle one."""
+    """What to multiply linear red, green and blue with; a grey image takes the middle one."""
     both = sensor.exposure is not None and like.exposure is not None
     exposure = like.exposure / sensor.exposure if both and like.exposure and sensor.exposure else 1.0
     wanted = _gains(like)[1]

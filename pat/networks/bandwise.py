@@ -18,9 +18,9 @@ from torch import Tensor, nn
 from arraygeom import Segments
 
 from .guided import Encoded, GuidedPAT, GuidedPATConfig, Seen, fused_from, hw_of, segments_of
-from .protocol import Fused, Look, Looks
-from .semi_global import FINE, Balances, Consensus, consensus
-from .spectral_mix import Mix, coarse_mix, consensus_of_bands
+from .protocol import FusionOutput, Look, Looks
+from .semi_global import FINE, Normalisations, SemiGlobalMatches, semi_global_matching
+from .spectral_mix import SpectralMix, coarse_mix, semi_global_matching_of_bands
 
 COARSELY = 400_000
 """Pixels of alpha at most on which the bands' combination is found."""
@@ -55,39 +55,41 @@ class BandwisePAT(nn.Module):
         if config.head_dim and self.single.head.last.bias is not None:
             nn.init.zeros_(self.single.head.last.bias)
 
-    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
-        """The look with how the bands of the whole pictures are combined, levelled and made equally sharp."""
+    def normalisation(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
+        """The look with how the bands of the whole images are combined, levelled and made equally sharp."""
         factor = 2
         while factor < self.multiple // 2 and alpha.shape[-2] * alpha.shape[-1] > COARSELY * factor**2:
             factor *= 2
         mix = coarse_mix(alpha, beta, *_segments(alpha, look, factor), factor)
-        return replace(look, mix=mix, balances=Balances.of(alpha, mix.of(beta)))
+        return replace(look, mix=mix, normalisations=Normalisations.of(alpha, mix.of(beta)))
 
-    def _told(self, alpha: Tensor, beta: Tensor, look: Look) -> tuple[Mix, Balances]:
-        """What `balance` says, of these pictures if not known of the whole ones."""
-        if look.mix is None or look.balances is None:
-            look = self.balance(alpha, beta, look)
+    def _told(self, alpha: Tensor, beta: Tensor, look: Look) -> tuple[SpectralMix, Normalisations]:
+        """What `balance` says, of these images if not known of the whole ones."""
+        if look.mix is None or look.normalisations is None:
+            look = self.normalisation(alpha, beta, look)
         assert look.mix is not None
-        assert look.balances is not None
-        return look.mix, look.balances
+        assert look.normalisations is not None
+        return look.mix, look.normalisations
 
-    def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
+    def survey(
+        self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look
+    ) -> SemiGlobalMatches:
         """What can be known before attention looks, once for all bands of a beta."""
-        mix, balances = self._told(alpha, beta, look)
+        mix, normalisations = self._told(alpha, beta, look)
         whole, blocks = _segments(alpha, look, 1)
         if beta.shape[1] == 1:
-            return consensus(alpha, beta, beta, whole, blocks, balances)
-        return consensus_of_bands(alpha, beta, whole, blocks, mix, balances)
+            return semi_global_matching(alpha, beta, beta, whole, blocks, normalisations)
+        return semi_global_matching_of_bands(alpha, beta, whole, blocks, mix, normalisations)
 
     def forward(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> Fused:
+    ) -> FusionOutput:
         """Fuse alpha with each band of each beta. Position, spread and confidence are one for each beta."""
         return self.explain(alpha, betas, looks)[0]
 
     def explain(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> tuple[Fused, list[Seen]]:
+    ) -> tuple[FusionOutput, list[Seen]]:
         """The same, with what each beta told, which training supervises."""
         own = self.single.encoder(alpha)
         parts = [self._of_beta(own, alpha, beta, look) for beta, look in zip(betas, looks)]
@@ -100,8 +102,8 @@ class BandwisePAT(nn.Module):
         What the network makes of each is counted from its local regression on alpha: where a band is unlike alpha,
         its difference from alpha is not alike in places that look alike.
         """
-        mix, balances = self._told(alpha, beta, look)
-        look = replace(look, mix=mix, balances=balances)
+        mix, normalisations = self._told(alpha, beta, look)
+        look = replace(look, mix=mix, normalisations=normalisations)
         known = look.known if look.known is not None else self.survey(alpha, beta, look)
         seen = self.single.seen(own, alpha, beta, replace(look, known=known), guide=mix.of)
         base = known.colour[:, 0]

@@ -22,8 +22,8 @@ from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
 from ..attention import Attended, attend, attend_with_statistics
 from ..media.colour import luminance
 from .blocks import ResidualBlock, conv, enlarge
-from .protocol import Fused, Look, Looks
-from .semi_global import FILLS, FINE, Balances, Consensus, along, consensus, matches
+from .protocol import FusionOutput, Look, Looks
+from .semi_global import FILLS, FINE, Normalisations, SemiGlobalMatches, along, matches, semi_global_matching
 
 COARSE = 4
 """Context is worked out at a quarter of the size."""
@@ -112,18 +112,20 @@ class GuidedPAT(nn.Module):
             self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
-    def balance(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
-        """The look with how the whole pictures are levelled and made equally sharp, for surveys of pieces of them."""
-        return replace(look, balances=Balances.of(alpha, _guide(beta)))
+    def normalisation(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
+        """The look with how the whole images are levelled and made equally sharp, for surveys of pieces of them."""
+        return replace(look, normalisations=Normalisations.of(alpha, _guide(beta)))
 
-    def survey(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Consensus:
-        """What can be known before attention looks, of whole pictures; for pieces of them it is cut, not redone."""
+    def survey(
+        self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look
+    ) -> SemiGlobalMatches:
+        """What can be known before attention looks, of whole images; for pieces of them it is cut, not redone."""
         whole, blocks = (segments_of(look, hw_of(alpha), step, alpha.double()) for step in (1, FINE))
-        return consensus(alpha, _guide(beta), beta, whole, blocks, look.balances)
+        return semi_global_matching(alpha, _guide(beta), beta, whole, blocks, look.normalisations)
 
     def forward(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> Fused:
+    ) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
 
         Raises ValueError if those do not add up to the configured number.
@@ -132,7 +134,7 @@ class GuidedPAT(nn.Module):
 
     def explain(
         self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> tuple[Fused, list[Seen]]:
+    ) -> tuple[FusionOutput, list[Seen]]:
         """The same, with what each beta told, which training supervises."""
         bands = sum(b.shape[1] for b in betas)
         if bands != self.config.bands:
@@ -175,7 +177,7 @@ class GuidedPAT(nn.Module):
         other = self.encoder(of(beta))
         segments = segments_of(look, hw_of(alpha), 1, self._exact(alpha))
         known = look.known if look.known is not None else self.survey(alpha, beta, look)
-        window = window_around(known.reach, segments, self.config.window)
+        window = window_around(known.disparity, segments, self.config.window)
         query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
         found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
         value = found.value.to(alpha)
@@ -186,9 +188,9 @@ class GuidedPAT(nn.Module):
         colour = torch.lerp(value - alpha, known.matched, exact.sigmoid())
         return Seen(found, colour, known.colour, logit, choice)
 
-    def _judged(self, own: Encoded, known: Consensus, facts: Tensor, valid: Tensor) -> Tensor:
+    def _judged(self, own: Encoded, known: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the consensus's match."""
-        agreed = torch.cat([known.reach / 64, known.facts], 1)
+        agreed = torch.cat([known.disparity / 64, known.facts], 1)
         told = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(agreed, 2), avg_pool2d(told, COARSE)], 1)
         context = self.judge(torch.cat([own.quarter, rough], 1))
@@ -199,9 +201,9 @@ class GuidedPAT(nn.Module):
         return x if self.training else x.double()
 
 
-def fused_from(image: Float[Tensor, "b c h w"], seen: Sequence[Seen]) -> Fused:
+def fused_from(image: Float[Tensor, "b c h w"], seen: Sequence[Seen]) -> FusionOutput:
     """The image with where each beta was looked at, and with what confidence."""
-    return Fused(
+    return FusionOutput(
         image,
         [s.attended.position for s in seen],
         [s.attended.spread for s in seen],
@@ -214,9 +216,9 @@ def _guide(beta: Tensor) -> Tensor:
     return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
 
 
-def hw_of(picture: Tensor) -> tuple[int, int]:
+def hw_of(image: Tensor) -> tuple[int, int]:
     """Height and width."""
-    return picture.shape[-2], picture.shape[-1]
+    return image.shape[-2], image.shape[-1]
 
 
 class Trust(nn.Sequential):
@@ -256,9 +258,9 @@ class Carry(nn.Module):
         return found[:, :-1], found[:, -1:]
 
 
-def window_around(reach: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
+def window_around(disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
     """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `reach` from their end."""
-    middle, step = matches(segments, reach), window * along(segments)
+    middle, step = matches(segments, disparity), window * along(segments)
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
@@ -268,13 +270,13 @@ def segments_of(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Seg
     x = (pixel_grid(grid, dtype=like.dtype, device=like.device) + 0.5) * step - 0.5
     found = look.at(x.reshape(-1, 2))
     if not isinstance(found, Segments):
-        raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the pictures")
+        raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the images")
     start, end = (v.reshape(-1, *grid, 2) for v in (found.start, found.end))
     return Segments(start, end, found.valid.reshape(-1, *grid))
 
 
 class Encoder(nn.Module):
-    """Features of one grey picture, the same weights for every view."""
+    """Features of one grey image, the same weights for every view."""
 
     def __init__(self, widths: tuple[int, int, int, int]) -> None:
         super().__init__()
@@ -285,9 +287,9 @@ class Encoder(nn.Module):
         self.up = nn.Conv2d(w8, w4, 1)
         self.merge = ResidualBlock(w4)
 
-    def forward(self, picture: Float[Tensor, "b 1 h w"]) -> Encoded:
-        """Features of a picture whose sides are multiples of 8."""
-        half = self.at_half(pixel_unshuffle(picture - 0.5, 2))
+    def forward(self, image: Float[Tensor, "b 1 h w"]) -> Encoded:
+        """Features of an image whose sides are multiples of 8."""
+        half = self.at_half(pixel_unshuffle(image - 0.5, 2))
         quarter = self.at_quarter(half)
         return Encoded(half, self.merge(quarter + enlarge(self.up(self.at_eighth(quarter)))))
 
@@ -323,5 +325,5 @@ class Head(nn.Module):
         nn.init.zeros_(self.last.weight)
 
     def forward(self, fine: Tensor, half: Tensor, context: Tensor) -> Tensor:
-        """(B, bands, H, W), from pictures at full size, features at 1/2 and the context at 1/4."""
+        """(B, bands, H, W), from images at full size, features at 1/2 and the context at 1/4."""
         return pixel_shuffle(self.last(self.start(torch.cat([pixel_unshuffle(fine, 2), half, enlarge(context)], 1))), 2)

@@ -16,14 +16,14 @@ from torch import Tensor, nn
 
 from ..attention import Attended, attend_with_statistics
 from .blocks import ResidualASPP, ResidualBlock
-from .protocol import Fused, Look, Looks
+from .protocol import FusionOutput, Look, Looks
 
 
 @dataclass(frozen=True)
 class PATConfig:
     """The paper's network by default.
 
-    `betas` is their number, `in_channels` that of each picture (a picture with fewer is repeated), `dim` the
+    `betas` is their number, `in_channels` that of each image (an image with fewer is repeated), `dim` the
     width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
     of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is looked up.
     """
@@ -62,7 +62,7 @@ class PAT(nn.Module):
 
     def forward(
         self, alpha: Float[Tensor, "b c h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> Fused:
+    ) -> FusionOutput:
         """Fuse alpha with the betas, in the order the network was made for.
 
         Raises ValueError for another number of betas than configured, or channels that do not fit.
@@ -75,20 +75,20 @@ class PAT(nn.Module):
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
             image = image + self._enlarged(alpha)
-        return Fused(image, *(list(part) for part in list(zip(*attended))[1:]))
+        return FusionOutput(image, *(list(part) for part in list(zip(*attended))[1:]))
 
-    def balance(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
+    def normalisation(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
         """The same look: nothing need be known."""
         return look
 
     def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
         """Nothing: each piece of a frame is fused by itself."""
 
-    def _channels(self, picture: Tensor) -> Tensor:
+    def _channels(self, image: Tensor) -> Tensor:
         wanted = self.config.in_channels
-        if picture.shape[1] not in (1, wanted):
-            raise ValueError(f"pictures must have 1 or {wanted} channels for this network, got {picture.shape[1]}")
-        return picture.expand(-1, wanted, -1, -1)
+        if image.shape[1] not in (1, wanted):
+            raise ValueError(f"images must have 1 or {wanted} channels for this network, got {image.shape[1]}")
+        return image.expand(-1, wanted, -1, -1)
 
     def _enlarged(self, alpha: Tensor) -> Tensor:
         alpha = alpha.expand(-1, self.config.out_channels, -1, -1)

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_grid
 
-from .semi_global import Balances, Consensus
-from .spectral_mix import Mix
+from .semi_global import Normalisations, SemiGlobalMatches
+from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)
@@ -21,15 +21,15 @@ class Look:
     """Where to look in one beta: `at` maps alpha pixels (n, 2) to segments or positions in beta's pixels.
 
     `at` may answer for one rig (n) or for a batch of rigs (B, n). Segments are looked at in `samples` places.
-    `known` is what a survey of the whole pictures has found, for networks that make one, and `balances` and `mix` what
+    `known` is what a survey of the whole images has found, for networks that make one, and `balances` and `mix` what
     the survey of a piece is to know of the whole.
     """
 
     at: Callable[[Tensor], Segments | Positions]
     samples: int
-    known: Consensus | None = None
-    balances: Balances | None = None
-    mix: Mix | None = None
+    known: SemiGlobalMatches | None = None
+    normalisations: Normalisations | None = None
+    mix: SpectralMix | None = None
 
     @classmethod
     def along(cls, field: ReceptiveField, pair: Pair) -> Look:
@@ -47,10 +47,10 @@ class Look:
 Looks = Sequence[Look]
 
 
-class Fused(NamedTuple):
+class FusionOutput(NamedTuple):
     """What a fusion network says of alpha's view.
 
-    image: (B, C, s H, s W), the fused picture.
+    image: (B, C, s H, s W), the fused image.
     position: one (B, 2, H, W) for each beta, where its pixels were found, in beta's pixels.
     spread: one (B, H, W) for each beta, the uncertainty of that, in beta's pixels.
     confidence: one (B, H, W) for each beta, 0 to 1: whether beta sees the point, and where is known.
@@ -67,13 +67,13 @@ class FusionNetwork(Protocol):
     """What `fuse` asks of a network."""
 
     halo: int
-    """How far around a pixel alpha's picture, and where it looks, can matter, pixels."""
+    """How far around a pixel alpha's image, and where it looks, can matter, pixels."""
     beta_halo: int
-    """How far around where it is looked at beta's picture can matter, pixels."""
+    """How far around where it is looked at beta's image can matter, pixels."""
     bytes_per_pixel: float
     """Working memory for each pixel of alpha and of the betas, measured."""
     multiple: int
-    """Pictures are padded to multiples of this, and cut at them."""
+    """Images are padded to multiples of this, and cut at them."""
     equal_pitch: bool
     """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
 
@@ -81,14 +81,14 @@ class FusionNetwork(Protocol):
     """Which betas that see the same from one place are to come as one of several bands: none, those that follow each
     other (where the order of the bands matters), or all."""
 
-    def balance(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
-        """The look with what surveys of pieces are to know of the whole pictures (of whole multiples), if anything."""
+    def normalisation(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
+        """The look with what surveys of pieces are to know of the whole images (of whole multiples), if anything."""
         ...
 
-    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> Consensus | None:
-        """What is to be known of whole pictures (of whole multiples) before pieces of them are fused, if anything."""
+    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> SemiGlobalMatches | None:
+        """What is to be known of whole images (of whole multiples) before pieces of them are fused, if anything."""
         ...
 
-    def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> Fused:
+    def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> FusionOutput:
         """Fuse alpha (B, C, H, W) with betas of any sizes."""
         ...

@@ -3,7 +3,7 @@
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
 semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
 are places along each pixel's own segment, so it works for any rig with straight fields, rectified or not. It is
-worked out on pictures of half the size, as a whole frame and without gradients.
+worked out on images of half the size, as a whole frame and without gradients.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
-from arraygeom.sampling import on_picture, sample
+from arraygeom.sampling import on_image, sample
 
 from ..support.threads import in_parallel
 from . import semi_global_kernels as kernels
 
 FINE = 2
-"""The consensus is found on pictures this many times smaller."""
+"""The consensus is found on images this many times smaller."""
 BLOCK = 320
-"""Side of the squares that are worked off at a time, in pixels of the reduced pictures."""
+"""Side of the squares that are worked off at a time, in pixels of the reduced images."""
 MOST_MARGIN = 192
 CONSISTENT = 0.2
 """The views agree on a match if the look back is less than this (times 8 pixels) from it."""
@@ -50,11 +50,11 @@ DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
 MOST_DETAIL = 0.2
 """Differences of brightness beyond this are no detail that beta lost."""
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-"""Standard deviations, in pixels, with which the sharper picture is tried until it is as sharp as the other."""
+"""Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other."""
 
 
-class Consensus(NamedTuple):
-    """What neighbours agree on, for pictures of H x W.
+class SemiGlobalMatches(NamedTuple):
+    """What neighbours agree on, for images of H x W.
 
     reach: (B, 1, H / 2, W / 2), how far from its segment's end the match is, pixels of beta; where the match is
         not trusted, spread from where it is.
@@ -64,20 +64,20 @@ class Consensus(NamedTuple):
     colour: (B, fills, C, H, W), the same from pixels with trust spread to those without.
     """
 
-    reach: Tensor
+    disparity: Tensor
     facts: Tensor
     matched: Tensor
     colour: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> Consensus:
+    def cut(self, box: tuple[int, int, int, int]) -> SemiGlobalMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        return Consensus(self.reach[half], self.facts[half], self.matched[whole], self.colour[whole])
+        return SemiGlobalMatches(self.disparity[half], self.facts[half], self.matched[whole], self.colour[whole])
 
 
-class Balance(NamedTuple):
+class Normalisation(NamedTuple):
     """How beta's brightness is levelled to alpha's, and with what either is then blurred, for each of a batch.
 
     level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
@@ -88,36 +88,36 @@ class Balance(NamedTuple):
     blurs: tuple[list[float], list[float]]
 
     @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Balance:
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
         """What makes the means and standard deviations the same, and then the sharpness."""
         (spread, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
         level = torch.stack([mean, (wanted / spread.clamp(min=1e-3)).clamp(max=4), middle])
-        return cls(level, equalising_blurs(alpha, _levelled(beta, level)))
+        return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
 
-    def levelled(self, beta: Tensor) -> Tensor:
+    def normalised(self, beta: Tensor) -> Tensor:
         """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
-        return _levelled(beta, self.level)
+        return _normalised(beta, self.level)
 
     def softened(self, alpha: Tensor) -> Tensor:
         """Alpha (or a part of it), no sharper than beta."""
         return _blurred(alpha, self.blurs[0])
 
-    def equally_sharp(self, alpha: Tensor, levelled: Tensor) -> tuple[Tensor, Tensor]:
+    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Both (or parts of them), the sharper one blurred."""
-        own, other = (_blurred(p, blurs) for p, blurs in zip((alpha, levelled), self.blurs))
+        own, other = (_blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
         return own, other
 
 
-class Balances(NamedTuple):
-    """Those of pictures, and of the same at half the size."""
+class Normalisations(NamedTuple):
+    """Those of images, and of the same at half the size."""
 
-    whole: Balance
-    half: Balance
+    whole: Normalisation
+    half: Normalisation
 
     @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Balances:
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
         """Of alpha and beta's brightness; all sides are even."""
-        return cls(Balance.of(alpha, beta), Balance.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
+        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
 
 
 class _Geometry(NamedTuple):
@@ -133,58 +133,60 @@ class _Geometry(NamedTuple):
 
 
 @torch.no_grad()
-def consensus(
+def semi_global_matching(
     alpha: Float[Tensor, "b 1 h w"],
     guide: Float[Tensor, "b 1 hb wb"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
     blocks: Segments,
-    balances: Balances | None = None,
-) -> Consensus:
+    normalisations: Normalisations | None = None,
+) -> SemiGlobalMatches:
     """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
 
     `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
-    of its 2x2 pixels, in beta's pixels. All sides are even. `balances` are those of the whole pictures if these are
+    of its 2x2 pixels, in beta's pixels. All sides are even. `balances` are those of the whole images if these are
     parts. On the CPU, with as many threads as torch may use; the same whatever their number.
     """
-    balances = balances or Balances.of(alpha, guide)
-    reach, facts = agreement(alpha, guide, blocks, balances.half)
-    return Consensus(reach, facts, *_colours(alpha, guide, beta, segments, reach, facts, balances.whole))
+    normalisations = normalisations or Normalisations.of(alpha, guide)
+    disparity, facts = agreement(alpha, guide, blocks, normalisations.half)
+    return SemiGlobalMatches(
+        disparity, facts, *_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
+    )
 
 
 def agreement(
-    alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, balance: Balance
+    alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, normalisation: Normalisation
 ) -> tuple[Float[Tensor, "b 1 h2 w2"], Float[Tensor, "b 3 h2 w2"]]:
     """`reach` and `facts` of the consensus alone; `balance` is that of half the size."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    own, other = balance.equally_sharp(own, balance.levelled(other))
+    own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
     geometry = _geometry(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
     found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
     planes = zip(found, consistent, _bytes(avg_pool2d(alpha, FINE)))
     spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
     smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, spread)])
-    reach = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
-    return reach, torch.from_numpy(told).movedim(-1, 1).to(alpha)
+    disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
+    return disparity, torch.from_numpy(told).movedim(-1, 1).to(alpha)
 
 
-def levelled_at_matches(
-    picture: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+def normalised_at_matches(
+    image: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The picture with another's mean and standard deviation, where the weight is; both show the same at a place.
+    """The image with another's mean and standard deviation, where the weight is; both show the same at a place.
 
-    Levels of whole pictures say little where these show different parts of a scene.
+    Levels of whole images say little where these show different parts of a scene.
     """
     weight = (weight + 1e-6) / (weight + 1e-6).sum((2, 3), keepdim=True)
-    means = [(weight * p).sum((2, 3), keepdim=True) for p in (picture, like)]
+    means = [(weight * p).sum((2, 3), keepdim=True) for p in (image, like)]
     spread, wanted = (
-        (weight * (p - m).square()).sum((2, 3), keepdim=True).sqrt() for p, m in zip((picture, like), means)
+        (weight * (p - m).square()).sum((2, 3), keepdim=True).sqrt() for p, m in zip((image, like), means)
     )
-    return (picture - means[0]) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + means[1]
+    return (image - means[0]) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + means[1]
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Over squares around each pixel, as far as these are on the picture."""
+    """Over squares around each pixel, as far as these are on the image."""
     side = 2 * radius + 1
     rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
     return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
@@ -196,7 +198,7 @@ def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
     Segments that start within a pixel of beta's edge may have been cut there.
     """
     length = segments.length
-    cut = segments.valid & ~on_picture(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
+    cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
     end = (segments.end + 0.5) / FINE - 0.5
     length = torch.where(segments.valid, length / FINE, -1.0)
     planes = (_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length, cut))
@@ -206,16 +208,16 @@ def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
 def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
     """Reach (B, h, w) in pixels of the reduced beta, and facts (B, h, w, 3)."""
     labels = int(max(geometry.length.max(), 0)) + 2
-    reach = np.zeros(own.shape, np.float32)
+    disparity = np.zeros(own.shape, np.float32)
     facts = np.ones((*own.shape, 3), np.float32)
     bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
     in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
     tasks = []
     for i, (a, b) in enumerate(zip(own, other)):
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
-        tasks += [partial(_block, views, box, labels, reach[i], facts[i]) for box in _blocks(a.shape, labels)]
+        tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in _blocks(a.shape, labels)]
     in_parallel(tasks)
-    return reach, facts
+    return disparity, facts
 
 
 def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
@@ -231,7 +233,7 @@ def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, sli
             yield inner, outer
 
 
-def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray) -> None:
+def _block(views: tuple, box: tuple, labels: int, disparity: NDArray, facts: NDArray) -> None:
     own, own_bits, other, other_bits, end, along, length, cut = views
     inner, outer = box
     planes = (own, own_bits, end, along, length, cut)
@@ -243,52 +245,58 @@ def _block(views: tuple, box: tuple, labels: int, reach: NDArray, facts: NDArray
     r, f = np.empty(a.shape, np.float32), np.empty((*a.shape, 3), np.float32)
     kernels.winners(total, e, u, n, o, *other.shape, r, f)
     inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
-    reach[inner], facts[inner] = r[inside], f[inside]
+    disparity[inner], facts[inner] = r[inside], f[inside]
 
 
-def _levelled(picture: Tensor, level: Tensor) -> Tensor:
-    mean, factor, middle = level.to(picture)
-    return (picture - mean) * factor + middle
+def _normalised(image: Tensor, level: Tensor) -> Tensor:
+    mean, factor, middle = level.to(image)
+    return (image - mean) * factor + middle
 
 
 def equalising_blurs(
-    picture: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
+    image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
     """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
 
-    Sharpness is the mean difference of neighbouring pixels. 0 for a picture that has hardly more than the other.
+    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the other.
     """
-    own, its = ([float(_contrast(p)) for p in pictures] for pictures in (picture, other))
-    return [_least_blur(p, c) for p, c in zip(picture, its)], [_least_blur(p, c) for p, c in zip(other, own)]
+    own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
+    return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
 
 
-def _least_blur(picture: Tensor, contrast: float) -> float:
+def _least_blur(image: Tensor, contrast: float) -> float:
     """The least of `BLURS` after which there is no more contrast than that."""
-    enough = (b for b in (0.0, *BLURS) if float(_contrast(_blurred(picture[None], [b])[0])) <= 1.05 * contrast)
+    enough = (b for b in (0.0, *BLURS) if float(_contrast(_blurred(image[None], [b])[0])) <= 1.05 * contrast)
     return next(enough, BLURS[-1])
 
 
-def _blurred(pictures: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    def one(picture: Tensor, blur: float) -> Tensor:
-        return torch.from_numpy(cv2.GaussianBlur(_numpy(picture), (0, 0), blur)).to(picture) if blur else picture
+def _blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+    def one(image: Tensor, blur: float) -> Tensor:
+        return torch.from_numpy(cv2.GaussianBlur(_numpy(image), (0, 0), blur)).to(image) if blur else image
 
-    return torch.stack([one(p[0], blur) for p, blur in zip(pictures, blurs)])[:, None]
+    return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
 
 
-def _contrast(picture: Float[Tensor, "1 h w"]) -> Tensor:
-    return picture.diff(dim=-1).abs().mean() + picture.diff(dim=-2).abs().mean()
+def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
+    return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
 
 
 def _colours(
-    alpha: Tensor, guide: Tensor, beta: Tensor, segments: Segments, reach: Tensor, facts: Tensor, balance: Balance
+    alpha: Tensor,
+    guide: Tensor,
+    beta: Tensor,
+    segments: Segments,
+    disparity: Tensor,
+    facts: Tensor,
+    normalisation: Normalisation,
 ) -> tuple[Tensor, Tensor]:
     """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
     bands = beta.shape[1]
-    seen, valid = at_matches(torch.cat([beta, guide, balance.levelled(guide)], 1), segments, reach)
+    seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
     values, own, brightness = seen.split([bands, 1, 1], 1)
     consistent = agreed_on(facts)
-    brightness = levelled_at_matches(brightness, alpha, valid * consistent)
-    soft = balance.softened(alpha)
+    brightness = normalised_at_matches(brightness, alpha, valid * consistent)
+    soft = normalisation.softened(alpha)
     if bands > 1:
         matched = _detailed(values - own, brightness, alpha) + own - alpha
     else:
@@ -297,14 +305,14 @@ def _colours(
 
 
 def at_matches(
-    beta: Float[Tensor, "b c hb wb"], segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]
+    beta: Float[Tensor, "b c hb wb"], segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
     """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, reach).to(beta)
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity).to(beta)
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
     values = sample(beta, inside, interpolation="bicubic").values
-    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_picture(middle, hw)[:, None]
+    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
 
 
 def agreed_on(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
@@ -370,10 +378,10 @@ def _regressed(
     return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
 
 
-def matches(segments: Segments, reach: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
+def matches(segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
     """Where the alpha pixels of segments (B or 1, H, W) have their matches `reach` from the ends, beta's pixels."""
     length = segments.length
-    far = interpolate(reach, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
+    far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
     return segments.end + far.clamp(min=0).minimum(length)[..., None] * along(segments)
 
 
@@ -401,5 +409,5 @@ def _numpy(x: Tensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)
 
 
-def _bytes(picture: Tensor) -> NDArray[np.uint8]:
-    return np.rint(np.clip(_numpy(picture[:, 0]), 0, 1) * 255).astype(np.uint8)
+def _bytes(image: Tensor) -> NDArray[np.uint8]:
+    return np.rint(np.clip(_numpy(image[:, 0]), 0, 1) * 255).astype(np.uint8)

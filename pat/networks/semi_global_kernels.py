@@ -1,4 +1,4 @@
-"""The compiled loops of `pat.networks.semi_global`, each on one picture, in one thread and without Python's lock."""
+"""The compiled loops of `pat.networks.semi_global`, each on one image, in one thread and without Python's lock."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ HALF = np.float32(0.5)
 
 
 @compiled(nogil=True, cache=True)
-def census(picture, out):
+def census(image, out):
     """One bit for each of the 48 pixels around: whether it is darker (Zabih and Woodfill 1994)."""
-    height, width = picture.shape
+    height, width = image.shape
     for y in range(height):
         for x in range(width):
-            centre, bits = picture[y, x], np.uint64(0)
+            centre, bits = image[y, x], np.uint64(0)
             for dy in range(-3, 4):
                 row = min(max(y + dy, 0), height - 1)
                 for dx in range(-3, 4):
                     if dx != 0 or dy != 0:
                         column = min(max(x + dx, 0), width - 1)
-                        bits = (bits << np.uint64(1)) | np.uint64(picture[row, column] < centre)
+                        bits = (bits << np.uint64(1)) | np.uint64(image[row, column] < centre)
             out[y, x] = bits
 
 
@@ -52,8 +52,8 @@ def _count(bits):
 @compiled(inline="always")
 def _pixel(end, along, label):
     """Column and row of beta's pixel at a label: so many pixels from `end`."""
-    reach = np.float32(label)
-    return int(np.floor(end[0] + reach * along[0] + HALF)), int(np.floor(end[1] + reach * along[1] + HALF))
+    disparity = np.float32(label)
+    return int(np.floor(end[0] + disparity * along[0] + HALF)), int(np.floor(end[1] + disparity * along[1] + HALF))
 
 
 @compiled(nogil=True, cache=True)
@@ -67,11 +67,11 @@ def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
     rows, columns = other.shape
     for y in range(height):
         for x in range(width):
-            reach = length[y, x] + HALF
+            disparity = length[y, x] + HALF
             beyond = UNSEEN if cut[y, x] else NOWHERE
             for label in range(labels):
                 column, row = _pixel(end[y, x], along[y, x], label)
-                if label > reach:
+                if label > disparity:
                     out[y, x, label] = beyond
                 elif column < 0 or row < 0 or column >= columns or row >= rows:
                     out[y, x, label] = NOWHERE
@@ -149,7 +149,7 @@ def _sweep(cost, guide, total, dx, way):
 
 
 @compiled(nogil=True, cache=True)
-def winners(total, end, along, length, cut, rows, columns, reach, facts):
+def winners(total, end, along, length, cut, rows, columns, disparity, facts):
     """Each pixel's best label, to a fraction (reach); and facts (h, w, 3): how far the best label of those that
     look at the same pixel of beta is from it, by how much it is better than the second, and how good it is."""
     claims = _claims(total, end, along, length, rows, columns)
@@ -159,7 +159,7 @@ def winners(total, end, along, length, cut, rows, columns, reach, facts):
             last = labels - 1 if cut[y, x] else min(labels - 1, int(length[y, x] + HALF))
             best, second = _two_best(total[y, x], last)
             lowest = total[y, x, best]
-            reach[y, x] = np.float32(best) + _between(total[y, x], best, last)
+            disparity[y, x] = np.float32(best) + _between(total[y, x], best, last)
             column, row = _pixel(end[y, x], along[y, x], best)
             facts[y, x, 0] = ONE
             if best <= length[y, x] + HALF and 0 <= row < rows and 0 <= column < columns:

@@ -19,9 +19,9 @@ from arraygeom import Segments
 
 from .semi_global import (
     MOST_DETAIL,
-    Balance,
-    Balances,
-    Consensus,
+    Normalisation,
+    Normalisations,
+    SemiGlobalMatches,
     agreed_on,
     agreement,
     at_matches,
@@ -45,10 +45,10 @@ DILUTED = 0.8
 """Wrong matches make least squares' weights too small. They are enlarged until the combination varies as much as alpha,
 as if no less than this share of alpha's variance were explained."""
 WIDE = 4
-"""Bands are compared with alpha within squares whose radius is the picture's longer side over this."""
+"""Bands are compared with alpha within squares whose radius is the image's longer side over this."""
 
 
-class Mix(NamedTuple):
+class SpectralMix(NamedTuple):
     """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times bands.
 
     slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next; less if
@@ -63,7 +63,7 @@ class Mix(NamedTuple):
     gain: Float[Tensor, " b"]
 
     @classmethod
-    def equal(cls, bands: Float[Tensor, "b c _ _"]) -> Mix:
+    def equal(cls, bands: Float[Tensor, "b c _ _"]) -> SpectralMix:
         """The mean of the bands."""
         ones = torch.ones(bands.shape[:2], dtype=torch.float64, device=bands.device)
         return cls(ones / bands.shape[1], 0 * ones[:, 0], ones, 0 * ones[:, 0])
@@ -71,7 +71,7 @@ class Mix(NamedTuple):
     @classmethod
     def fitted(
         cls, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
-    ) -> Mix:
+    ) -> SpectralMix:
         """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the second time
         without outliers."""
         parts = [_fit(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
@@ -96,41 +96,43 @@ class Mix(NamedTuple):
 @torch.no_grad()
 def coarse_mix(
     alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], segments: Segments, blocks: Segments, factor: int
-) -> Mix:
-    """The combination of beta's bands that is most like alpha, found on pictures reduced by `factor`.
+) -> SpectralMix:
+    """The combination of beta's bands that is most like alpha, found on images reduced by `factor`.
 
     `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of alpha's
     pixels, in pixels of the whole beta.
     """
     if beta.shape[1] == 1:
-        return Mix.equal(beta)
+        return SpectralMix.equal(beta)
     own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
-    guide = Mix.equal(bands).of(bands)
-    balances = Balances.of(own, guide)
-    reach, facts = agreement(own, guide, _reduced(blocks, factor), balances.half)
-    values, valid = at_matches(bands, _reduced(segments, factor), reach)
-    return Mix.fitted(values, balances.whole.softened(own), valid * agreed_on(facts))
+    guide = SpectralMix.equal(bands).of(bands)
+    normalisations = Normalisations.of(own, guide)
+    disparity, facts = agreement(own, guide, _reduced(blocks, factor), normalisations.half)
+    values, valid = at_matches(bands, _reduced(segments, factor), disparity)
+    return SpectralMix.fitted(values, normalisations.whole.softened(own), valid * agreed_on(facts))
 
 
 @torch.no_grad()
-def consensus_of_bands(
+def semi_global_matching_of_bands(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
     blocks: Segments,
-    mix: Mix,
-    balances: Balances,
-) -> Consensus:
+    mix: SpectralMix,
+    normalisations: Normalisations,
+) -> SemiGlobalMatches:
     """`consensus` of alpha and the mix of the bands; all are carried to alpha's view."""
-    reach, facts = agreement(alpha, mix.of(beta), blocks, balances.half)
-    values, valid = at_matches(beta, segments, reach)
-    matched, unlike = _matched(values, alpha, mix, balances.whole)
-    return Consensus(reach, facts, matched, spread_from(matched, alpha, trusted(unlike, agreed_on(facts), valid)))
+    disparity, facts = agreement(alpha, mix.of(beta), blocks, normalisations.half)
+    values, valid = at_matches(beta, segments, disparity)
+    matched, unlike = _matched(values, alpha, mix, normalisations.whole)
+    return SemiGlobalMatches(
+        disparity, facts, matched, spread_from(matched, alpha, trusted(unlike, agreed_on(facts), valid))
+    )
 
 
-def _matched(values: Tensor, alpha: Tensor, mix: Mix, balance: Balance) -> tuple[Tensor, Tensor]:
+def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Normalisation) -> tuple[Tensor, Tensor]:
     """Bands minus alpha, with the detail that alpha has and they have not; how unlike alpha they are."""
-    brightness, soft = mix.of(values), balance.softened(alpha)
+    brightness, soft = mix.of(values), normalisation.softened(alpha)
     gain = mix.gain[:, None, None, None].to(alpha)
     beyond = (alpha - soft) + gain * (soft - brightness)
     rises = mix.rises(values)

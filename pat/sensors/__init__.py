@@ -1,11 +1,11 @@
-"""The forward model: what becomes of an ideal picture until a camera has recorded it.
+"""The forward model: what becomes of an ideal image until a camera has recorded it.
 
-A chain is a list of steps, applied in order to pictures (B, C, H, W) with values 0..1 on any device. Light adds up
-in linear values only, so a chain for ordinary pictures begins with `Linear()` and ends with `Coded()`:
+A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1 on any device. Light adds up
+in linear values only, so a chain for ordinary images begins with `Linear()` and ends with `Coded()`:
 
     [Linear(), Spectral("luminance"), DiscBlur(1.5), Resample(0.5), Noise(2000, 5), Clip(), Coded(), Quantise(8)]
 
-Steps with randomness draw it from the generator given to `record`, separately for each picture of the batch.
+Steps with randomness draw it from the generator given to `record`, separately for each image of the batch.
 Steps that change the pixel grid say how through `pixel_matrix`; K' = A K with the A that `record` returns, and
 `record_array` composes it into the rig.
 """

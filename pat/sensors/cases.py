@@ -1,4 +1,4 @@
-"""Cases: how the pictures of a pair are degraded, one drawn for each pair."""
+"""Cases: how the images of a pair are degraded, one drawn for each pair."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .optics import BoxBlur
 
 @dataclass(frozen=True)
 class Case:
-    """One way in which the two pictures of a pair are degraded."""
+    """One way in which the two images of a pair are degraded."""
 
     name: str
     alpha: tuple[Step, ...] = ()
@@ -40,7 +40,7 @@ def paper_cases(blur: int = 5) -> tuple[Case, Case, Case, Case]:
 
 
 class Pairs(NamedTuple):
-    """Degraded pictures of both cameras, and which case each pair of the batch met."""
+    """Degraded images of both cameras, and which case each pair of the batch met."""
 
     alpha: Float[Tensor, "b ca ha wa"]
     beta: Float[Tensor, "b cb hb wb"]

@@ -1,4 +1,4 @@
-"""Chains of steps, and what each does to pictures, pixels and cameras."""
+"""Chains of steps, and what each does to images, pixels and cameras."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from arraygeom.sampling import sample
 
 @dataclass(frozen=True)
 class Light:
-    """Pictures on their way through a chain, and what is known of what they show, all of the same pixels.
+    """Images on their way through a chain, and what is known of what they show, all of the same pixels.
 
     `depth` in metres along the optical axis; `motion` (x, y) in pixels a second; `camera` with K of these pixels;
     `pixels` is A with x ~ A x_first (float64).
@@ -38,13 +38,13 @@ class Light:
         return self.image.shape[-2], self.image.shape[-1]
 
     def moved(self, A: Float[Tensor, "3 3"], image: Float[Tensor, "b c2 h2 w2"]) -> Light:
-        """New pictures whose pixels are x' ~ A x; depth and motion are those of the nearest former pixels."""
+        """New images whose pixels are x' ~ A x; depth and motion are those of the nearest former pixels."""
         hw = image.shape[-2], image.shape[-1]
         if hw == self.hw and torch.equal(A, torch.eye(3, dtype=A.dtype)):
             return replace(self, image=image)
         depth = None if self.depth is None else _looked_up(self.depth[:, None], A, hw)[:, 0]
         motion = None if self.motion is None else _turned(_looked_up(self.motion, A, hw), A)
-        camera = None if self.camera is None else self.camera.mapped(A, hw)
+        camera = None if self.camera is None else self.camera.transformed(A, hw)
         return Light(image, A @ self.pixels, depth, motion, camera)
 
 
@@ -59,35 +59,35 @@ def _turned(motion: Tensor, A: Tensor) -> Tensor:
 
 
 class Step(ABC):
-    """One thing that happens to a picture. Subclasses say what in `apply`, or in `expose` if they must know more."""
+    """One thing that happens to an image. Subclasses say what in `apply`, or in `expose` if they must know more."""
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """A with x_after ~ A x_before for a picture of height and width `hw`."""
+        """A with x_after ~ A x_before for an image of height and width `hw`."""
         return torch.eye(3, dtype=torch.float64)
 
     @abstractmethod
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
-        """The pictures afterwards."""
+        """The images afterwards."""
 
     def expose(self, light: Light, generator: Generator) -> Light:
-        """The pictures afterwards, with what is known of them."""
+        """The images afterwards, with what is known of them."""
         return light.moved(self.pixel_matrix(light.hw), self.apply(light.image, generator))
 
 
 class LitStep(Step):
-    """A step that must know what the picture shows; `expose` is the whole of it."""
+    """A step that must know what the image shows; `expose` is the whole of it."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The pictures afterwards, if what `light` holds beside the picture is not needed after all."""
+        """The images afterwards, if what `light` holds beside the image is not needed after all."""
         return self.expose(Light(image, torch.eye(3, dtype=torch.float64)), generator).image
 
     @abstractmethod
     def expose(self, light: Light, generator: Generator) -> Light:
-        """The pictures afterwards, with what is known of them."""
+        """The images afterwards, with what is known of them."""
 
 
 class Recorded(NamedTuple):
-    """Pictures after a chain, and A with x_after ~ A x_before (float64)."""
+    """Images after a chain, and A with x_after ~ A x_before (float64)."""
 
     image: Float[Tensor, "b c h w"]
     pixels: Float[Tensor, "3 3"]
@@ -114,7 +114,7 @@ def record(
 
 
 class RecordedArray(NamedTuple):
-    """Pictures of every camera after its chain, and the rig of those pictures."""
+    """Images of every camera after its chain, and the rig of those images."""
 
     images: dict[str, Float[Tensor, "b _ _ _"]]
     rig: Rig
@@ -129,7 +129,7 @@ def record_array(
     depth: Mapping[str, Float[Tensor, "b _ _"]] | None = None,
     motion: Mapping[str, Float[Tensor, "b 2 _ _"]] | None = None,
 ) -> RecordedArray:
-    """Each camera's chain on its pictures; cameras without one record the ideal picture.
+    """Each camera's chain on its images; cameras without one record the ideal image.
 
     Each camera draws from its own generator, made of `seed` and its name: a camera more or less changes nothing
     for the others. The rig's cameras follow what the steps do to the pixels. Raises ValueError for a camera that
@@ -146,9 +146,9 @@ def record_array(
             motion=(motion or {}).get(name),
             camera=view if isinstance(view, Camera) else None,
         )
-        rig = rig.mapped(name, pixels, (recorded[name].shape[-2], recorded[name].shape[-1]))
+        rig = rig.transformed(name, pixels, (recorded[name].shape[-2], recorded[name].shape[-1]))
     for name in chains:
-        rig.known(name)
+        rig.require(name)
     return RecordedArray(recorded, rig)
 
 

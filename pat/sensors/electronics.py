@@ -19,7 +19,7 @@ class Exposure(Step):
     gain: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The brighter or darker pictures, not clipped."""
+        """The brighter or darker images, not clipped."""
         return image * self.gain
 
 
@@ -43,7 +43,7 @@ class Noise(Step):
             )
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The noisy pictures, not clipped."""
+        """The noisy images, not clipped."""
         if self.counts == "poisson":
             return self._counted(image, generator)
         variance = (image.clamp(min=0) * self.full_well + self.read**2) / self.full_well**2
@@ -61,7 +61,7 @@ class Clip(Step):
     """Saturation: values held between 0 and 1."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The clipped pictures."""
+        """The clipped images."""
         return image.clamp(0, 1)
 
 
@@ -72,7 +72,7 @@ class Quantise(Step):
     bits: int = 8
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The rounded pictures."""
+        """The rounded images."""
         levels = 2**self.bits - 1
         clipped = image.clamp(0, 1)
         return clipped + ((clipped * levels).round() / levels - clipped).detach()
@@ -80,7 +80,7 @@ class Quantise(Step):
 
 @dataclass(frozen=True)
 class Jitter(Step):
-    """Cameras never agree: each picture gets its own gain, gamma and white balance, then is clipped.
+    """Cameras never agree: each image gets its own gain, gamma and white balance, then is clipped.
 
     The logarithms of gain, gamma and of each channel's balance are normal with these standard deviations. Meant
     for coded values.
@@ -88,11 +88,11 @@ class Jitter(Step):
 
     gain: float = 0.05
     gamma: float = 0.05
-    balance: float = 0.03
+    normalisation: float = 0.03
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The changed pictures."""
+        """The changed images."""
         b, c = image.shape[:2]
-        gain = self.gain * normal((b, 1), image, generator) + self.balance * normal((b, c), image, generator)
+        gain = self.gain * normal((b, 1), image, generator) + self.normalisation * normal((b, c), image, generator)
         gamma = self.gamma * normal((b, 1, 1, 1), image, generator)
         return (image.clamp(min=1e-6) ** gamma.exp() * gain.exp()[..., None, None]).clamp(0, 1)

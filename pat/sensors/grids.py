@@ -32,7 +32,7 @@ class Resample(Step):
     """Another number of pixels for the same field of view: c' = (c + 0.5) s - 0.5.
 
     `to` is a factor (sizes are rounded, and the factor along each axis is what they give) or a (height, width).
-    "area" is what a sensor with larger pixels records: it keeps the mean of the picture exactly. "bicubic" is
+    "area" is what a sensor with larger pixels records: it keeps the mean of the image exactly. "bicubic" is
     the usual antialiased resize with a = -0.5.
     """
 
@@ -54,7 +54,7 @@ class Resample(Step):
         return resize_matrix(hw, self.hw(hw))
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
-        """The resized pictures."""
+        """The resized images."""
         h, w = image.shape[-2:]
         new = self.hw((h, w))
         if self.method == "bicubic":
@@ -83,11 +83,11 @@ class Crop(Step):
         return shift_matrix(self.left, self.top)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
-        """The window. Raises ValueError where it leaves the picture."""
+        """The window. Raises ValueError where it leaves the image."""
         (h, w), (height, width) = self.hw, image.shape[-2:]
         if min(self.top, self.left) < 0 or self.top + h > height or self.left + w > width:
             raise ValueError(
-                f"crop: {w}x{h} from ({self.left}, {self.top}) leaves the picture of {width}x{height}: "
+                f"crop: {w}x{h} from ({self.left}, {self.top}) leaves the image of {width}x{height}: "
                 "give a window in it"
             )
         return image[..., self.top : self.top + h, self.left : self.left + w]
@@ -103,14 +103,14 @@ class Mosaic(Step):
         _known(self.pattern)
 
     def apply(self, image: Float[Tensor, "b 3 h w"], generator: Generator) -> Float[Tensor, "b 1 h w"]:
-        """The raw pictures. Raises ValueError for odd sizes."""
+        """The raw images. Raises ValueError for odd sizes."""
         _even(image)
         return rgb_to_raw(image, _KORNIA[self.pattern])
 
 
 @dataclass(frozen=True)
 class Demosaic(Step):
-    """Colours from a raw picture: bilinear (kornia; differentiable) or edge-aware (OpenCV, on 16 bits, clipped).
+    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (OpenCV, on 16 bits, clipped).
 
     The gradient of "edge-aware" is that of "bilinear".
     """
@@ -122,13 +122,13 @@ class Demosaic(Step):
         _known(self.pattern)
 
     def apply(self, image: Float[Tensor, "b 1 h w"], generator: Generator) -> Float[Tensor, "b 3 h w"]:
-        """The pictures in colour. Raises ValueError for odd sizes."""
+        """The images in colour. Raises ValueError for odd sizes."""
         _even(image)
         bilinear = raw_to_rgb(image, _KORNIA[self.pattern])
         if self.method == "bilinear":
             return bilinear
         raw = (image.detach().clamp(0, 1) * 65535).round().cpu().numpy().astype(np.uint16)
-        colours = np.stack([cv2.cvtColor(picture[0], _OPENCV[self.pattern]) for picture in raw])
+        colours = np.stack([cv2.cvtColor(plane[0], _OPENCV[self.pattern]) for plane in raw])
         edge_aware = torch.from_numpy(colours.astype(np.float32) / 65535).movedim(-1, 1).to(image)
         return bilinear + (edge_aware - bilinear).detach()
 

@@ -29,7 +29,7 @@ class BoxBlur(Step):
             raise ValueError(f"the width of a box blur must be an odd number of pixels, got {self.width}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The blurred pictures."""
+        """The blurred images."""
         kernel = image.new_full((self.width,), 1 / self.width)
         return _convolved(_convolved(image, kernel[None]), kernel[:, None])
 
@@ -41,7 +41,7 @@ class GaussianBlur(Step):
     sigma: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The blurred pictures."""
+        """The blurred images."""
         r = math.ceil(4 * _value(self.sigma))
         x = torch.arange(-r, r + 1, dtype=image.dtype, device=image.device)
         kernel = torch.exp(-0.5 * (x / max(self.sigma, 1e-6)) ** 2)
@@ -56,7 +56,7 @@ class DiscBlur(Step):
     radius: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The blurred pictures."""
+        """The blurred images."""
         return _convolved(image, disc_kernel(self.radius, image))
 
 
@@ -66,8 +66,8 @@ class Defocus(LitStep):
 
     A point at depth z becomes a disc of diameter f_pixels (lens / f_number / 1000) |1 / focus - 1 / z| pixels (an
     ellipse where fx and fy differ), or a Gaussian with the same variance. Light is spread from every pixel and
-    what is nearer covers what is farther; what the sharp picture does not show behind an edge is filled from
-    around it. Needs depth and a camera. Differentiable in the picture, and in depth through the size of the blur.
+    what is nearer covers what is farther; what the sharp image does not show behind an edge is filled from
+    around it. Needs depth and a camera. Differentiable in the image, and in depth through the size of the blur.
     """
 
     focus: float
@@ -81,7 +81,7 @@ class Defocus(LitStep):
                 raise ValueError(f"defocus: {name} must be positive, got {getattr(self, name):g}")
 
     def expose(self, light: Light, generator: Generator) -> Light:
-        """The defocused pictures."""
+        """The defocused images."""
         if light.depth is None or light.camera is None:
             raise ValueError(
                 "defocus needs the depth of every pixel and the camera: give record() `depth` and `camera`"
@@ -138,7 +138,7 @@ def _levels(low: float, high: float) -> list[float]:
 
 @dataclass(frozen=True)
 class MotionBlur(LitStep):
-    """The mean over the time the shutter is open, `shutter` seconds, centred on the moment of the sharp picture.
+    """The mean over the time the shutter is open, `shutter` seconds, centred on the moment of the sharp image.
 
     Everything moves with `velocity` (x, y) in pixels a second, or each pixel with the motion given to `record`.
     Looked up backwards along each pixel's own motion: exact where neighbours move alike. The border is continued.
@@ -152,7 +152,7 @@ class MotionBlur(LitStep):
             raise ValueError(f"motion blur: shutter is a time in seconds, got {self.shutter:g}")
 
     def expose(self, light: Light, generator: Generator) -> Light:
-        """The blurred pictures."""
+        """The blurred images."""
         way = self.shutter * self._motion(light).movedim(1, -1)
         steps = max(math.ceil(2 * float(way.detach().norm(dim=-1).max())), 1)
         times = (torch.arange(steps, dtype=way.dtype) + 0.5) / steps - 0.5
@@ -176,15 +176,15 @@ class MotionBlur(LitStep):
 class Vignetting(LitStep):
     """Less light towards the corners: gain 1 + a r^2 + b r^4 + c r^6, with r = 1 half a diagonal from the centre.
 
-    The centre is the camera's principal point if the camera is given to `record`, else the picture's middle, and
-    the diagonal is that of the picture. `natural` multiplies by cos^4 of the ray's angle, which needs the camera.
+    The centre is the camera's principal point if the camera is given to `record`, else the image's middle, and
+    the diagonal is that of the image. `natural` multiplies by cos^4 of the ray's angle, which needs the camera.
     """
 
     falloff: tuple[float, ...] = ()
     natural: bool = False
 
     def expose(self, light: Light, generator: Generator) -> Light:
-        """The darkened pictures."""
+        """The darkened images."""
         grid = pixel_grid(light.hw, dtype=light.image.dtype, device=light.image.device)
         gain = self._falloff(grid, light)
         if self.natural:
@@ -220,8 +220,8 @@ def gaussian_kernel(sigma: float, like: Tensor, aspect: float = 1.0) -> Tensor:
     return kernel / kernel.sum()
 
 
-def _kernel_grid(reach: float, aspect: float, like: Tensor) -> tuple[Tensor, Tensor]:
-    nx, ny = math.ceil(reach), math.ceil(reach * aspect)
+def _kernel_grid(disparity: float, aspect: float, like: Tensor) -> tuple[Tensor, Tensor]:
+    nx, ny = math.ceil(disparity), math.ceil(disparity * aspect)
     x = torch.arange(-nx, nx + 1, dtype=like.dtype, device=like.device)
     y = torch.arange(-ny, ny + 1, dtype=like.dtype, device=like.device)
     return x[None], y[:, None] / aspect

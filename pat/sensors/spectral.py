@@ -16,7 +16,7 @@ from ..media.colour import linear_from_srgb, srgb_from_linear
 from .chain import Step
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
-"""What the channels R, G, B and NIR of an ideal picture are taken to hold: Gaussians, centre and sigma in nm."""
+"""What the channels R, G, B and NIR of an ideal image are taken to hold: Gaussians, centre and sigma in nm."""
 
 NAMES = ("rgb", "luminance", "nir")
 _REC601 = (0.299, 0.587, 0.114)
@@ -54,11 +54,11 @@ class Gamma(Step):
 
 @dataclass(frozen=True)
 class Spectral(Step):
-    """What a sensor with another spectral response sees of an RGB, or an RGB + NIR, picture.
+    """What a sensor with another spectral response sees of an RGB, or an RGB + NIR, image.
 
     "rgb" is the first three channels; "luminance" is Rec. 601 (0.299, 0.587, 0.114); "nir" is the fourth channel;
     a `Band` or a `Curve` is one channel: the channels taken as Gaussians (`CHANNELS`), weighted by how much of
-    each the response collects, and scaled so that white stays white. A picture does not hold a spectrum: this
+    each the response collects, and scaled so that white stays white. An image does not hold a spectrum: this
     approximation is right for greys and only plausible for colours. Beyond 700 nm it needs a NIR channel.
     """
 
@@ -74,7 +74,7 @@ class Spectral(Step):
         """One channel, or three for "rgb"."""
         channels = image.shape[1]
         if channels not in (3, 4):
-            raise ValueError(f"a spectral response needs a picture in RGB or RGB + NIR, got {channels} channels")
+            raise ValueError(f"a spectral response needs an image in RGB or RGB + NIR, got {channels} channels")
         if self.response == "rgb":
             return image[:, :3]
         weights = image.new_tensor(self._weights(channels))
@@ -85,7 +85,7 @@ class Spectral(Step):
             return (*_REC601, 0.0)[:channels]
         if self.response == "nir":
             if channels == 3:
-                raise ValueError("the response 'nir' needs a picture with a NIR channel, got RGB alone")
+                raise ValueError("the response 'nir' needs an image with a NIR channel, got RGB alone")
             return 0.0, 0.0, 0.0, 1.0
         if isinstance(self.response, Band):
             return band_weights(self.response, channels)
@@ -103,7 +103,7 @@ def band_weights(band: Band, channels: int = 3) -> tuple[float, ...]:
     """
     low, high = _VISIBLE if channels == 3 else _NEAR_INFRARED
     if not low <= band.centre <= high:
-        kind = "an RGB picture" if channels == 3 else "an RGB + NIR picture"
+        kind = "an RGB image" if channels == 3 else "an RGB + NIR image"
         raise ValueError(f"{kind} tells nothing of a band at {band.centre:g} nm; use {low:g} to {high:g} nm")
     own = (band.width / (8 * math.log(2)) ** 0.5) ** 2
     variances = [own + sigma**2 for _, sigma in CHANNELS[:channels]]
@@ -120,7 +120,7 @@ def curve_weights(curve: Curve, channels: int = 3) -> tuple[float, ...]:
     gaussians = [(-0.5 * ((wavelength - c) / s) ** 2).exp() / s for c, s in CHANNELS[:channels]]
     overlaps = [float(torch.trapezoid(response * g, wavelength)) for g in gaussians]
     if sum(overlaps) < 1e-6:
-        raise ValueError("the response curve collects no light of the picture's channels: check its wavelengths, in nm")
+        raise ValueError("the response curve collects no light of the image's channels: check its wavelengths, in nm")
     return _shares(overlaps)
 
 

@@ -58,7 +58,7 @@ class JobError(ValueError):
 
 
 ENVIRONMENT = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
-"""Of local workers. Not Dask's own, which makes glibc return every freed picture to the system at once: half of the
+"""Of local workers. Not Dask's own, which makes glibc return every freed image to the system at once: half of the
 time of two workers then went into getting the same pages again."""
 
 

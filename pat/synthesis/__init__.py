@@ -1,1 +1,1 @@
-"""Scenes to pictures of arrays, with ground truth."""
+"""Scenes to images of arrays, with ground truth."""

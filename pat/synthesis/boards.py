@@ -1,4 +1,4 @@
-"""Calibration boards as pictures, and as OpenCV knows them."""
+"""Calibration boards as images, and as OpenCV knows them."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def draw_board(board: Board) -> UInt8[NDArray, "h w"]:
     """The sheet, margins included: black and white, `PIXELS` a square."""
     columns, rows = board.squares
     if board.kind == "charuco":
-        picture = opencv_board(board).generateImage((columns * PIXELS, rows * PIXELS))
+        image = opencv_board(board).generateImage((columns * PIXELS, rows * PIXELS))
     else:
         squares = np.indices((rows, columns)).sum(0) % 2 * np.uint8(255)
-        picture = np.kron(squares, np.ones((PIXELS, PIXELS))).astype(np.uint8)
+        image = np.kron(squares, np.ones((PIXELS, PIXELS))).astype(np.uint8)
     margin = round(board.margin / board.square * PIXELS)
-    return np.asarray(np.pad(picture, margin, constant_values=255))
+    return np.asarray(np.pad(image, margin, constant_values=255))

@@ -18,7 +18,7 @@ from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
 from .layered import ArrayBatch
-from .rendered import Frame
+from .rendered import RenderedFrame
 from .surfaces import depth_between
 
 
@@ -33,7 +33,7 @@ class Across(NamedTuple):
 def look_across(batch: ArrayBatch, alpha: int = 0, beta: int = 1, *, tolerance: float = 0.01) -> Across:
     """Follow every pixel of view `alpha` into view `beta` by its depth.
 
-    Visible means on beta's picture and as far from beta as the surface recorded there, to the relative `tolerance`.
+    Visible means on beta's image and as far from beta as the surface recorded there, to the relative `tolerance`.
     Inverse depth is interpolated, which is exact on planes; points beside an edge in beta count as not visible.
     """
     a, b = batch.cameras[alpha], batch.cameras[beta]
@@ -90,7 +90,7 @@ class Report:
         return {"accepted": self.accepted, "reasons": list(self.reasons), "views": self.views, "pairs": self.pairs}
 
 
-def check_views(rig: Rig, frames: Mapping[str, Frame], limits: Limits | None = None) -> Report:
+def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: Limits | None = None) -> Report:
     """Check one frame of every camera against each other and against the limits.
 
     Pairs of frames of different times are left out.
@@ -105,8 +105,8 @@ def check_views(rig: Rig, frames: Mapping[str, Frame], limits: Limits | None = N
     return Report(views=views, pairs=pairs, reasons=tuple(reasons))
 
 
-def view_figures(frame: Frame) -> dict[str, float]:
-    """Brightness, texture and depths of one picture."""
+def view_figures(frame: RenderedFrame) -> dict[str, float]:
+    """Brightness, texture and depths of one image."""
     there = frame.depth.isfinite()
     depths = frame.depth[there] if there.any() else frame.depth.new_tensor([torch.inf])
     figures = {
@@ -130,13 +130,15 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
     return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
 
 
-def pair_figures(alpha: Camera, here: Frame, beta: Camera, there: Frame, *, most: int = 200_000) -> dict[str, float]:
+def pair_figures(
+    alpha: Camera, here: RenderedFrame, beta: Camera, there: RenderedFrame, *, most: int = 200_000
+) -> dict[str, float]:
     """How well alpha's depth foretells beta's view, at up to `most` pixels.
 
-    `inside` is the share of alpha's pixels whose points are on beta's picture; of all, `visible` are seen there,
+    `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen there,
     `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside an edge in beta
     are none of these. `median`, `p95` and `p99` of the error on visible points are in alpha's pixels. `colour` is the
-    median difference of their colours, relative to their brightness, `shift` how many pixels one picture is displaced
+    median difference of their colours, relative to their brightness, `shift` how many pixels one image is displaced
     against the other by all of these differences together.
     """
     alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
@@ -166,7 +168,7 @@ def pair_figures(alpha: Camera, here: Frame, beta: Camera, there: Frame, *, most
     return _rounded(figures)
 
 
-def _chosen(frame: Frame, most: int) -> tuple[Tensor, Tensor, Tensor]:
+def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
     """Pixels that see something, evenly thinned: x (n, 2), depth and index."""
     grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
     there = frame.depth.isfinite()
@@ -175,9 +177,9 @@ def _chosen(frame: Frame, most: int) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _compared(
-    here: Frame, x: Float[Tensor, "n 2"], there: Frame, target: Float[Tensor, "n 2"]
+    here: RenderedFrame, x: Float[Tensor, "n 2"], there: RenderedFrame, target: Float[Tensor, "n 2"]
 ) -> tuple[Tensor, Tensor]:
-    """Median difference of colours, and the shift of one picture against the other that explains most of it."""
+    """Median difference of colours, and the shift of one image against the other that explains most of it."""
     slopes = torch.cat(torch.gradient(here.rgb, dim=(-1, -2)))[None]
     mine, dx, dy = sample(torch.cat([here.rgb[None], slopes], 1).double(), x[None]).values[0].split(3)
     difference = sample(there.rgb[None].double(), target[None]).values[0] - mine
@@ -199,11 +201,11 @@ def _camera(rig: Rig, name: str) -> Camera:
 def _view_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
     found = []
     if figures["dark"] > limits.dark:
-        found.append(f"{name}: {figures['dark']:.0%} of the picture is black (at most {limits.dark:.0%})")
+        found.append(f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})")
     if figures["bright"] > limits.bright:
-        found.append(f"{name}: {figures['bright']:.0%} of the picture is saturated (at most {limits.bright:.0%})")
+        found.append(f"{name}: {figures['bright']:.0%} of the image is saturated (at most {limits.bright:.0%})")
     if figures["texture"] < limits.texture:
-        found.append(f"{name}: {figures['texture']:.0%} of the picture has texture (at least {limits.texture:.0%})")
+        found.append(f"{name}: {figures['texture']:.0%} of the image has texture (at least {limits.texture:.0%})")
     return found
 
 

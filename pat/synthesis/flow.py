@@ -1,4 +1,4 @@
-"""How far the points that pixels see move in the picture, from depth, index and the objects' motions."""
+"""How far the points that pixels see move in the image, from depth, index and the objects' motions."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from torch import Tensor
 from arraygeom.camera import Camera
 from arraygeom.pixels import pixel_grid
 
-from .rendered import Frame
+from .rendered import RenderedFrame
 from .scene import Motion, Scene
 
 
-def flow(scene: Scene, camera: Camera, frame: Frame, step: float) -> Float[Tensor, "2 h w"]:
+def flow(scene: Scene, camera: Camera, frame: RenderedFrame, step: float) -> Float[Tensor, "2 h w"]:
     """Displacement (x, y) in pixels over `step` seconds of every pixel's point; 0 where nothing is.
 
     Exact for any lens: points are carried by their object's motion and projected again.

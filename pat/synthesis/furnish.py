@@ -79,7 +79,7 @@ class Setting:
         return float(min(z if z > 0.3 * d else d for z, d in zip(depths, distances)))
 
     def ahead(self, camera: Camera, fraction: NDArray, depth: float) -> NDArray:
-        """The point at a depth in the middle `fraction` (-1..1, across and down) of a camera's picture."""
+        """The point at a depth in the middle `fraction` (-1..1, across and down) of a camera's image."""
         h, w = camera.hw
         x = camera.K.new_tensor([(w - 1) / 2 * (1 + fraction[0]), (h - 1) / 2 * (1 + fraction[1])])
         return camera.unproject(x, x.new_tensor(depth)).double().numpy()
@@ -134,7 +134,7 @@ def _room(setting: Setting) -> _Room:
 
 
 def _rays(camera: Camera) -> NDArray:
-    """Directions in the world, per metre of depth, of pixels all over the picture."""
+    """Directions in the world, per metre of depth, of pixels all over the image."""
     grid = coarse_grid(camera.hw, max(camera.hw) // 24 or 1).reshape(-1, 2)
     directions = (camera.unproject(grid, grid.new_ones(len(grid))) - camera.centre).double().numpy()
     return np.asarray(directions[np.isfinite(directions).all(1)])

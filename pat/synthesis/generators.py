@@ -21,7 +21,7 @@ from arraygeom.rig import Rig
 from .furnish import Setting, furnished, seeded, vec
 from .scene import Board, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
 
-PICTURES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
 
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
@@ -34,21 +34,21 @@ def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
 
 
 def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0) -> Scene:
-    """Scenes like those of `abstract`, with the pictures under a folder on all surfaces.
+    """Scenes like those of `abstract`, with the images under a folder on all surfaces.
 
-    Pictures that are black in large parts are used only if there are no others. Raises ValueError if the folder holds
-    no pictures.
+    Images that are black in large parts are used only if there are no others. Raises ValueError if the folder holds
+    no images.
     """
-    files = _pictures(Path(folder))
+    files = _images(Path(folder))
 
-    def picture(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
+    def image(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> Texture:
         rng, tint = setting.rng, float(setting.rng.uniform(0.75, 1.0))
         width = setting.metres(depth, rng.uniform(150, 400))
         paint = Paint((tint, tint, tint), float(rng.uniform(0.8, 1.0)))
         shift = (float(rng.uniform()), float(rng.uniform()), 0.0)
-        return Texture(kind="picture", picture=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift)
+        return Texture(kind="image", image=_bright_one(rng, files), scale=1 / width, paints=(paint,), offset=shift)
 
-    return furnished("photographs", seed, rig, picture, moving)
+    return furnished("photographs", seed, rig, image, moving)
 
 
 def board(poses: Sequence[Pose], spec: Board, *, seed: int = 0) -> Scene:
@@ -85,7 +85,7 @@ GENERATORS: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photograph
 def random_board_poses(rig: Rig, spec: Board, count: int, *, seed: int = 0) -> list[Pose]:
     """Poses (world_from_board) in front of all cameras at once: near and far, to all sides, tilted up to 40 degrees.
 
-    The board is from 0.6 to 1.1 times as long as the narrowest view is wide, and its middle is in every picture.
+    The board is from 0.6 to 1.1 times as long as the narrowest view is wide, and its middle is in every image.
     """
     setting = Setting(rig, seeded("poses", seed))
     return [_board_pose(setting, spec) for _ in range(count)]
@@ -131,22 +131,22 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
 
 
 @lru_cache(maxsize=8)
-def _pictures(folder: Path) -> tuple[str, ...]:
-    found = sorted(str(p.resolve()) for p in folder.rglob("*") if p.suffix.lower() in PICTURES)
+def _images(folder: Path) -> tuple[str, ...]:
+    found = sorted(str(p.resolve()) for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
     if not found:
-        raise ValueError(f"{folder}: no pictures ({', '.join(sorted(PICTURES))}) under this folder")
+        raise ValueError(f"{folder}: no images ({', '.join(sorted(IMAGE_SUFFIXES))}) under this folder")
     return tuple(found)
 
 
 def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:
-    """One of the pictures, and if it can be helped none that is black in large parts."""
+    """One of the images, and if it can be helped none that is black in large parts."""
     drawn = [str(rng.choice(files)) for _ in range(8)]
     return next((file for file in drawn if _blackness(file) < 0.3), drawn[0])
 
 
 @lru_cache(maxsize=4096)
 def _blackness(file: str) -> float:
-    """The share of pixels that are nearly black; 1 for what is no picture."""
+    """The share of pixels that are nearly black; 1 for what is no image."""
     small = cv2.imread(file, cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return 1.0 if small is None else float((small < 24).mean())
 

@@ -1,4 +1,4 @@
-"""Rendered light as ordinary pictures: PNG, JPEG and EXR; black and white, colour, colour with coverage."""
+"""Rendered light as ordinary images: PNG, JPEG and EXR; black and white, colour, colour with coverage."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from arraygeom.atomic import write_atomically
 
 from ..media.images import write_image
-from .rendered import Frame, Rendered
+from .rendered import Rendered, RenderedFrame
 
 Channels = Literal["bw", "rgb", "rgba", "nir"]
 Kind = Literal["png8", "png16", "jpeg", "exr"]
@@ -26,7 +26,7 @@ _SUFFIX = {"png8": ".png", "png16": ".png", "jpeg": ".jpg", "exr": ".exr"}
 
 
 def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels: Channels = "rgb") -> list[Path]:
-    """Write all frames of a rendered folder as pictures named like its arrays; the paths written.
+    """Write all frames of a rendered folder as images named like its arrays; the paths written.
 
     PNG and JPEG are sRGB and cut at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without the
     pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
@@ -40,7 +40,7 @@ def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels
     return written
 
 
-def light(frame: Frame, channels: Channels) -> Float[Tensor, "c h w"]:
+def light(frame: RenderedFrame, channels: Channels) -> Float[Tensor, "c h w"]:
     """The linear channels of a frame, colour multiplied by coverage in "rgba". Raises ValueError for missing passes."""
     if channels == "rgb":
         return frame.rgb

@@ -1,8 +1,8 @@
 """Scenes of layers: textured planes at random depths and slants with random outlines, seen by any cameras.
 
 A layer is a plane in the world with a painter: a camera with K = I that looks at it squarely from distance 1, so
-that the painter's picture is the plane itself in metres. The plane's homography from each view to the painter
-gives, at any pixel, the place on the plane and (as its third entry) the inverse depth: pictures, depth and
+that the painter's image is the plane itself in metres. The plane's homography from each view to the painter
+gives, at any pixel, the place on the plane and (as its third entry) the inverse depth: images, depth and
 occlusion are exact, and no geometry is approximated. All surfaces are opaque and diffuse.
 """
 
@@ -32,7 +32,7 @@ _MAX_OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class ArrayBatch:
-    """Pictures and truth, one entry a camera, alpha first.
+    """Images and truth, one entry a camera, alpha first.
 
     `images` 0..1 (sRGB as the photographs have it); `depth` in metres along each camera's own axis at the
     pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths;
@@ -101,7 +101,7 @@ class LayeredScenes:
         return ArrayBatch(list(images), list(depth), K, R, t, hw, bounds, list(index))
 
     def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Picture, and depth at the pixels' centres and index of the surface that covers most of each pixel."""
+        """Image, and depth at the pixels' centres and index of the surface that covers most of each pixel."""
         front = self._front(layers, camera)
         depth, index = ((v.view(-1, *camera.hw)) for v in (1 / front.inverse_depth, front.main + 1))
         if factor == 1:
@@ -136,7 +136,7 @@ class LayeredScenes:
         return q, opacity * in_front
 
     def _shade(self, layers: Layers, camera: Camera, front: _Front) -> Tensor:
-        """The picture (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the first."""
+        """The image (B, 3, h, w): the two foremost layers of each pixel, mixed by the opacity of the first."""
         H = (layers.texel_from_plane @ plane_from_camera(layers, camera)).float().to(self.device)
         colour = self._colours(layers, H, camera.hw, front.first, torch.ones_like(front.opacity, dtype=torch.bool))
         edge = front.opacity < 1 - _FAINT

@@ -110,7 +110,7 @@ def _rays(camera: Camera, pixel: Tensor) -> Tensor:
 
 
 def _anchors(alpha: Camera, shape: tuple[int, int], g: Generator) -> Tensor:
-    """Rays through the layers' middles, up to 15 % of the picture outside it."""
+    """Rays through the layers' middles, up to 15 % of the image outside it."""
     h, w = alpha.hw
     size = torch.tensor([w, h], dtype=torch.float64)
     return _rays(alpha, uniform((-0.15, 1.15), (*shape, 2), g) * size)
@@ -151,7 +151,7 @@ def _inverse_depths(rigs: RigBatch, shape: tuple[int, int], g: Generator) -> Ten
 def _not_nearer(rigs: RigBatch, q: Tensor, normal: Tensor, ray: Tensor, radius: Tensor) -> Tensor:
     """Inverse depths at the anchors, lowered where the slant would bring the plane nearer than `near`.
 
-    The inverse depth of a plane grows by q |normal_xy| / (normal . ray) over one focal length of the picture;
+    The inverse depth of a plane grows by q |normal_xy| / (normal . ray) over one focal length of the image;
     `radius` is how far the layer reaches, in alpha's pixels.
     """
     slope = normal[..., :2].norm(dim=-1) / (normal * ray).sum(-1).clamp(min=1e-3)
@@ -175,7 +175,7 @@ def _painters(normal: Tensor) -> Tensor:
 
 
 def _upright(R: Tensor) -> Tensor:
-    """The angle by which e1 is turned in the picture."""
+    """The angle by which e1 is turned in the image."""
     return torch.atan2(R[..., 0, 1], R[..., 0, 0])
 
 

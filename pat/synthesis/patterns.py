@@ -15,32 +15,32 @@ def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
     return [_bytes(makers[i % len(makers)](rng)) for i in range(count)]
 
 
-def recoloured(pictures: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """Textures with the luminance of one picture and the chroma of another, or smooth, or without one of them.
+def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
+    """Textures with the luminance of one image and the chroma of another, or smooth, or without one of them.
 
     What a network could learn of colour from luminance in photographs does not hold here.
     """
-    return [_bytes(_mixed(pictures, rng)) for _ in range(count)]
+    return [_bytes(_mixed(images, rng)) for _ in range(count)]
 
 
-def _mixed(pictures: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    shape, paint = (_window(pictures[i], rng) for i in rng.integers(len(pictures), size=2))
+def _mixed(images: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
+    shape, paint = (_window(images[i], rng) for i in rng.integers(len(images), size=2))
     shape, paint = (_smoothed(p, rng) if rng.random() < 0.4 else p for p in (shape, paint))
     luminance = 0.15 + 0.7 * (shape @ _LUMINANCE)
     chroma = paint - (paint @ _LUMINANCE)[..., None]
     return luminance[..., None] + rng.uniform(0.5, 1.5) * chroma
 
 
-def _window(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    h, w = picture.shape[:2]
+def _window(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    h, w = image.shape[:2]
     side = min(h, w, 2 * _SIDE)
     y, x = rng.integers(h - side + 1), rng.integers(w - side + 1)
-    part = cv2.resize(picture[y : y + side, x : x + side], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
+    part = cv2.resize(image[y : y + side, x : x + side], (_SIDE, _SIDE), interpolation=cv2.INTER_AREA)
     return part.astype(np.float32) / 255
 
 
-def _smoothed(picture: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    return cv2.GaussianBlur(picture, (0, 0), rng.uniform(4, 30))
+def _smoothed(image: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    return cv2.GaussianBlur(image, (0, 0), rng.uniform(4, 30))
 
 
 def _colours(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -96,5 +96,5 @@ def _cloud(rng: np.random.Generator) -> np.ndarray:
     return _colours(rng, 1)[0] + 0.2 * sum(octaves)
 
 
-def _bytes(picture: np.ndarray) -> np.ndarray:
-    return (np.clip(picture, 0, 1) * 255 + 0.5).astype(np.uint8)
+def _bytes(image: np.ndarray) -> np.ndarray:
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -29,10 +29,10 @@ class PhotoBank:
     `len(bank)` textures; `photos` of them, the first, are photographs and the others patterns made from a seed.
     """
 
-    def __init__(self, pictures: Iterable[np.ndarray], *, photos: int | None = None):
-        levels = [_pyramid(_cropped(p)) for p in pictures]
+    def __init__(self, images: Iterable[np.ndarray], *, photos: int | None = None):
+        levels = [_pyramid(_cropped(p)) for p in images]
         if not levels:
-            raise ValueError("a PhotoBank needs at least one picture")
+            raise ValueError("a PhotoBank needs at least one image")
         sizes = [[(p.shape[1], p.shape[0]) for p in pyramid] for pyramid in levels]
         counts = np.array([[w * h for w, h in pyramid] for pyramid in sizes])
         starts = np.concatenate([[0], counts.ravel().cumsum()[:-1]]).reshape(counts.shape)
@@ -50,19 +50,19 @@ class PhotoBank:
         seed: int = 0,
         choose: Callable[[int], bool] = lambda i: True,
     ) -> PhotoBank:
-        """All pictures under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside them.
+        """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside them.
 
         `cache` names an .npz file (keep it outside the repository) that is written on the first call and read
-        on later ones; it is not checked against the folders. `choose` says by its number whether a picture is
-        taken, to hold some out. Raises ValueError where no picture is found.
+        on later ones; it is not checked against the folders. `choose` says by its number whether an image is
+        taken, to hold some out. Raises ValueError where no image is found.
         """
-        pictures = _cached(cache) if cache and Path(cache).exists() else _read(folders, max_edge)
+        images = _cached(cache) if cache and Path(cache).exists() else _read(folders, max_edge)
         if cache and not Path(cache).exists():
-            np.savez(cache, *pictures)
-        pictures = [p for i, p in enumerate(pictures) if choose(i)]
+            np.savez(cache, *images)
+        images = [p for i, p in enumerate(images) if choose(i)]
         rng = np.random.default_rng(seed)
-        extra = patterns(rng, 48) + recoloured(pictures, rng, 48)
-        return cls(pictures + extra, photos=len(pictures))
+        extra = patterns(rng, 48) + recoloured(images, rng, 48)
+        return cls(images + extra, photos=len(images))
 
     def __len__(self) -> int:
         return len(self.wh)
@@ -79,7 +79,7 @@ class PhotoBank:
     ) -> Float[Tensor, "3 n"]:
         """Colours 0..1 at pixels (x, y) of the textures (first centre (0, 0)), trilinear in position and level.
 
-        `level` is log2 of the distance between samples in pixels of the full texture: at 0 the full picture is
+        `level` is log2 of the distance between samples in pixels of the full texture: at 0 the full image is
         read, at 1 its 2x reduction, whose pixel (0, 0) lies at (0.5, 0.5) of the full one.
         """
         level = level.clamp(0, LEVELS - 1)
@@ -120,10 +120,10 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
 
 def _read(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
     paths = sorted(p for f in folders for p in Path(f).rglob("*") if p.suffix.lower() in _SUFFIXES)
-    pictures = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
-    if not pictures:
-        raise ValueError(f"no picture found under {', '.join(map(str, folders)) or 'no folder'}")
-    return pictures
+    images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
+    if not images:
+        raise ValueError(f"no image found under {', '.join(map(str, folders)) or 'no folder'}")
+    return images
 
 
 def _cached(path: str | Path) -> list[np.ndarray]:
@@ -132,35 +132,35 @@ def _cached(path: str | Path) -> list[np.ndarray]:
 
 
 def _decoded(path: Path) -> np.ndarray | None:
-    """RGB bytes, or None for a file that is no picture or is too small to be a texture."""
-    picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
-    if picture is None or min(picture.shape[:2]) < _MULTIPLE:
+    """RGB bytes, or None for a file that is no image or is too small to be a texture."""
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    if image is None or min(image.shape[:2]) < _MULTIPLE:
         return None
-    return cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
-def _reduced(picture: np.ndarray, max_edge: int) -> np.ndarray:
-    h, w = picture.shape[:2]
+def _reduced(image: np.ndarray, max_edge: int) -> np.ndarray:
+    h, w = image.shape[:2]
     s = max_edge / max(h, w)
     if s >= 1:
-        return picture
+        return image
     size = (max(round(w * s), _MULTIPLE), max(round(h * s), _MULTIPLE))
-    return cv2.resize(picture, size, interpolation=cv2.INTER_AREA)
+    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _cropped(picture: np.ndarray) -> np.ndarray:
-    h, w = (n // _MULTIPLE * _MULTIPLE for n in picture.shape[:2])
-    return picture[:h, :w]
+def _cropped(image: np.ndarray) -> np.ndarray:
+    h, w = (n // _MULTIPLE * _MULTIPLE for n in image.shape[:2])
+    return image[:h, :w]
 
 
-def _pyramid(picture: np.ndarray) -> list[np.ndarray]:
-    exact = [picture.astype(np.float32)]
+def _pyramid(image: np.ndarray) -> list[np.ndarray]:
+    exact = [image.astype(np.float32)]
     for _ in range(LEVELS - 1):
         h, w = exact[-1].shape[:2]
         exact.append(exact[-1].reshape(h // 2, 2, w // 2, 2, 3).mean((1, 3)))
     return [(p + 0.5).astype(np.uint8) for p in exact]
 
 
-def _packed(picture: np.ndarray) -> np.ndarray:
-    r, g, b = np.moveaxis(picture.reshape(-1, 3).astype(np.int32), -1, 0)
+def _packed(image: np.ndarray) -> np.ndarray:
+    r, g, b = np.moveaxis(image.reshape(-1, 3).astype(np.int32), -1, 0)
     return r | g << 8 | b << 16

@@ -1,4 +1,4 @@
-"""A rendered scene on disk: pictures and truth of every camera, its rig, its description, how it was checked.
+"""A rendered scene on disk: images and truth of every camera, its rig, its description, how it was checked.
 
 A folder holds `rig.yaml` (the rig as rendered), `scene.yaml`, `render.json` (settings, versions, frames, check) and
 one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `Frame` by name.
@@ -31,13 +31,13 @@ RENDER_FILE = "render.json"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Frame:
-    """One picture and its truth, at the pixels' centres.
+class RenderedFrame:
+    """One image and its truth, at the pixels' centres.
 
     `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of the near
     infrared, `alpha` how much of a pixel objects cover. `depth` is z in metres (float32), infinite where nothing
     is. `index` is 0 where nothing is, else the object's place in the scene plus one. `normals` are unit vectors in
-    the camera's frame; `flow` is how far each pixel's point moves in the picture until the camera's next frame (for
+    the camera's frame; `flow` is how far each pixel's point moves in the image until the camera's next frame (for
     one frame: 1/30 s). What a lens does not see has `depth` NaN and index 0.
     """
 
@@ -53,7 +53,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A rendered folder. Pictures are read when asked for."""
+    """A rendered folder. Images are read when asked for."""
 
     folder: Path
 
@@ -79,16 +79,16 @@ class Rendered:
 
     def frames(self, camera: str) -> int:
         """How many frames of a camera there are."""
-        return len(self.about["frames"][self.rig.known(camera)])
+        return len(self.about["frames"][self.rig.require(camera)])
 
-    def frame(self, camera: str, number: int = 0) -> Frame:
+    def frame(self, camera: str, number: int = 0) -> RenderedFrame:
         """One frame of a camera, as float32 (index: int64)."""
-        entry = self.about["frames"][self.rig.known(camera)][number]
+        entry = self.about["frames"][self.rig.require(camera)][number]
         with np.load(self.folder / entry["file"]) as arrays:
             tensors = {k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32)) for k in arrays}
-        return Frame(time=entry["time"], **tensors)
+        return RenderedFrame(time=entry["time"], **tensors)
 
-    def first_frames(self) -> Mapping[str, Frame]:
+    def first_frames(self) -> Mapping[str, RenderedFrame]:
         """The first frame of every camera."""
         return {name: self.frame(name) for name in self.rig.names}
 
@@ -97,7 +97,7 @@ _STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals":
 _MOST = 6e4
 
 
-def save_frame(path: Path, frame: Frame) -> None:
+def save_frame(path: Path, frame: RenderedFrame) -> None:
     """Write the arrays of a frame, on disk when this returns."""
     arrays: dict[str, NDArray] = {}
     for field in dataclasses.fields(frame):

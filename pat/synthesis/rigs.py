@@ -30,11 +30,11 @@ class RigBatch:
 class RigDistribution:
     """What random rigs look like. Pairs are ranges; lengths are drawn evenly in their logarithm.
 
-    - `mode`: "rectified" (betas displaced along x alone, their pictures resized copies of alpha's geometry, so
+    - `mode`: "rectified" (betas displaced along x alone, their images resized copies of alpha's geometry, so
       that x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
     - `parallax`: displacement of the nearest depth against infinity, in alpha's pixels; sets the baseline.
     - `near` in metres and `depth_ratio` = far / near.
-    - `frame`: width of the whole picture as a multiple of alpha's, which is a patch of it; `focal`: focal length
+    - `frame`: width of the whole image as a multiple of alpha's, which is a patch of it; `focal`: focal length
       as a multiple of that width.
     - `resolutions`: beta's pixels a radian over alpha's and its size over alpha's; one is drawn for each camera
       of a batch.
@@ -59,7 +59,7 @@ class RigDistribution:
     decentring: float = 0.1
 
     def sample(self, batch: int, hw: HW, generator: Generator) -> RigBatch:
-        """`batch` rigs, alpha's pictures being of height and width `hw`, alpha's frame being the world."""
+        """`batch` rigs, alpha's images being of height and width `hw`, alpha's frame being the world."""
         near = log_uniform(self.near, (batch,), generator)
         far = near * log_uniform(self.depth_ratio, (batch,), generator)
         alpha = self._alpha(batch, hw, generator)
@@ -91,7 +91,7 @@ class RigDistribution:
         return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, self._resolution(g)))
 
     def _general_beta(self, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
-        """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the picture."""
+        """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the image."""
         batch, resolution = len(near), self._resolution(g)
         hw = scaled(alpha.hw, resolution)
         centre = self._baseline(alpha, near, g)[:, None] * _direction(batch, g)

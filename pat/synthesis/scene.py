@@ -25,7 +25,7 @@ from ..support.schema import from_document, to_document
 
 Vec3 = tuple[float, float, float]
 Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "room"]
-TextureKind = Literal["plain", "voronoi", "magic", "brick", "checker", "noise", "wave", "picture", "board"]
+TextureKind = Literal["plain", "voronoi", "magic", "brick", "checker", "noise", "wave", "image", "board"]
 
 FORMAT = "pat-scene 1"
 
@@ -67,7 +67,7 @@ class Texture:
 
     Patterns live in the object's own coordinates in metres and have about `scale` features a metre; `offset`
     shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They run
-    through the `paints` in order. A "picture" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
+    through the `paints` in order. A "image" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
     and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is its red plus
     1.5 times by how much green exceeds red and blue (leaves), times the paint's. A "board" fills its plane.
     """
@@ -78,7 +78,7 @@ class Texture:
     offset: Vec3 = (0.0, 0.0, 0.0)
     distortion: float = 0.0
     grain: float = 0.0
-    picture: str = ""
+    image: str = ""
     board: Board | None = None
 
 
@@ -172,7 +172,7 @@ class Object:
     """A shape with a material, and perhaps a relief.
 
     A "room" is a cube seen from inside; it casts no shadow. Object `i` of a scene has the index i + 1 in rendered
-    index pictures.
+    index images.
     """
 
     name: str

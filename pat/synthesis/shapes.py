@@ -25,7 +25,7 @@ _MOST_CELLS = 96
 
 
 class Mesh(NamedTuple):
-    """Corners of quadrilaterals, and where each corner is on a picture laid on the surface.
+    """Corners of quadrilaterals, and where each corner is on an image laid on the surface.
 
     `vertices` are metres in the object's frame, at the extent of its first key. `faces` go counter-clockwise seen
     from outside; one of three corners has its last index twice. `uv` (metres, x right, y down) is by face and corner.

@@ -18,24 +18,24 @@ from arraygeom.rig import Rig
 from ..media.images import write_image
 from .blender import RenderSettings, Worker
 from .image_files import coded, light
-from .rendered import Frame, Rendered
+from .rendered import Rendered, RenderedFrame
 from .scene import Scene
 
 
 def contact_sheet(
     scenes: Sequence[Scene], rig: Rig, out: Path, *, settings: RenderSettings, columns: int = 6
 ) -> list[Rendered]:
-    """Render scenes into folders under `out`, and the first camera's pictures into `out/sheet.png`."""
+    """Render scenes into folders under `out`, and the first camera's images into `out/sheet.png`."""
     with Worker() as worker:
         done = [_rendered(worker, s, rig, out / f"{s.generator}-{s.seed:04d}", settings) for s in scenes]
     write_image(out / "sheet.png", tiled([coded(r.frame(r.rig.names[0]).rgb) for r in done], columns))
     return done
 
 
-def tiled(pictures: Sequence[Float[Tensor, "c _ _"]], columns: int) -> Float[Tensor, "c h w"]:
-    """Pictures in rows, each in a cell as large as the largest."""
-    h, w = (max(p.shape[i] for p in pictures) for i in (1, 2))
-    cells = [pad(p, (0, w - p.shape[2], 0, h - p.shape[1])) for p in pictures]
+def tiled(images: Sequence[Float[Tensor, "c _ _"]], columns: int) -> Float[Tensor, "c h w"]:
+    """Images in rows, each in a cell as large as the largest."""
+    h, w = (max(p.shape[i] for p in images) for i in (1, 2))
+    cells = [pad(p, (0, w - p.shape[2], 0, h - p.shape[1])) for p in images]
     cells += [torch.zeros_like(cells[0])] * (-len(cells) % columns)
     rows = [torch.cat(cells[i : i + columns], 2) for i in range(0, len(cells), columns)]
     return torch.cat(rows, 1)
@@ -56,8 +56,8 @@ def video(rendered: Rendered, camera: str, path: Path) -> None:
     with write_atomically(path) as temporary:
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, (w, h))
         for k in range(count):
-            picture = coded(rendered.frame(camera, k).rgb).mul(255).round().byte()
-            writer.write(np.ascontiguousarray(picture.flip(0).movedim(0, -1).numpy()))
+            image = coded(rendered.frame(camera, k).rgb).mul(255).round().byte()
+            writer.write(np.ascontiguousarray(image.flip(0).movedim(0, -1).numpy()))
         writer.release()
 
 
@@ -65,6 +65,6 @@ def _rendered(worker: Worker, scene: Scene, rig: Rig, folder: Path, settings: Re
     return Rendered(folder) if folder.exists() else worker.render(scene, rig, folder, settings=settings)
 
 
-def _with_infrared(frame: Frame) -> list[Tensor]:
+def _with_infrared(frame: RenderedFrame) -> list[Tensor]:
     grey = [coded(light(frame, "bw")), coded(light(frame, "nir"))]
     return [coded(frame.rgb), *(g.expand(3, -1, -1) for g in grey)]

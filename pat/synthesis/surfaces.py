@@ -1,4 +1,4 @@
-"""Depth between the pixels of a depth picture."""
+"""Depth between the pixels of a depth image."""
 
 from __future__ import annotations
 

@@ -7,19 +7,19 @@ from pathlib import Path
 from torch import Tensor
 
 from ..data.sample_array import ALPHA, BETA, SampleArray
-from ..fusion.results import FusedFrame, colour_depth, save_panels
+from ..fusion.results import Frame, colour_depth, save_panels
 
 
-def report_figure(sample: SampleArray, baseline: Tensor, frame: FusedFrame, path: Path) -> None:
+def report_figure(sample: SampleArray, baseline: Tensor, frame: Frame, path: Path) -> None:
     """One figure: inputs, the classical baseline, the fusion, ground truth, depth and confidence."""
     panels = {
         "alpha: mono": sample.images[ALPHA],
         "beta: colour": sample.images[BETA],
-        "ground truth": sample.truth,
+        "ground truth": sample.ground_truth,
         "classical": baseline,
         "fusion": frame.image,
         "depth (bright is near)": colour_depth(frame.depth),
         "confidence": frame.confidence[None],
-        "fusion's error x 5": (frame.image.clamp(0, 1) - sample.truth).abs() * 5,
+        "fusion's error x 5": (frame.image.clamp(0, 1) - sample.ground_truth).abs() * 5,
     }
     save_panels(panels, path, columns=4)

@@ -13,7 +13,7 @@ from torch import Generator, Tensor
 
 from arraygeom import Camera, Rig, pixel_grid, sample
 
-from ..fusion.results import FusedFrame
+from ..fusion.results import Frame
 from ..media.colour import linear_from_srgb
 from ..media.raw import light_of
 from ..sensors import Coded
@@ -24,7 +24,7 @@ READ_NOISE = 1.5e-3
 """Variance of reading over that of one white of light, for weighing exposures: typical of machine vision sensors."""
 
 
-def merged(frame: FusedFrame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], alpha: str) -> FusedFrame:
+def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], alpha: str) -> Frame:
     """The fused frame with brightness from all cameras, coded as sRGB, above 1 where alpha's white is exceeded.
 
     Betas, one band each, are looked up by the frame's depth. What alpha would read is a sum of those bands that are
@@ -47,8 +47,8 @@ def merged(frame: FusedFrame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ 
     return frame._replace(image=frame.image + brighter)
 
 
-def _at_alpha(frame: FusedFrame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
-    """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or not on the picture."""
+def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
+    """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or not on the image."""
     a, b = rig[alpha], rig[name]
     if not (isinstance(a, Camera) and isinstance(b, Camera)):
         raise ValueError("merging exposures needs calibrated cameras: the depth tells where betas see a point")
@@ -96,7 +96,7 @@ def _fit(bands: Float[Tensor, "m n"], own: Float[Tensor, " n"]) -> tuple[Float[T
 
 
 class Usable(NamedTuple):
-    """The darkest and the brightest light that a picture tells, and their ratio in factors of two."""
+    """The darkest and the brightest light that an image tells, and their ratio in factors of two."""
 
     low: float
     high: float
@@ -108,13 +108,13 @@ class Usable(NamedTuple):
 
 
 def usable_range(
-    told: Sequence[Float[Tensor, "*n"]], truth: Sequence[Float[Tensor, "*n"]], *, within: float = 0.25
+    told: Sequence[Float[Tensor, "*n"]], ground_truth: Sequence[Float[Tensor, "*n"]], *, within: float = 0.25
 ) -> Usable:
-    """The widest run of half-stops of true light in which a picture's relative error (median) is `within` this.
+    """The widest run of half-stops of true light in which an image's relative error (median) is `within` this.
 
     Raises ValueError if there is none.
     """
-    t, light = (torch.cat([v.flatten() for v in values]) for values in (told, truth))
+    t, light = (torch.cat([v.flatten() for v in values]) for values in (told, ground_truth))
     bins = (2 * light.clamp(min=1e-7).log2()).floor().long()
     runs: list[list[int]] = [[]]
     for i in range(int(bins.min()), int(bins.max()) + 1):
@@ -125,5 +125,5 @@ def usable_range(
         runs = [*runs[:-1], [*runs[-1], i]] if right else [*runs, []]
     best = max(runs, key=len)
     if not best:
-        raise ValueError("the picture tells no light anywhere")
+        raise ValueError("the image tells no light anywhere")
     return Usable(2 ** (best[0] / 2), 2 ** ((best[-1] + 1) / 2))

@@ -1,6 +1,6 @@
-"""Real pictures fused: stereo pairs, calibrated pairs that are not rectified, an array known only by F.
+"""Real images fused: stereo pairs, calibrated pairs that are not rectified, an array known only by F.
 
-The folder of pictures is laid out as `data/`: kitti, middlebury, flickr1024 (stereo pairs), syntim (pairs with
+The folder of images is laid out as `data/`: kitti, middlebury, flickr1024 (stereo pairs), syntim (pairs with
 `cam_NAME_g` and `cam_NAME_d`), hfr_lfr (the paper's fast + slow array).
 """
 
@@ -24,7 +24,7 @@ from ..evaluation.metrics import score
 from ..evaluation.stereo import METHODS, Row, evaluate_sets, markdown, rectified_fusion, sets_markdown, structure_kept
 from ..fusion.fuse import fuse
 from ..fusion.results import colour_depth, save_panels
-from ..fusion.steps import levelled, pitch_ratio
+from ..fusion.steps import normalised, pitch_ratio
 from ..media.colour import luminance_of
 from ..media.images import read_image
 from ..networks.protocol import FusionNetwork
@@ -33,7 +33,7 @@ from ..sensors import Clip, Coded, Exposure, record
 
 PAIRS = ("kitti", "middlebury", "flickr1024")
 SYNTIM = ("Color", "Serfaty", "Poly")
-"""Scenes in colour whose calibration fits their pictures to about a pixel."""
+"""Scenes in colour whose calibration fits their images to about a pixel."""
 FAST, SLOW = "fast", {"cam1": "F1_ref_to_cam1", "cam2": "F2_ref_to_cam2", "cam3": "F3_ref_to_cam3"}
 """The fast camera is alpha; the slow ones see about 600, 550 and 450 nm: red, green, blue."""
 SCENE, FAST_FRAME, SLOW_FRAME = "pillow_1", "141", "4"
@@ -61,14 +61,14 @@ def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) 
     rows = evaluate_sets({name: data / name for name in PAIRS}, methods, rates, out=out / "pairs")
     return (
         "### Stereo pairs\n\n"
-        "The left picture made grey is alpha, the right one reduced is beta, the left one in colour is the truth.\n"
-        "PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Every picture is in `pairs/`: beta enlarged,\n"
+        "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the truth.\n"
+        "PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Every image is in `pairs/`: beta enlarged,\n"
         f"alpha, classical, fusion, truth.\n\n{sets_markdown(rows)}"
     )
 
 
 class Scene(NamedTuple):
-    """A calibrated pair, left and right, with the depth range of what both see, and its pictures in colour."""
+    """A calibrated pair, left and right, with the depth range of what both see, and its images in colour."""
 
     name: str
     rig: Rig
@@ -78,7 +78,7 @@ class Scene(NamedTuple):
 
 def syntim_scene(folder: Path, name: str) -> Scene:
     """A pair of INRIA's, its depth range by matched points."""
-    left, right = (_syntim_picture(folder, name, side) for side in (0, 1))
+    left, right = (_syntim_image(folder, name, side) for side in (0, 1))
     rig = Rig.load(folder / f"cam_{name}_g")
     depth = seen_depths(rig.pair("left", "right"), match_points(left, right))
     return Scene(name, rig.replace(depth=depth, name=f"SYNTIM {name}"), left, right)
@@ -90,7 +90,7 @@ def _syntim(network: FusionNetwork, scenes: Sequence[Scene], out: Path) -> str:
     return (
         "### Calibrated pairs, not rectified (SYNTIM)\n\n"
         "Two cameras turned against each other, K, R and t as published; the depth range is that of matched points,\n"
-        "widened. Alpha is the left picture made grey. The rigs are `syntim_SCENE.yaml`. Between the pictures of\n"
+        "widened. Alpha is the left image made grey. The rigs are `syntim_SCENE.yaml`. Between the images of\n"
         "Serfaty two binders were moved: colour of theirs that is out of place comes from that.\n\n"
         f"{markdown(rows)}\n{structure_kept(rows)}\n\n{figures}"
     )
@@ -113,15 +113,15 @@ def _fused_scene(network: FusionNetwork, scene: Scene, out: Path) -> list[Row]:
     return [Row(name, 1, method, *score(image, left)) for method, image in results.items()]
 
 
-def _syntim_picture(folder: Path, scene: str, side: int) -> Tensor:
+def _syntim_image(folder: Path, scene: str, side: int) -> Tensor:
     found = sorted(folder.glob(f"{scene}{side}_OG*.png"))
     if not found:
-        raise FileNotFoundError(f"{folder / scene}{side}_OG*.png: no such picture")
+        raise FileNotFoundError(f"{folder / scene}{side}_OG*.png: no such image")
     return read_image(found[0])
 
 
 class Array(NamedTuple):
-    """The fast + slow array at one instant: rig, pictures, and what is known of each pair."""
+    """The fast + slow array at one instant: rig, images, and what is known of each pair."""
 
     rig: Rig
     images: dict[str, Tensor]
@@ -140,13 +140,13 @@ def _fast_and_slow(network: FusionNetwork, array: Array, out: Path) -> str:
     frame = fuse(network, array.rig, array.images, alpha=FAST, field=field, match_levels=True)
     shown = {"alpha: the fast camera": array.images[FAST]}
     shown |= {f"beta: {name}": array.images[name] for name in SLOW}
-    shown |= {"betas by the rough map alone": mapped(array), "fusion": frame.image}
+    shown |= {"betas by the rough map alone": transformed(array), "fusion": frame.image}
     save_panels(shown, out / "fast_slow.png", columns=2)
     array.rig.save(out / "fast_slow.yaml")
     return (
         "### The paper's fast + slow array\n\n"
         "Alpha is a frame of the fast camera; the slow ones carry filters: 600 nm is shown as red, 550 nm as green,\n"
-        "450 nm as blue. Only fundamental matrices are published. They put points seen in both pictures some pixels\n"
+        "450 nm as blue. Only fundamental matrices are published. They put points seen in both images some pixels\n"
         "beside their lines, so F is fitted to those points, and with it a rough map H and how far along the line to\n"
         "look. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest 0.5% are brought to\n"
         "white, all are coded as sRGB, and each beta is brought to alpha's mean and spread: so colours are in\n"
@@ -157,7 +157,7 @@ def _fast_and_slow(network: FusionNetwork, array: Array, out: Path) -> str:
 
 
 def fast_and_slow_array(folder: Path) -> Array:
-    """The array from its pictures and `fundamental_matrices.json`."""
+    """The array from its images and `fundamental_matrices.json`."""
     images = {FAST: _coded(read_image(folder / SCENE / f"{FAST_FRAME}.png"), brightest=0.995)}
     images |= {name: _coded(read_image(folder / SCENE / f"{name}_{SLOW_FRAME}.png")) for name in SLOW}
     published = published_matrices(folder / "fundamental_matrices.json")
@@ -183,19 +183,19 @@ def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
         raise ValueError(f"{file}: wanted 3x3 matrices {', '.join(SLOW.values())} under 'pillow' ({error!r})") from None
 
 
-def mapped(array: Array) -> Float[Tensor, "3 h w"]:
-    """The slow pictures at alpha's view by their rough maps, as red, green and blue, at alpha's level: no matching."""
+def transformed(array: Array) -> Float[Tensor, "3 h w"]:
+    """The slow images at alpha's view by their rough maps, as red, green and blue, at alpha's level: no matching."""
     alpha = array.images[FAST]
     x = pixel_grid((alpha.shape[1], alpha.shape[2]))
     bands = []
     for name in array.fits:
         where = apply_homography(array.rig.pair(FAST, name).homography.to(x), x).x
-        bands.append(sample(levelled(array.images[name], alpha)[None], where[None]).values[0])
+        bands.append(sample(normalised(array.images[name], alpha)[None], where[None]).values[0])
     return torch.cat(bands)
 
 
-def _coded(picture: Float[Tensor, "_ h w"], *, brightest: float | None = None) -> Float[Tensor, "1 h w"]:
+def _coded(image: Float[Tensor, "_ h w"], *, brightest: float | None = None) -> Float[Tensor, "1 h w"]:
     """Linear values coded as sRGB; with `brightest`, exposed so that this share of the pixels stays below white."""
-    linear = luminance_of(picture)
+    linear = luminance_of(image)
     gain = 1.0 if brightest is None else 1 / float(linear.flatten().sort().values[int(brightest * linear.numel())])
     return record(linear[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]

@@ -29,7 +29,7 @@ BAND = 4_000_000
 class Stage(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
-    Textures are the pictures of a folder, or patterns and the pictures that scikit-image ships. The seed decides all.
+    Textures are the images of a folder, or patterns and the images that scikit-image ships. The seed decides all.
     """
 
     def __init__(
@@ -57,9 +57,9 @@ class Stage(LayeredScenes):
 
     @torch.no_grad()
     def seen(self, name: str, layers: Layers | None = None) -> Seen:
-        """The picture (sRGB) and the depth that a camera sees, of the scene itself or of it changed.
+        """The image (sRGB) and the depth that a camera sees, of the scene itself or of it changed.
 
-        Large pictures are rendered in bands of rows, with a row around for the width of outlines.
+        Large images are rendered in bands of rows, with a row around for the width of outlines.
         """
         camera = self.camera(name)
         finest = max(float(self.camera(n).K[0, 0, 0]) for n in self.rig.names)
@@ -97,7 +97,7 @@ class Stage(LayeredScenes):
         return dataclasses.replace(self.scene, plane_from_world=Pose(planes.R, planes.t - matvec(planes.R, moving)))
 
     def shares(self) -> Float[Tensor, " l"]:
-        """The part of alpha's picture that each layer covers."""
+        """The part of alpha's image that each layer covers."""
         count = self.scene.present.shape[1]
         image, _ = self.seen(self.alpha, self.painted([(i + 1) / 32 for i in range(count)]))
         index = (image[0, 0] * 32).round().long().clamp(1, count) - 1
@@ -109,5 +109,5 @@ def _textures(photos: Path | None, seed: int) -> PhotoBank:
         return PhotoBank.load(photos, seed=seed)
     from pat.data.make_sample import photographs
 
-    pictures = photographs()
-    return PhotoBank(pictures + patterns(np.random.default_rng(seed), 10), photos=len(pictures))
+    images = photographs()
+    return PhotoBank(images + patterns(np.random.default_rng(seed), 10), photos=len(images))

@@ -28,8 +28,8 @@ from arraygeom.io.native import write as rig_text
 from pat.evaluation.baseline import classical, classical_band_calibrated
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.results import FusedFrame, colour_depth, save_frame, save_panels, view_of
-from pat.fusion.sequence import PictureFiles, SequenceFusion, flicker
+from pat.fusion.results import Frame, colour_depth, save_frame, save_panels, view_of
+from pat.fusion.sequence import ImageFiles, SequenceFusion, flicker
 from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
 from pat.media.images import read_image, write_image
@@ -52,21 +52,21 @@ class Recording:
     """
 
     raw: Mapping[str, list[Float[Tensor, "_ _ _"]]]
-    truth: list[Float[Tensor, "3 h w"]]
+    ground_truth: list[Float[Tensor, "3 h w"]]
     light: Mapping[str, Float[Tensor, "1 _ _"]] = field(default_factory=dict)
 
     @property
     def known(self) -> dict[str, Tensor]:
-        """All but the raw pictures, by name."""
-        truth = {f"truth {i:03d}": picture.contiguous() for i, picture in enumerate(self.truth)}
-        return truth | {f"light {name}": picture.contiguous() for name, picture in self.light.items()}
+        """All but the raw images, by name."""
+        ground_truth = {f"truth {i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)}
+        return ground_truth | {f"light {name}": image.contiguous() for name, image in self.light.items()}
 
     @classmethod
     def of(cls, known: Mapping[str, Tensor]) -> Recording:
-        """What `known` was of, without the raw pictures."""
+        """What `known` was of, without the raw images."""
         kinds = {name.partition(" ")[::2]: tensor for name, tensor in known.items()}
-        truth = [kinds[key] for key in sorted(kinds) if key[0] == "truth"]
-        return cls({}, truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"})
+        ground_truth = [kinds[key] for key in sorted(kinds) if key[0] == "truth"]
+        return cls({}, ground_truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"})
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class System:
         return file.read_text(encoding="utf-8") if file.is_file() else ""
 
     def sized(self, full: bool, *, scale: float = 1.0) -> Rig:
-        """The rig at full size, or at `scale` times the reduced one; raw pictures keep even sides."""
+        """The rig at full size, or at `scale` times the reduced one; raw images keep even sides."""
         rig = self.rig
         for name in rig.names if not full else ():
             h, w = (max(round(n * scale * self.module.REDUCED / 2) * 2, 16) for n in rig[name].hw)
@@ -128,16 +128,16 @@ def run_system(
     max_memory: str | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> Result:
-    """Render, record, fuse and compare; inputs, pictures, figure.png and scores.md go to `out`.
+    """Render, record, fuse and compare; inputs, images, figure.png and scores.md go to `out`.
 
     At `full` size, or at `scale` times the reduced one, which is minutes on two cores; half of it is seconds.
-    `photos` is a folder of pictures for the scene's textures; without, patterns and scikit-image's pictures are used.
+    `photos` is a folder of images for the scene's textures; without, patterns and scikit-image's images are used.
     """
     system = load_system(name)
     rig = system.sized(full, scale=scale)
     recording, files = recorded(system, rig, out / "inputs", photos=photos, say=say)
     say("fusing")
-    run = _sequence if len(recording.truth) > 1 else _still
+    run = _sequence if len(recording.ground_truth) > 1 else _still
     how = How(weights, max_memory, say)
     lines, panels = run(how, system, rig, files, recording, out)
     save_panels(panels, out / "figure.png", columns=4)
@@ -173,7 +173,7 @@ def recorded(
     stage = Stage(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
     recording = module.record_scene(stage)
     write_recording(recording, rig, out)
-    counts = {name: len(pictures) for name, pictures in recording.raw.items()}
+    counts = {name: len(images) for name, images in recording.raw.items()}
     with write_atomically(kept) as temporary:
         save_file(recording.known, temporary, {"key": key, "counts": json.dumps(counts)})
     return recording, _files(out, counts)
@@ -184,16 +184,16 @@ def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:
 
 
 def write_recording(recording: Recording, rig: Rig, out: Path) -> None:
-    """The pictures as cameras store them, 16 bits with the counts of the rig's, the truth, and the rig."""
+    """The images as cameras store them, 16 bits with the counts of the rig's, the truth, and the rig."""
     out.mkdir(parents=True, exist_ok=True)
     rig.save(out / "rig.yaml")
-    for name, pictures in recording.raw.items():
+    for name, images in recording.raw.items():
         white = 2 ** (rig[name].sensor.bits or 16) - 1
-        for i, picture in enumerate(pictures):
-            counts = (picture.clamp(0, 1) * white).round()
+        for i, image in enumerate(images):
+            counts = (image.clamp(0, 1) * white).round()
             write_image(out / f"{name}_{i:03d}.png", counts / 65535, bits=16)
-    for i, picture in enumerate(recording.truth):
-        write_image(out / f"truth_{i:03d}.png", picture, bits=16)
+    for i, image in enumerate(recording.ground_truth):
+        write_image(out / f"truth_{i:03d}.png", image, bits=16)
 
 
 Panels = dict[str, Tensor]
@@ -202,7 +202,7 @@ Panels = dict[str, Tensor]
 def _still(
     how: How, system: System, rig: Rig, files: Mapping[str, list[Path]], recording: Recording, out: Path
 ) -> tuple[list[str], Panels]:
-    alpha, truth = system.alpha, recording.truth[0]
+    alpha, ground_truth = system.alpha, recording.ground_truth[0]
     first = {name: paths[0] for name, paths in files.items()}
     memory: list[str] = []
     if how.max_memory is None:
@@ -225,14 +225,14 @@ def _still(
             *_permuted(load_weights(how.weights), read, images, alpha, frame),
         ]
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
-    white = 1.0 if not recording.light else float(truth.max())
+    white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
-    panels |= {"truth": truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
+    panels |= {"truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
     panels |= {"depth (bright is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
-    return [*_table(rows, truth, white), *_known_where(frame, truth), *extra, *memory], panels
+    return [*_table(rows, ground_truth, white), *_known_where(frame, ground_truth), *extra, *memory], panels
 
 
-def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out: Path) -> tuple[FusedFrame, list[str]]:
+def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out: Path) -> tuple[Frame, list[str]]:
     """A frame fused by `pat fuse` in a process of its own, and what that took, as lines of text."""
     images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
     command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", alpha, *images, "--out", str(out)]
@@ -253,40 +253,43 @@ def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out:
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
     unknown = torch.full_like(confidence, torch.nan)
     depth = unknown if depth is None else torch.where(depth > 0, depth, unknown)
-    return FusedFrame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
+    return Frame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
 
 
 def _sequence(
     how: How, system: System, rig: Rig, files: Mapping[str, list[Path]], recording: Recording, out: Path
 ) -> tuple[list[str], Panels]:
     alpha, network = system.alpha, load_weights(how.weights)
-    frames = {name: PictureFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
+    frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
     job = SequenceFusion(network, rig, frames, alpha, options={"max_memory": how.max_memory})
     keys = job.timeline.key_frames()
     colours = {key.alpha: job.colour(key) for key in keys}
-    fused = [job.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(recording.truth))]
+    fused = [job.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(recording.ground_truth))]
     alone = [job.alone(i) for i in range(len(fused))]
     for i, frame in enumerate(fused):
         save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
     greys = [job.grey(i) for i in range(len(fused))]
-    base = [classical_baseline(rig, _pictures(job, i), alpha) for i in range(len(fused))]
+    base = [classical_baseline(rig, _images(job, i), alpha) for i in range(len(fused))]
     methods = {
         "alpha alone": [g.expand(3, -1, -1) for g in greys],
         "classical": base,
         "fusion, each frame alone": [f.image for f in alone],
         "fusion": [f.image for f in fused],
     }
-    lines = [*_sequence_table(methods, recording.truth, greys), *_known_where(fused[2], recording.truth[2])]
+    lines = [
+        *_sequence_table(methods, recording.ground_truth, greys),
+        *_known_where(fused[2], recording.ground_truth[2]),
+    ]
     i = next(i for i in range(len(fused)) if i not in colours)
     first = next(name for name in rig.betas(alpha))
-    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0], "truth": recording.truth[i]}
+    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0], "truth": recording.ground_truth[i]}
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
     panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
     return lines, panels
 
 
-def _pictures(job: SequenceFusion, i: int) -> dict[str, Tensor]:
+def _images(job: SequenceFusion, i: int) -> dict[str, Tensor]:
     return {job.alpha: job.grey(i), **{n: job.frames[n][j] for n, j in job.timeline.at(i).items()}}
 
 
@@ -305,20 +308,20 @@ def _band(rig: Rig, images: Mapping[str, Tensor], alpha: str, name: str) -> Tens
     return classical_band_calibrated(images[alpha], images[name], a.K, b.K, pose.R, pose.t, depth=(near, far))
 
 
-def _table(rows: Mapping[str, Tensor], truth: Tensor, white: float) -> list[str]:
+def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:
     lines = ["| | PSNR, dB | SSIM |", "| --- | ---: | ---: |"]
-    for name, picture in rows.items():
-        found = score((picture / white).clamp(0, 1), truth / white)
+    for name, image in rows.items():
+        found = score((image / white).clamp(0, 1), ground_truth / white)
         lines.append(f"| {name} | {found.psnr:.2f} | {found.ssim:.4f} |")
     return lines
 
 
-def _sequence_table(methods: Mapping[str, list[Tensor]], truth: list[Tensor], greys: list[Tensor]) -> list[str]:
+def _sequence_table(methods: Mapping[str, list[Tensor]], ground_truth: list[Tensor], greys: list[Tensor]) -> list[str]:
     lines = ["| | PSNR, dB | lowest | SSIM | flicker x 1000 |", "| --- | ---: | ---: | ---: | ---: |"]
-    for name, pictures in {**methods, "truth": truth}.items():
-        scores = [score(p.clamp(0, 1), t) for p, t in zip(pictures, truth)]
+    for name, images in {**methods, "truth": ground_truth}.items():
+        scores = [score(p.clamp(0, 1), t) for p, t in zip(images, ground_truth)]
         levels, ssim = [s.psnr for s in scores], sum(s.ssim for s in scores) / len(scores)
-        shown = f"{1000 * flicker(pictures, greys):.2f}"
+        shown = f"{1000 * flicker(images, greys):.2f}"
         figures = (
             ("", "", "")
             if name == "truth"
@@ -336,9 +339,9 @@ WRONG = 0.1
 """Chroma farther off than this counts as a wrong colour."""
 
 
-def _known_where(frame: FusedFrame, truth: Tensor) -> list[str]:
+def _known_where(frame: Frame, ground_truth: Tensor) -> list[str]:
     """Whether confidence knows where colour is wrong: among the surest and the least sure quarter of the pixels."""
-    off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(truth)[1]).abs().amax(0).flatten()
+    off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(ground_truth)[1]).abs().amax(0).flatten()
     order = frame.confidence.flatten().argsort()
     quarter = len(order) // 4
     sure, doubtful = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
@@ -346,23 +349,21 @@ def _known_where(frame: FusedFrame, truth: Tensor) -> list[str]:
 
 
 def _ranges(
-    rig: Rig, recording: Recording, images: Mapping[str, Tensor], frame: FusedFrame, joint: FusedFrame, alpha: str
+    rig: Rig, recording: Recording, images: Mapping[str, Tensor], frame: Frame, joint: Frame, alpha: str
 ) -> list[str]:
-    """A table of the range of light that each picture tells right to a quarter."""
+    """A table of the range of light that each image tells right to a quarter."""
     lines = ["", "| light told right to a quarter | darkest | brightest | stops |", "| --- | ---: | ---: | ---: |"]
     told = {name: (linear_from_srgb(images[name])[0], recording.light[name][0]) for name in rig.names}
-    truth = linear_from_srgb(recording.truth[0])
-    for name, picture in {"fusion": frame.image, "fusion, exposures merged": joint.image}.items():
-        told[name] = (luminance(linear_from_srgb(picture.clamp(min=0)))[0], luminance(truth)[0])
+    ground_truth = linear_from_srgb(recording.ground_truth[0])
+    for name, image in {"fusion": frame.image, "fusion, exposures merged": joint.image}.items():
+        told[name] = (luminance(linear_from_srgb(image.clamp(min=0)))[0], luminance(ground_truth)[0])
     for name, (value, light) in told.items():
         found = usable_range([value], [light])
         lines.append(f"| {name} | {found.low:.4f} | {found.high:.3f} | {found.stops:.1f} |")
     return lines
 
 
-def _permuted(
-    network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: FusedFrame
-) -> list[str]:
+def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame) -> list[str]:
     """How far a fusion with the betas in another order differs from the same fusion with its bands reordered."""
     betas = rig.betas(alpha)
     order = [2, 0, 1]

@@ -43,7 +43,7 @@ class Recording:
     miscalibrated: float = 0.0
     """Error of the poses that fields are made from: how far it moves points, root mean square, pixels."""
     lens: float = 0.0
-    """Chance of a lens that bends (|k1| up to 0.3), its picture straightened again."""
+    """Chance of a lens that bends (|k1| up to 0.3), its image straightened again."""
     spectral: float = 0.0
     """Chance of random bands, one to four if one beta has them all, in the place of red, green and blue."""
     ideal: bool = False
@@ -60,7 +60,7 @@ class TrainConfig:
     photos: tuple[Path, ...] = ()
     """Folders of photographs that scenes are textured with."""
     out: Path = Path("runs/mono-colour")
-    """Folder for weights, checkpoints, figures and pictures."""
+    """Folder for weights, checkpoints, figures and images."""
     start: Path | None = None
     """File of weights to go on from."""
     network: NetworkConfig = dataclasses.field(default_factory=GuidedPATConfig)
@@ -75,7 +75,7 @@ class TrainConfig:
     hw: tuple[int, int] = (96, 192)
     """Height and width of alpha in the scenes."""
     loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
-    """On the picture: minus the mean PSNR, or the mean squared error."""
+    """On the image: minus the mean PSNR, or the mean squared error."""
     rate: float = 8e-4
     """Learning rate of Adam."""
     momenta: tuple[float, float] = (0.9, 0.99)
@@ -124,7 +124,7 @@ class TrainConfig:
     compile: bool = False
     """Compile convolutions by torch.compile."""
     tensorboard: bool = False
-    """Write figures and pictures for TensorBoard, too."""
+    """Write figures and images for TensorBoard, too."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):

@@ -1,4 +1,4 @@
-"""Pictures taken through lenses that bend, and straightened again by what `pat fuse` straightens with."""
+"""Images taken through lenses that bend, and straightened again by what `pat fuse` straightens with."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pixels import pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.sampling import Sampled
-from arraygeom.undistortion import retaken
+from arraygeom.undistortion import resampled
 
 STRONGEST = 0.3
 """|k1| of the strongest lens."""
@@ -24,26 +24,26 @@ LOST = 0.1
 
 
 def through_lenses(
-    pictures: Float[Tensor, "b c h w"],
+    images: Float[Tensor, "b c h w"],
     cameras: Camera,
     recorded: Callable[[Tensor], Tensor],
     g: Generator,
     *,
     lost: float = 0.0,
 ) -> Sampled:
-    """What is `recorded` of pictures that a lens bends, one for each of the pinholes, straightened back to those.
+    """What is `recorded` of images that a lens bends, one for each of the pinholes, straightened back to those.
 
-    Where the lens saw nothing, up to the share `lost` on each side, a picture repeats its edge and is not valid.
+    Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not valid.
     """
-    pinholes = [one_camera(cameras, i) for i in range(len(pictures))]
+    pinholes = [one_camera(cameras, i) for i in range(len(images))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
-    bent = [
-        retaken(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(pictures.cpu(), pinholes, lenses)
+    has_lens = [
+        resampled(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
     ]
-    seen = recorded(torch.cat(bent).clamp(0, 1).to(pictures.device)).cpu()
-    back = [retaken(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(seen, lenses, pinholes)]
+    seen = recorded(torch.cat(has_lens).clamp(0, 1).to(images.device)).cpu()
+    back = [resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(seen, lenses, pinholes)]
     values, valid = (torch.cat(parts) for parts in zip(*back))
-    return Sampled(values.clamp(min=0).to(pictures), valid.to(pictures.device))
+    return Sampled(values.clamp(min=0).to(images), valid.to(images.device))
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
@@ -53,21 +53,21 @@ def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
     widest = float(rays[..., :2].square().sum(-1).max())
     k1 = (2 * float(torch.rand((), generator=g)) - 1) * min(STRONGEST, STRETCHED / (3 * widest))
     lens = pinhole.replace(distortion=Distortion(BROWN_CONRADY, pinhole.K.new_tensor([k1, 0, 0, 0])))
-    bent, _ = lens.bend(x)
-    low, high = bent.amin(0) - 0.5, bent.amax(0) + 0.5
+    has_lens, _ = lens.distort(x)
+    low, high = has_lens.amin(0) - 0.5, has_lens.amax(0) + 0.5
     cut = lost * torch.rand(2, 2, generator=g, dtype=torch.float64) * (high - low)
     low, high = low + cut[0], high - cut[1]
-    return lens.mapped(filling(low, high, pinhole.hw), pinhole.hw)
+    return lens.transformed(filling(low, high, pinhole.hw), pinhole.hw)
 
 
 def border(camera: Camera) -> Float[Tensor, "n 2"]:
-    """The pixels on the border of a picture."""
+    """The pixels on the border of an image."""
     x = pixel_grid(camera.hw, dtype=torch.float64)
     return torch.cat([x[0], x[-1], x[:, 0], x[:, -1]])
 
 
 def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, int]) -> Float[Tensor, "3 3"]:
-    """The map of pixels that takes the area between two corners to a picture of a size."""
+    """The map of pixels that takes the area between two corners to an image of a size."""
     scale = torch.tensor([hw[1], hw[0]], dtype=torch.float64) / (high - low)
     A = torch.eye(3, dtype=torch.float64)
     A[0, 0], A[1, 1] = scale

@@ -31,14 +31,14 @@ from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
 EARLY = 16
-"""From this step on, at each doubling until the first validation, pictures are written."""
+"""From this step on, at each doubling until the first validation, images are written."""
 
 
 def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
     """Train, looking where `field` (or `config.field`) says; returns the file of the best weights.
 
     In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for
-    each step), pictures/ and checkpoints/. Where that folder holds the same run, stopped, it goes on: with
+    each step), images/ and checkpoints/. Where that folder holds the same run, stopped, it goes on: with
     `steps` the result is that of a run never stopped, bit for bit; with `minutes` the time spent counts.
 
     Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
@@ -225,9 +225,9 @@ def in_bfloat16(part: nn.Module) -> None:
     """Let a part compute in bfloat16 where autocast does, and answer in float32."""
     forward = part.forward
 
-    def cast(*pictures: Tensor) -> Any:
-        with torch.autocast(pictures[0].device.type, torch.bfloat16):
-            answer = forward(*pictures)
+    def cast(*images: Tensor) -> Any:
+        with torch.autocast(images[0].device.type, torch.bfloat16):
+            answer = forward(*images)
         return tree_map(lambda t: t.float(), answer)
 
     part.forward = cast
@@ -244,7 +244,7 @@ def finite(objective: Objective, given: Sample) -> bool:
 
 def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
     """All tensors of a group of samples: alpha, truth, and beta, position, visible of each beta by number."""
-    tensors = {"alpha": given.alpha, "truth": given.truth}
+    tensors = {"alpha": given.alpha, "truth": given.ground_truth}
     for name in ("betas", "position", "visible"):
         tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
     with write_atomically(path) as temporary:

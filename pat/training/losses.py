@@ -11,38 +11,38 @@ from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, ms
 
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.guided import GuidedPAT, Seen
-from pat.networks.protocol import Fused
+from pat.networks.protocol import FusionOutput
 from pat.networks.weights import Network
 
 from .samples import Sample
 
 
-def picture_loss(image: Tensor, truth: Tensor) -> Tensor:
+def image_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
     """Minus the mean PSNR over 10, but for a floor under the error: every sample pulls alike."""
-    return ((image - truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
+    return ((image - ground_truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
 
-def structure_loss(image: Tensor, truth: Tensor) -> Tensor:
+def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
     """One minus the mean structural similarity in windows of 7x7 pixels (Wang et al. 2004)."""
 
     def mean(x: Tensor) -> Tensor:
         return avg_pool2d(x, 7, 1)
 
-    a, b = mean(image), mean(truth)
-    spread = mean(image * image) - a * a + mean(truth * truth) - b * b
-    common = mean(image * truth) - a * b
+    a, b = mean(image), mean(ground_truth)
+    spread = mean(image * image) - a * a + mean(ground_truth * ground_truth) - b * b
+    common = mean(image * ground_truth) - a * b
     likeness = (2 * a * b + 1e-4) * (2 * common + 9e-4) / ((a * a + b * b + 1e-4) * (spread + 9e-4))
     return 1 - likeness.mean()
 
 
-def picture_and_structure_loss(image: Tensor, truth: Tensor) -> Tensor:
-    """`picture_loss` and `structure_loss` together."""
-    return picture_loss(image, truth) + structure_loss(image, truth)
+def image_and_structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
+    """`image_loss` and `structure_loss` together."""
+    return image_loss(image, ground_truth) + structure_loss(image, ground_truth)
 
 
-PICTURE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
-    "psnr": picture_loss,
-    "psnr-ssim": picture_and_structure_loss,
+IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "psnr": image_loss,
+    "psnr-ssim": image_and_structure_loss,
     "mse": mse_loss,
 }
 
@@ -53,16 +53,16 @@ class Objective(nn.Module):
     def __init__(self, network: Network, loss: str) -> None:
         super().__init__()
         self.network = network
-        self.picture_loss = PICTURE_LOSSES[loss]
+        self.image_loss = IMAGE_LOSSES[loss]
 
     def forward(self, given: Sample) -> Tensor:
         """The loss of a group of samples."""
         fused, seen = explained(self.network, given)
-        loss = self.picture_loss(fused.image, given.truth)
+        loss = self.image_loss(fused.image, given.ground_truth)
         return loss + match_loss(seen, given) if seen else loss
 
 
-def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Seen]]:
+def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[Seen]]:
     """The network's answer, and what each beta told where it says."""
     if isinstance(network, (GuidedPAT, BandwisePAT)):
         return network.explain(given.alpha, given.betas, given.looks)
@@ -71,9 +71,9 @@ def explained(network: nn.Module, given: Sample) -> tuple[Fused, list[Seen]]:
 
 def match_loss(seen: list[Seen], given: Sample) -> Tensor:
     """How far off the looks were where beta sees the point, pixels, and how wrong the confidence; 0 if nobody knows."""
-    total = given.truth.new_zeros(())
-    for told, truth, visible in zip(seen, given.position, given.visible):
-        off = (told.attended.position - truth.movedim(-1, 1)).abs().sum(1)
+    total = given.ground_truth.new_zeros(())
+    for told, ground_truth, visible in zip(seen, given.position, given.visible):
+        off = (told.attended.position - ground_truth.movedim(-1, 1)).abs().sum(1)
         total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
         good = (visible & (off.detach() < 1.5)).to(off)
         total = total + 0.05 * binary_cross_entropy_with_logits(told.logit[:, 0], good)
@@ -86,7 +86,7 @@ def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
     psnr, near = [], []
     for given in samples:
         fused = network(given.alpha, given.betas, given.looks)
-        error = (fused.image.clamp(0, 1) - given.truth).square().flatten(1).mean(1)
+        error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
         for where, visible in list(zip(given.position, given.visible))[:1]:
             off = (fused.position[0] - where.movedim(-1, 1)).norm(dim=1)

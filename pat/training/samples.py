@@ -76,7 +76,7 @@ class Sample(NamedTuple):
     alpha: Tensor
     betas: list[Tensor]
     looks: list[Look]
-    truth: Tensor
+    ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
 
@@ -209,7 +209,7 @@ def photographs(config: TrainConfig) -> tuple[PhotoBank, PhotoBank]:
     Raises ValueError where there are none, or too few to hold some out.
     """
     if not config.photos and not (config.cache and config.cache.exists()):
-        raise ValueError("no photographs: give `photos` one or more folders with pictures")
+        raise ValueError("no photographs: give `photos` one or more folders with images")
     n = config.held_out
 
     def bank(choose: Callable[[int], bool]) -> PhotoBank:
@@ -226,12 +226,12 @@ def degraded(
     recording: Recording = Recording(),  # noqa: B008
 ) -> Sample:
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
-    pictures, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
-    ideal, grey, cameras = pictures[0], luminance(scene.images[0]), scene.cameras
+    images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
+    ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
     betas, looks, position, visible = [], [], [], []
-    for i, picture in enumerate(pictures[1:], 1):
-        band = picture if alone else picture[:, i - 1 : i]
+    for i, image in enumerate(images[1:], 1):
+        band = image if alone else image[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
         betas.append(_enlarged(seen.values, scene.hw[0]))
         if alone and _chance(recording.paper, g):
@@ -242,29 +242,29 @@ def degraded(
             found = truth_in(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
             position.append(found[0])
             visible.append(found[1])
-    truth = ideal if recording.ideal else ideal + (alpha - grey)
-    return Sample(alpha, betas, looks, truth, position, visible)
+    ground_truth = ideal if recording.ideal else ideal + (alpha - grey)
+    return Sample(alpha, betas, looks, ground_truth, position, visible)
 
 
 def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
-    """The scene's pictures, by this chance in other bands than red, green and blue."""
+    """The scene's images, by this chance in other bands than red, green and blue."""
     if spectral == 0 or not _chance(spectral, g):
         return scene.images
     count = 1 + int(torch.randint(MOST, (), generator=g)) if len(scene.images) == 2 else len(scene.images) - 1
     spectra = Spectra.drawn(len(scene.images[0]), count, g)
-    return [spectra.of(picture) for picture in scene.images]
+    return [spectra.of(image) for image in scene.images]
 
 
-def recorded(picture: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Sampled:
-    """What a camera makes of a picture: perhaps bent by a lens and straightened, up to `lost` of it on each side."""
+def recorded(image: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Sampled:
+    """What a camera makes of an image: perhaps bent by a lens and straightened, up to `lost` of it on each side."""
 
-    def record_here(picture: Tensor) -> Tensor:
-        return record(picture, steps(g, recording), g).image
+    def record_here(image: Tensor) -> Tensor:
+        return record(image, steps(g, recording), g).image
 
-    b, _, h, w = picture.shape
+    b, _, h, w = image.shape
     if recording.lens and _chance(recording.lens, g):
-        return through_lenses(picture, camera, record_here, g, lost=lost)
-    return Sampled(record_here(picture), picture.new_ones(b, h, w, dtype=torch.bool))
+        return through_lenses(image, camera, record_here, g, lost=lost)
+    return Sampled(record_here(image), image.new_ones(b, h, w, dtype=torch.bool))
 
 
 def steps(g: Generator, recording: Recording) -> list[Step]:
@@ -329,14 +329,14 @@ def alone(given: Sample, i: int) -> Sample:
 
         return Look(at, old.samples)
 
-    (alpha, truth), looks = one([given.alpha, given.truth]), [look(old) for old in given.looks]
-    return Sample(alpha, one(given.betas), looks, truth, one(given.position), one(given.visible))
+    (alpha, ground_truth), looks = one([given.alpha, given.ground_truth]), [look(old) for old in given.looks]
+    return Sample(alpha, one(given.betas), looks, ground_truth, one(given.position), one(given.visible))
 
 
-def _enlarged(picture: Tensor, hw: tuple[int, int]) -> Tensor:
-    if picture.shape[-2:] == hw:
-        return picture
-    return interpolate(picture, size=hw, mode="bicubic", align_corners=False).clamp(0, 1)
+def _enlarged(image: Tensor, hw: tuple[int, int]) -> Tensor:
+    if image.shape[-2:] == hw:
+        return image
+    return interpolate(image, size=hw, mode="bicubic", align_corners=False).clamp(0, 1)
 
 
 def _chance(p: float, g: Generator) -> bool:

@@ -1,6 +1,6 @@
 """Rendered scenes as training samples: a random window of any camera as alpha, of any others as betas.
 
-Folders hold what `pat render` leaves. Scenes may differ in their rigs and in the sizes of their pictures; cameras with
+Folders hold what `pat render` leaves. Scenes may differ in their rigs and in the sizes of their images; cameras with
 a lens are straightened as `pat fuse` does it.
 """
 
@@ -19,17 +19,17 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
-from arraygeom.undistortion import pinhole_view, retaken
+from arraygeom.undistortion import pinhole_view, resampled
 from pat.data.patches import reading, reduced, reduced_depth, scene_folders, scene_rig
 from pat.data.scenes import coded
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
-from pat.synthesis.rendered import Frame, Rendered
+from pat.synthesis.rendered import Rendered, RenderedFrame
 from pat.synthesis.rigs import scaled
 
 T = TypeVar("T")
 HELD = 8
-"""Scenes, or pairs, that samples are taken from at a time; their pictures stay in memory."""
+"""Scenes, or pairs, that samples are taken from at a time; their images stay in memory."""
 TURN = 8
 """After so many groups of samples one of them is exchanged."""
 REDUCED = 4
@@ -41,7 +41,7 @@ DECENTRED = 0.1
 
 
 class View(NamedTuple):
-    """A picture in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its pinhole."""
+    """An image in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its pinhole."""
 
     rgb: Float[Tensor, "3 h w"]
     depth: Float[Tensor, "h w"]
@@ -80,7 +80,7 @@ class RenderedCrops(Crops):
     """Random windows of the rendered scenes in folders.
 
     Raises ValueError for a folder without scenes or with one that is not whole, for a scene of one camera, and for
-    one of which no picture is as large as `hw`; when it comes up, for one whose pictures cannot be read.
+    one of which no image is as large as `hw`; when it comes up, for one whose images cannot be read.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -150,7 +150,7 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         said = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
-        raise ValueError(f"{folder}: no picture is as large as the samples, {hw[1]}x{hw[0]} ({said}): lower `hw`")
+        raise ValueError(f"{folder}: no image is as large as the samples, {hw[1]}x{hw[0]} ({said}): lower `hw`")
     return names
 
 
@@ -162,19 +162,19 @@ def read_view(folder: Path, name: str) -> View:
     hw = (frame.depth.shape[-2], frame.depth.shape[-1])
     if hw != camera.hw or frame.rgb.shape[1:] != frame.depth.shape:
         raise ValueError(
-            f"{folder}: the picture of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}: "
+            f"{folder}: the image of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}: "
             "remove it and run 'pat render' again"
         )
     return straight(frame, camera.to(torch.float64))
 
 
-def straight(frame: Frame, camera: Camera) -> View:
+def straight(frame: RenderedFrame, camera: Camera) -> View:
     """A frame without its lens's bending."""
     if camera.distortion is None:
         return View(frame.rgb, frame.depth, camera)
     pinhole = pinhole_of(camera)
-    rgb = retaken(frame.rgb, camera, pinhole, extended=True).values[0].clamp(min=0)
-    depth = retaken(frame.depth[None], camera, pinhole, interpolation="nearest")
+    rgb = resampled(frame.rgb, camera, pinhole, extended=True).values[0].clamp(min=0)
+    depth = resampled(frame.depth[None], camera, pinhole, interpolation="nearest")
     return View(rgb, torch.where(depth.valid[0], depth.values[0, 0], torch.nan), pinhole)
 
 
@@ -200,18 +200,18 @@ def beside(alpha: View, beta: View, size: HW, hw: HW, g: Generator) -> View:
 
 
 def _inside(start: float, length: int, whole: int) -> int:
-    """Where a window starts, moved into the picture, or about it where it is larger."""
+    """Where a window starts, moved into the image, or about it where it is larger."""
     low, high = sorted((0, whole - length))
     return round(min(max(start, low), high))
 
 
 def pitch(camera: Camera) -> float:
-    """Pixels a radian in the middle of the picture."""
+    """Pixels a radian in the middle of the image."""
     return float(camera.K[:2, :2].det().abs().sqrt())
 
 
 def window(view: View, top: int, left: int, size: HW, hw: HW) -> View:
-    """A window of a view, reduced (or enlarged) to `hw`. Beyond the picture its edge is repeated, without depth."""
+    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge is repeated, without depth."""
     rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
     h, w = view.camera.hw
     there = ((rows >= 0) & (rows < h))[:, None] & (columns >= 0) & (columns < w)

@@ -34,15 +34,15 @@ class Spectra(NamedTuple):
         parts = torch.rand(batch, count, 3, generator=generator).square() + 1e-3
         one = torch.eye(3)[torch.randint(3, (batch, count), generator=generator)]
         mixture = torch.where(chance(0.5)[..., None], one, parts / parts.sum(-1, keepdim=True))
-        bent = 1.4 * torch.rand(batch, count, generator=generator) - 0.7
-        gamma = torch.where(chance(0.5), bent, 0.0).exp2()
+        has_lens = 1.4 * torch.rand(batch, count, generator=generator) - 0.7
+        gamma = torch.where(chance(0.5), has_lens, 0.0).exp2()
         low = 0.2 * torch.rand(batch, count, generator=generator)
         high = 1 - 0.4 * torch.rand(batch, count, generator=generator)
         inverted = chance(0.1)
         return cls(mixture, gamma, torch.where(inverted, high, low), torch.where(inverted, low, high))
 
-    def of(self, picture: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h w"]:
-        """The bands of a colour picture."""
-        mixture, gamma, low, high = (part.to(picture) for part in self)
-        mixed = torch.einsum("bck,bkhw->bchw", mixture, picture).clamp(min=1e-6) ** gamma[..., None, None]
+    def of(self, image: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b c h w"]:
+        """The bands of a colour image."""
+        mixture, gamma, low, high = (part.to(image) for part in self)
+        mixed = torch.einsum("bck,bkhw->bchw", mixture, image).clamp(min=1e-6) ** gamma[..., None, None]
         return low[..., None, None] + (high - low)[..., None, None] * mixed

@@ -1,6 +1,6 @@
-"""Stereo pairs as training samples: a random window of one picture as alpha and truth, of the other as beta.
+"""Stereo pairs as training samples: a random window of one image as alpha and truth, of the other as beta.
 
-Nobody knows where their points are, so the loss is on the picture alone. Their cameras are made up: rectified ones with
+Nobody knows where their points are, so the loss is on the image alone. Their cameras are made up: rectified ones with
 the disparities that the pair may have, and a metre apart.
 """
 
@@ -26,14 +26,14 @@ from pat.synthesis.layered import ArrayBatch
 from .scenes import HELD, Crops, below, chosen, in_hand, one_of
 
 REDUCED = 2
-"""How many times a window is reduced at most: pictures from the net are often less sharp than their pixels."""
+"""How many times a window is reduced at most: images from the net are often less sharp than their pixels."""
 
 
 class PairCrops(Crops):
     """Random windows of the rectified stereo pairs in folders.
 
-    Raises ValueError for a folder without pairs, for a pair whose pictures differ in size, are not in colour or are
-    smaller than `hw`; when it comes up, for a picture that cannot be read.
+    Raises ValueError for a folder without pairs, for a pair whose images differ in size, are not in colour or are
+    smaller than `hw`; when it comes up, for an image that cannot be read.
     """
 
     def _find(self, roots: Sequence[Path], choose: Callable[[int], bool]) -> None:
@@ -41,7 +41,7 @@ class PairCrops(Crops):
         self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
         for pair in self.pairs:
             check_pair(pair, self.hw)
-        self._pictures = lru_cache(HELD)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
+        self._images = lru_cache(HELD)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Windows of group `number`, of the pairs whose turn it is. Several betas are in one place.
@@ -51,25 +51,25 @@ class PairCrops(Crops):
         hand = in_hand(number, len(self.pairs), self.seed)
         sizes = self.beta_sizes(betas, generator)
         drawn = [self._window(one_of(hand, generator), generator) for _ in range(batch)]
-        alpha, beta = (torch.stack(pictures) for pictures in list(zip(*drawn))[:2])
+        alpha, beta = (torch.stack(images) for images in list(zip(*drawn))[:2])
         side, disparity = (torch.tensor(numbers, dtype=torch.float64) for numbers in list(zip(*drawn))[2:])
-        images = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
-        return made_up(images, side, disparity, self.device)
+        chosen_images = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]
+        return made_up(chosen_images, side, disparity, self.device)
 
     def _window(self, i: int, g: Generator) -> tuple[Tensor, Tensor, float, float]:
         """Alpha, beta, 1 where alpha is left and -1 where it is right, and the largest disparity."""
-        pictures, (h, w) = self._pictures(i), self.hw
-        hw = pictures[0].shape[1:]
+        images, (h, w) = self._images(i), self.hw
+        hw = images[0].shape[1:]
         times = 1 + below(min(REDUCED, hw[0] // h, hw[1] // w), g)
         top, left = (below(whole - times * n + 1, g) for whole, n in zip(hw, self.hw))
-        cut = [p[:, top : top + times * h, left : left + times * w] for p in pictures]
+        cut = [p[:, top : top + times * h, left : left + times * w] for p in images]
         small = [reduced(p[None], self.hw)[0].clamp(max=1) for p in cut]
         far = self.pairs[i].max_disparity / times
         return (small[0], small[1], 1.0, far) if below(2, g) else (small[1], small[0], -1.0, far)
 
 
 def made_up(images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Tensor, " b"], device: str) -> ArrayBatch:
-    """The pictures, alpha first, with cameras a metre apart that put the nearest points `disparity` pixels apart."""
+    """The images, alpha first, with cameras a metre apart that put the nearest points `disparity` pixels apart."""
     batch, _, h, w = images[0].shape
     K = intrinsics(float(w), (h, w)).expand(batch, 3, 3)
     t = torch.zeros(batch, 3, dtype=torch.float64)
@@ -83,7 +83,7 @@ def made_up(images: list[Tensor], side: Float[Tensor, " b"], disparity: Float[Te
 
 
 def check_pair(pair: PairFiles, hw: HW) -> None:
-    """Raises ValueError unless both pictures are in colour, of one size, and at least `hw`."""
+    """Raises ValueError unless both images are in colour, of one size, and at least `hw`."""
     left, right = _header(pair.left), _header(pair.right)
     if left != right:
         raise ValueError(f"{pair.left} is {_said(left)} and {pair.right.name} {_said(right)}: pairs must be alike")
@@ -94,12 +94,12 @@ def check_pair(pair: PairFiles, hw: HW) -> None:
 
 
 def _header(file: Path) -> tuple[int, int, int]:
-    """Height, width and channels (1 or 3) of a picture, without reading it whole."""
+    """Height, width and channels (1 or 3) of an image, without reading it whole."""
     try:
-        with Image.open(file) as picture:
-            return picture.height, picture.width, 1 if picture.mode[0] in "1LIF" else 3
+        with Image.open(file) as image:
+            return image.height, image.width, 1 if image.mode[0] in "1LIF" else 3
     except (OSError, UnidentifiedImageError):
-        raise ValueError(f"{file}: not a picture that can be read: give a whole PNG, TIFF or JPEG file") from None
+        raise ValueError(f"{file}: not an image that can be read: give a whole PNG, TIFF or JPEG file") from None
 
 
 def _said(header: tuple[int, int, int]) -> str:

@@ -1,7 +1,7 @@
 """Training on scenes made while training.
 
 Every batch has its own rigs, fields and degradations: layered scenes from photographs, seen by random cameras
-through `arraygeom`. The loss is on the fused picture, and, for networks that say where they looked, on that.
+through `arraygeom`. The loss is on the fused image, and, for networks that say where they looked, on that.
 
 The parts are in `pat.training`: recipes (`config`), samples, losses, checkpoints, the loop.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from .config import Recording, TrainConfig, load_config, recipes, save_config
 from .loop import train
-from .losses import match_loss, picture_loss, validation
+from .losses import image_loss, match_loss, validation
 from .samples import Sample, degraded, pair_of, photographs, scenes, truth_in
 
 __all__ = [
@@ -18,11 +18,11 @@ __all__ = [
     "Sample",
     "TrainConfig",
     "degraded",
+    "image_loss",
     "load_config",
     "match_loss",
     "pair_of",
     "photographs",
-    "picture_loss",
     "recipes",
     "save_config",
     "scenes",

@@ -1,4 +1,4 @@
-"""What a run shows while it goes on: a bar, a line for each step and each validation, pictures, TensorBoard."""
+"""What a run shows while it goes on: a bar, a line for each step and each validation, images, TensorBoard."""
 
 from __future__ import annotations
 
@@ -79,11 +79,11 @@ class Watch:
                 self.board.add_scalar(f"validation/{name}", facts[name], int(facts["step"]))
 
     def show(self, network: nn.Module, samples: list[Sample], step: int) -> None:
-        """Pictures of the validation: beta, alpha, fused, truth, confidence, side by side."""
+        """Images of the validation: beta, alpha, fused, truth, confidence, side by side."""
         if self.config is None:
             return
         sheet = contact_sheet(network, samples[:SHOWN])
-        write_image(self.out / "pictures" / f"step-{step:06d}.png", sheet)
+        write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
         if self.board:
             self.board.add_image("validation", sheet, step)
 
@@ -112,8 +112,8 @@ def _row(network: nn.Module, given: Sample) -> Tensor:
     fused, _ = explained(network, given)
     beta = torch.cat([b[:1] for b in given.betas], 1)
     confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)
-    hw = (given.truth.shape[-2], given.truth.shape[-1])
-    columns = [beta, given.alpha[:1], fused.image[:1], given.truth[:1], confidence]
+    hw = (given.ground_truth.shape[-2], given.ground_truth.shape[-1])
+    columns = [beta, given.alpha[:1], fused.image[:1], given.ground_truth[:1], confidence]
     three = [c[:, :3] if c.shape[1] > 2 else c[:, :1].expand(-1, 3, -1, -1) for c in columns]
     row = [interpolate(c.float(), hw, mode="bilinear", align_corners=False) for c in three]
     return torch.cat(row, -1)[0].clamp(0, 1)

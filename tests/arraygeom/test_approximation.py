@@ -44,8 +44,8 @@ def test_fitted_homography_is_scipys_least_squares():
 def test_fitted_homography_is_exact_without_noise_and_keeps_its_sign():
     x, _ = noisy_points()
     H = torch.tensor([[1.1, 0.1, 30], [-0.08, 0.9, -12], [1e-4, -2e-4, 1]], dtype=torch.float64)
-    mapped = apply_homography(H, x)
-    fitted = fit_homography(x, mapped.x)
+    transformed = apply_homography(H, x)
+    fitted = fit_homography(x, transformed.x)
     torch.testing.assert_close(fitted / fitted[2, 2], H, atol=1e-9, rtol=1e-9)
     assert apply_homography(fitted, x).valid.all()
 

@@ -60,13 +60,13 @@ def test_points_behind_are_invalid_and_finite_with_their_gradients():
 
 
 @pytest.mark.parametrize("change", CHANGES)
-def test_projections_stay_the_same_point_of_the_actual_picture(change):
+def test_projections_stay_the_same_point_of_the_actual_image(change):
     """A blob painted where a point projects stays where the changed camera projects it."""
     c = camera()
     X = c.unproject(torch.tensor([33.3, 21.7], dtype=torch.float64), torch.tensor(3.0, dtype=torch.float64))
     image = blob(c.hw, *c.project(X).x.tolist(), sigma=3.5)
     changed = CHANGES[change](c)
-    picture = {
+    changed_image = {
         "smaller": lambda: torch.nn.functional.interpolate(image, (20, 31), mode="area"),
         "larger": lambda: torch.nn.functional.interpolate(image, (100, 130), mode="bilinear", align_corners=False),
         "cropped": lambda: image[..., 6:38, 18:50],
@@ -75,10 +75,10 @@ def test_projections_stay_the_same_point_of_the_actual_picture(change):
         "turned back": lambda: torch.rot90(image, -1, (-2, -1)),
         "upside down": lambda: torch.rot90(image, 2, (-2, -1)),
     }[change]()
-    assert changed.hw == tuple(picture.shape[-2:])
+    assert changed.hw == tuple(changed_image.shape[-2:])
     # cropping cuts the blob's tails; resampling is uneven where pixels do not divide: hence a few hundredths
     tolerance = {"cropped": 0.01, "smaller": 0.05, "larger": 0.02}.get(change, 2e-3)
-    torch.testing.assert_close(centroid(picture), changed.project(X).x, atol=tolerance, rtol=0)
+    torch.testing.assert_close(centroid(changed_image), changed.project(X).x, atol=tolerance, rtol=0)
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -136,7 +136,7 @@ def test_angles_between_cameras():
     np.testing.assert_allclose(direction_of(b).numpy(), expected, atol=1e-12)
 
 
-def test_contains_is_the_pictures_area():
+def test_contains_is_the_images_area():
     c = camera()
     x = torch.tensor([[-0.5, 0], [-0.51, 0], [63.5, 47.5], [63.6, 0], [0, 47.6]], dtype=torch.float64)
     assert c.contains(x).tolist() == [True, False, True, False, False]
@@ -147,7 +147,7 @@ def test_intrinsics_put_the_principal_point_in_the_middle():
     assert K.tolist() == [[500, 0, 319.5], [0, 510, 239.5], [0, 0, 1]]
 
 
-def test_scene_points_are_in_the_picture():
+def test_scene_points_are_in_the_image():
     rig = random_rig(0)
     x, depth, valid = rig["alpha"].project(scene_points(rig))
     assert valid.all()

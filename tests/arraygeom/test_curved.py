@@ -215,7 +215,7 @@ def test_through_no_lenses_is_the_field_itself():
     assert torch.equal(through.xy[through.mask], straight.xy[straight.mask])
 
 
-def test_links_through_lenses_survive_what_is_done_to_pictures():
+def test_links_through_lenses_survive_what_is_done_to_images():
     """Resized, cropped and turned: the same points, in the new pixels."""
     rig = known_by_F(with_lenses(random_rig(3), BARREL, BARREL))
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)

@@ -64,7 +64,7 @@ def test_essential_matrix_is_that_of_opencv_decomposition():
     assert min(np.abs(s * t[:, 0] - direction).max() for s in (1, -1)) < 1e-9
 
 
-def test_epipoles_are_the_pictures_of_the_other_camera():
+def test_epipoles_are_the_images_of_the_other_camera():
     rig = random_rig(4)
     pair = rig.pair("alpha", "beta")
     for e, camera, other in zip(epipoles(pair.fundamental), pair.cameras, pair.cameras[::-1]):

@@ -71,7 +71,7 @@ def test_points_between_the_bounds_lie_on_their_segments(field, seed):
 
 
 @pytest.mark.parametrize("field", STRAIGHT, ids=ids)
-def test_segments_lie_on_the_lines_and_inside_the_picture(field):
+def test_segments_lie_on_the_lines_and_inside_the_image(field):
     pair = pair_of(random_rig(1))
     segments = look(field, pair, pixel_grid(pair.alpha.hw, dtype=torch.float64))
     lines = epipolar_lines(pair.fundamental, pixel_grid(pair.alpha.hw, dtype=torch.float64))
@@ -117,12 +117,12 @@ def test_the_covering_displacement_covers_and_is_the_least():
     pair = pair_of(random_rig(2))
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)
     exact = Epipolar()(pair, x)
-    reach = covering_displacement(pair, x)
-    assert covering_displacement(pair) == pytest.approx(reach.item(), abs=1e-9)
+    disparity = covering_displacement(pair, x)
+    assert covering_displacement(pair) == pytest.approx(disparity.item(), abs=1e-9)
     centre = apply_homography(pair.homography, x).x
     ends = torch.stack([(centre - e).norm(dim=-1)[exact.valid] for e in (exact.start, exact.end)])
     # along the line; H x itself lies on it for a plane's homography
-    assert ends.max() == pytest.approx(reach.item(), abs=1e-9)
+    assert ends.max() == pytest.approx(disparity.item(), abs=1e-9)
 
 
 # --------------------------------------------------------------------------------------- rectified, local, dense
@@ -250,7 +250,7 @@ def test_pixels_without_the_batch_axis_are_refused():
         Epipolar()(pair_of(batch_of([random_rig(0)])), torch.zeros(2))
 
 
-def test_whole_pictures_in_chunks_are_what_single_rows_are():
+def test_whole_images_in_chunks_are_what_single_rows_are():
     rig = random_rig(1).resize("alpha", (300, 400))
     pair = pair_of(rig)
     for field in STRAIGHT:
@@ -438,11 +438,11 @@ def disturbed(rig: Rig, case: int, g: torch.Generator) -> Rig:
 
 
 def larger(rig: Rig, margin: float) -> Pair:
-    """The pair with beta's picture wider by a margin on all sides (in as many pixels), where rounding decides."""
+    """The pair with beta's image wider by a margin on all sides (in as many pixels), where rounding decides."""
     h, w = rig["beta"].hw
     sx, sy = w / (w + 2 * margin), h / (h + 2 * margin)
     A = [[sx, 0, (0.5 + margin) * sx - 0.5], [0, sy, (0.5 + margin) * sy - 0.5], [0, 0, 1]]
-    return pair_of(rig.mapped("beta", torch.tensor(A, dtype=torch.float64), (h, w)))
+    return pair_of(rig.transformed("beta", torch.tensor(A, dtype=torch.float64), (h, w)))
 
 
 def sure_of(exact: Segments, hw: tuple[int, int]) -> torch.Tensor:
@@ -456,7 +456,7 @@ def sure_of(exact: Segments, hw: tuple[int, int]) -> torch.Tensor:
 @settings(max_examples=10, deadline=None)
 @given(st.integers(0, 10**9), st.sampled_from([0.2, 1.0, 3.0]))
 def test_float32_agrees_with_float64_on_a_thousand_rigs(seed, turn):
-    """10 times 100 rigs: no NaN, and no other `valid` than rounding at the picture's edge explains."""
+    """10 times 100 rigs: no NaN, and no other `valid` than rounding at the image's edge explains."""
     g = torch.Generator().manual_seed(seed)
     kinds = [disturbed(random_rig(seed + i, near=0.5, turn=turn, baseline=1.0), i, g) for i in range(100)]
     rig, x = batch_of(kinds), uniform(g, 0, 47, 100, 50, 2)

@@ -44,9 +44,9 @@ def project(K: torch.Tensor, X: torch.Tensor) -> torch.Tensor:
 def test_a_point_of_the_plane_projects_the_same_through_both(scene):
     X = points_on_plane(scene)
     X_beta = X @ scene["R"].mT + scene["t"][:, None]
-    mapped = apply_homography(plane_homography(**scene), project(scene["K_alpha"], X))
-    assert mapped.valid.all()
-    torch.testing.assert_close(mapped.x, project(scene["K_beta"], X_beta), rtol=0, atol=1e-9)
+    transformed = apply_homography(plane_homography(**scene), project(scene["K_alpha"], X))
+    assert transformed.valid.all()
+    torch.testing.assert_close(transformed.x, project(scene["K_beta"], X_beta), rtol=0, atol=1e-9)
 
 
 def test_the_scale_is_the_ratio_of_depths(scene):
@@ -81,17 +81,17 @@ def test_a_far_plane_tends_to_the_infinite_homography(scene):
 
 def test_points_behind_or_at_infinity_are_flagged_and_finite():
     H = torch.tensor([[1.0, 0, 0], [0, 1, 0], [0.1, 0, 1]])
-    mapped = apply_homography(H, torch.tensor([[0.0, 0], [-10, 0], [-20, 5], [float("nan"), 0]]))
-    assert mapped.valid.tolist() == [True, False, False, False]
-    assert mapped.x.isfinite().all()
+    transformed = apply_homography(H, torch.tensor([[0.0, 0], [-10, 0], [-20, 5], [float("nan"), 0]]))
+    assert transformed.valid.tolist() == [True, False, False, False]
+    assert transformed.x.isfinite().all()
 
 
 def test_gradients(scene):
     x = torch.tensor([[30.0, 40.0], [200.0, 10.0]], dtype=torch.float64).expand(5, 2, 2)
     names = list(scene)
 
-    def mapped(x: torch.Tensor, *values: torch.Tensor) -> torch.Tensor:
+    def transformed(x: torch.Tensor, *values: torch.Tensor) -> torch.Tensor:
         return apply_homography(plane_homography(**dict(zip(names, values))), x).x
 
     inputs = [v.detach()[:2].clone().requires_grad_() for v in (x, *scene.values())]
-    assert torch.autograd.gradcheck(mapped, inputs)
+    assert torch.autograd.gradcheck(transformed, inputs)

@@ -474,7 +474,7 @@ def test_wrong_units_warn(tmp_path):
 
 
 def test_unstated_sizes_warn():
-    with pytest.warns(RigFileWarning, match=r"states no picture size: took 1201 x 341, .* say `hw"):
+    with pytest.warns(RigFileWarning, match=r"states no image size: took 1201 x 341, .* say `hw"):
         assert read_rig(FIXTURES / "kitti_calib.txt")["cam1"].hw == (341, 1201)
 
 
@@ -541,7 +541,7 @@ def test_a_size_that_is_missing_is_called_missing(tmp_path):
         Rig.load(tmp_path / "rig.yaml")
 
 
-def test_a_picture_turned_upside_down_survives_the_native_file(tmp_path):
+def test_a_image_turned_upside_down_survives_the_native_file(tmp_path):
     """Its K has negative focal lengths, which `focal` cannot state."""
     K = intrinsics(300.0, (240, 320))
     rig = Rig({"a": Camera(K=K, cam_from_world=Pose.identity(), hw=(240, 320))}).turn("a", 2)
@@ -563,8 +563,8 @@ def test_lenses_of_uncalibrated_cameras_come_back(tmp_path):
     assert type(again["b"]) is View
     assert again["a"].sensor == views["a"].sensor
     x = torch.tensor([[10.0, 20.0], [250.0, 470.0]], dtype=torch.float64)
-    assert torch.equal(again["a"].straighten(x)[0], rig["a"].straighten(x)[0])
-    assert (again["a"].straighten(x)[0] - x).norm(dim=-1).max() > 1
+    assert torch.equal(again["a"].undistort(x)[0], rig["a"].undistort(x)[0])
+    assert (again["a"].undistort(x)[0] - x).norm(dim=-1).max() > 1
     assert torch.equal(again.links["a", "b"].F, rig.links["a", "b"].F)
 
 
@@ -575,7 +575,7 @@ def test_a_lens_without_focal_length_states_its_scale(tmp_path):
     view = Rig.load(path)["a"]
     assert isinstance(view, LensView)
     assert not isinstance(view, Camera)
-    assert view.bend(torch.tensor([640.0, 200.0], dtype=torch.float64))[0].tolist() == pytest.approx([672, 200])
+    assert view.distort(torch.tensor([640.0, 200.0], dtype=torch.float64))[0].tolist() == pytest.approx([672, 200])
     path.write_text(text + "{model: brown-conrady, coefficients: [0.1, 0, 0, 0]}\n")
     with pytest.raises(RigFileError, match=r"cameras\.a\.distortion: is of a camera without 'focal'.*`scale`"):
         Rig.load(path)

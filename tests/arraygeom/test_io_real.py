@@ -142,12 +142,10 @@ def test_syntim_agrees_with_photographs(shared_data):
     folder = shared_data / "syntim"
     found = []
     for scene in ("BalMire", "Color", "Sigraph", "Serfaty"):
-        pictures = [next(iter(sorted(folder.glob(f"{scene}{side}_O*.png")))) for side in (0, 1)]
+        images = [next(iter(sorted(folder.glob(f"{scene}{side}_O*.png")))) for side in (0, 1)]
         rig = read_rig(folder / f"cam_{scene}_g")
-        pair = [
-            rig[name].resize(cv2.imread(str(picture)).shape[:2]) for name, picture in zip(("left", "right"), pictures)
-        ]
-        found.append(float(epipolar_errors(*pair, *matches(*pictures)).median()))
+        pair = [rig[name].resize(cv2.imread(str(image)).shape[:2]) for name, image in zip(("left", "right"), images)]
+        found.append(float(epipolar_errors(*pair, *matches(*images)).median()))
     assert 0.3 < np.median(found) < 1.2, found
 
 

@@ -1,11 +1,11 @@
 import pytest
 import torch
 
-from arraygeom.pixels import coarse_grid, map_homogeneous, pixel_grid, resize_matrix, shift_matrix, turn_matrix
+from arraygeom.pixels import coarse_grid, map_homogeneous, pixel_grid, resize_matrix, rot90_matrix, shift_matrix
 
 
 def blob(hw: tuple[int, int], x: float, y: float, *, sigma: float = 2.0) -> torch.Tensor:
-    """A picture (1, 1, H, W) of one bright spot."""
+    """An image (1, 1, H, W) of one bright spot."""
     grid = pixel_grid(hw, dtype=torch.float64)
     offset = grid - torch.tensor([x, y], dtype=torch.float64)
     return torch.exp(-0.5 * offset.square().sum(-1) / sigma**2)[None, None]
@@ -24,7 +24,7 @@ def moved(A: torch.Tensor, x: float, y: float) -> torch.Tensor:
 def test_turning_follows_the_actual_pixels(k):
     image = blob((40, 60), 21.3, 14.7)
     turned = torch.rot90(image, k, (-2, -1))
-    torch.testing.assert_close(centroid(turned), moved(turn_matrix((40, 60), k), 21.3, 14.7), atol=1e-6, rtol=0)
+    torch.testing.assert_close(centroid(turned), moved(rot90_matrix((40, 60), k), 21.3, 14.7), atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize("new", [(20, 30), (10, 30), (40, 20)])
@@ -52,8 +52,8 @@ def test_cropping_and_padding_follow_the_actual_pixels():
 def test_maps_and_their_inverses():
     eye = torch.eye(3, dtype=torch.float64)
     torch.testing.assert_close(resize_matrix((3, 7), (9, 2)) @ resize_matrix((9, 2), (3, 7)), eye)
-    torch.testing.assert_close(turn_matrix((7, 3), 3) @ turn_matrix((3, 7), 1), eye)
-    torch.testing.assert_close(turn_matrix((3, 7), 4), eye)
+    torch.testing.assert_close(rot90_matrix((7, 3), 3) @ rot90_matrix((3, 7), 1), eye)
+    torch.testing.assert_close(rot90_matrix((3, 7), 4), eye)
 
 
 def test_homogeneous_map_is_the_matrix_product():

@@ -27,8 +27,8 @@ def test_rows_agree(seed):
     both = alpha.valid & beta.valid & ours[0].valid & ours[1].valid
     assert both.sum() > 20
     assert (ours[0].x - ours[1].x)[both, 1].abs().max() < 1e-6
-    for camera, mapped in zip(done.pair.cameras, ours):
-        torch.testing.assert_close(camera.project(X).x[both], mapped.x[both], atol=1e-8, rtol=0)
+    for camera, transformed in zip(done.pair.cameras, ours):
+        torch.testing.assert_close(camera.project(X).x[both], transformed.x[both], atol=1e-8, rtol=0)
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -43,7 +43,7 @@ def test_rotations_are_opencvs(seed):
     done = rectify(pair, K=torch.from_numpy(P1[:, :3].copy()), hw=(h, w))
     np.testing.assert_allclose(done.R_alpha.numpy(), R1, atol=1e-9)
     np.testing.assert_allclose(done.R_beta.numpy(), R2, atol=1e-9)
-    # the same epipolar rows: a point of alpha is at OpenCV's row in both of our pictures
+    # the same epipolar rows: a point of alpha is at OpenCV's row in both of our images
     X = scene_points(sideways(seed), 50)
     for camera, c, R, P in zip(done.pair.cameras, pair.cameras, (R1, R2), (P1, P2)):
         local = c.cam_from_world.apply(X).numpy() @ R.T

@@ -26,7 +26,7 @@ def uncalibrated() -> Rig:
     ],
 )
 @pytest.mark.parametrize("name", ["alpha", "beta"])
-def test_links_follow_what_happens_to_pictures(change, name):
+def test_links_follow_what_happens_to_images(change, name):
     """The calibrated rig is the oracle of the uncalibrated one."""
     known, unknown = change(random_rig(0), name), change(uncalibrated(), name)
     assert known[name].hw == unknown[name].hw
@@ -61,7 +61,7 @@ def test_what_is_not_free_stays_bit_identical():
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_focal_lengths_of_turned_pictures(turns):
+def test_focal_lengths_of_turned_images(turns):
     """Changing the focal length and turning commute."""
     rig = random_rig(0)
     change = {"beta.focal": torch.tensor([1.0, 2.0], dtype=torch.float64)}

@@ -1,4 +1,4 @@
-"""Pinhole views: OpenCV's maps are the oracle, there and back is the picture, nothing of the view is left out."""
+"""Pinhole views: OpenCV's maps are the oracle, there and back is the image, nothing of the view is left out."""
 
 import math
 
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, LensView, Pose, intrinsics, pinhole_view, retaken, rotation_from_vector
+from arraygeom import Camera, Distortion, LensView, Pose, intrinsics, pinhole_view, resampled, rotation_from_vector
 from arraygeom.undistortion import pixels_between
 
 HW = (120, 160)
@@ -24,7 +24,7 @@ def camera(model, focal=110.0):
     return Camera(K=K, cam_from_world=pose, hw=HW, distortion=lens)
 
 
-def picture(hw, period=20.0):
+def image(hw, period=20.0):
     y, x = torch.meshgrid(*(torch.arange(n, dtype=torch.float64) for n in hw), indexing="ij")
     return torch.stack([0.5 + 0.4 * torch.sin(x / period * 2), 0.5 + 0.4 * torch.cos((x + y) / period)])
 
@@ -42,14 +42,14 @@ def test_pixels_are_where_opencv_has_them(model):
 
 
 @pytest.mark.parametrize("model", LENSES)
-def test_there_and_back_is_the_picture(model):
+def test_there_and_back_is_the_image(model):
     c = camera(model)
     view = pinhole_view(c)
-    there = retaken(picture(HW), c, view)
-    back = retaken(there.values[0], view, c)
+    there = resampled(image(HW), c, view)
+    back = resampled(there.values[0], view, c)
     inside = back.valid[0, 4:-4, 4:-4]
     assert inside.float().mean() > 0.95
-    assert (back.values[0] - picture(HW))[:, 4:-4, 4:-4].abs()[:, inside].max() < 0.01
+    assert (back.values[0] - image(HW))[:, 4:-4, 4:-4].abs()[:, inside].max() < 0.01
 
 
 def test_all_is_kept_up_to_the_widest_angle_and_the_middle_keeps_its_size():
@@ -82,16 +82,16 @@ def test_one_camera_at_a_time():
         pinhole_view(c.replace(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None])))
 
 
-def test_a_picture_extended_keeps_its_edge_where_nothing_is_seen():
+def test_a_image_extended_keeps_its_edge_where_nothing_is_seen():
     c = camera("brown-conrady")
     view = pinhole_view(c)
-    plain, extended = (retaken(picture(HW), c, view, extended=e) for e in (False, True))
+    plain, extended = (resampled(image(HW), c, view, extended=e) for e in (False, True))
     assert torch.equal(plain.valid, extended.valid)
     assert torch.equal(extended.values * extended.valid, plain.values)
     assert (extended.values > 0).all()
     for row, column in ((0, 0), (-1, -1)):
         assert not plain.valid[0, row, column]
-        corner = picture(HW)[:, row, column]
+        corner = image(HW)[:, row, column]
         assert torch.allclose(extended.values[0, :, row, column], corner, atol=1e-3)
 
 
@@ -100,13 +100,13 @@ def test_a_lens_of_unknown_focal_length_bends_as_that_of_a_camera():
     view = LensView(hw=c.hw, K=c.K, distortion=c.distortion)
     pinhole, of_view = pinhole_view(c), pinhole_view(view)
     assert of_view.hw == pinhole.hw
-    seen = retaken(picture(HW), view, of_view).valid
+    seen = resampled(image(HW), view, of_view).valid
     theirs, ours = pixels_between(c, pinhole)[0], pixels_between(view, of_view)[0]
     assert torch.allclose(theirs[seen[0]], ours[seen[0]])
     assert seen.float().mean() > 0.7
     x = torch.tensor([[10.0, 20.0], [150.0, 100.0]], dtype=torch.float64)
     rays, _ = c.rays(x)
-    straight, valid = view.straighten(x)
+    straight, valid = view.undistort(x)
     assert valid.all()
     assert torch.allclose(straight, c.replace(distortion=None).project_local(rays).x)
-    assert torch.allclose(view.bend(straight)[0], x)
+    assert torch.allclose(view.distort(straight)[0], x)

@@ -37,7 +37,7 @@ def test_frusta_are_in_front_of_their_cameras_and_project_to_the_corners():
     border = torch.from_numpy(viz.frustum(camera, 2.0)[-1])
     projected = camera.project(border)
     torch.testing.assert_close(projected.depth, torch.full_like(projected.depth, 2.0))
-    torch.testing.assert_close(projected.x, viz.picture_border(camera.hw))
+    torch.testing.assert_close(projected.x, viz.image_border(camera.hw))
 
 
 def test_pixels_beyond_the_lens_are_moved_inside():

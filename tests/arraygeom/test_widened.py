@@ -39,7 +39,7 @@ def test_the_first_row_is_to_the_left_of_the_way():
         return Segments(x, x + x.new_tensor([0.0, 5.0]), torch.ones_like(x[..., 0], dtype=torch.bool))
 
     band = Widened(downward, across=1.0, samples=2)(WIDE, torch.tensor([[30.0, 20.0]]))
-    assert band.xy[0, 0].tolist() == [31.0, 20.0]  # facing down the picture, left is +x
+    assert band.xy[0, 0].tolist() == [31.0, 20.0]  # facing down the image, left is +x
 
 
 def test_bands_hold_points_moved_by_less_than_they_allow():
@@ -72,7 +72,7 @@ def test_curves_widen_about_their_tangents():
     assert (a.xy - b.xy)[both].abs().max() < 0.1
 
 
-def test_nothing_outside_the_picture_counts():
+def test_nothing_outside_the_image_counts():
     band = Widened(Rectified(10.0), across=3.0, samples=4)(WIDE, torch.tensor([[30.0, 0.0]]))
     assert band.mask.sum() == 4 * 4
     assert not Widened(Rectified(10.0), across=1.0)(WIDE, torch.tensor([[-30.0, 0.0]])).mask.any()

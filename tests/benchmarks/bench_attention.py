@@ -39,7 +39,7 @@ DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
 
 
 def field(ha: int, wa: int, samples: int, device: str) -> Segments:
-    """Slanted segments of samples - 1 pixels, or as long as the picture is wide: an epipolar field."""
+    """Slanted segments of samples - 1 pixels, or as long as the image is wide: an epipolar field."""
     y, x = torch.meshgrid(torch.arange(ha).float(), torch.arange(wa).float(), indexing="ij")
     length = min(samples - 1, wa - 1)
     slope = min(0.06, (ha - 5) / length)
@@ -49,7 +49,7 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
 
 
 def index_everything(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
-    """(a): (b, d, h, w, l) keys and values, nearest, from pictures that lie channels first, as they usually
+    """(a): (b, d, h, w, l) keys and values, nearest, from images that lie channels first, as they usually
     do."""
     x, y = _pixels(k, look, samples)
     keys, values = (t.contiguous()[:, :, y, x] for t in (k, v))
@@ -143,7 +143,7 @@ def features(ha: int, wa: int, d: int, dtype: torch.dtype, device: str) -> Tenso
 
 
 def _warm(run, device: str, dtype: torch.dtype, job: dict) -> None:
-    """Compiles what has to be, on a small picture."""
+    """Compiles what has to be, on a small image."""
     q, k, v = (torch.randn(1, job["d"], 8, 8, dtype=dtype, device=device, requires_grad=True) for _ in range(3))
     out = run(q, k, v, field(8, 8, 4, device), 4, job["interpolation"])
     if job["backward"]:

@@ -1,11 +1,11 @@
-"""How often `pat rig doctor` names the right mistake, over real rigs and pictures: a table of confusions.
+"""How often `pat rig doctor` names the right mistake, over real rigs and images: a table of confusions.
 
     python -m tests.benchmarks.bench_doctor --data ../shared/data --cases 10 --out tests/benchmarks/RESULTS_doctor.md
 
-A case is a real pair and a random mistake made with its rig or its pictures. One that is no more than the rig's own
+A case is a real pair and a random mistake made with its rig or its images. One that is no more than the rig's own
 misfit is drawn again: where lines move by less than 0.1 px, or by less than 3 times what the rig was off before, a
 mistake cannot be told from the drift of a rig. Shifts of a pixel or half of one are drawn for rigs alone that fit
-their own pictures to 0.17 px.
+their own images to 0.17 px.
 """
 
 from __future__ import annotations
@@ -112,10 +112,10 @@ def resized(rig: Rig, images: Images, g: Random) -> Made:
 
 def turned(rig: Rig, images: Images, g: Random) -> Made:
     words = str(g.choice(list(TURNS)))
-    return rig, images | {name: turned_picture(images[name], words) for name in some(rig.names, g)}
+    return rig, images | {name: rotated_image(images[name], words) for name in some(rig.names, g)}
 
 
-def turned_picture(picture: Tensor, words: str) -> Tensor:
+def rotated_image(image: Tensor, words: str) -> Tensor:
     changes: list[Callable[[Tensor], Tensor]] = [
         lambda p: p.flip(-1, -2),
         lambda p: torch.rot90(p, 1, (-2, -1)),
@@ -125,7 +125,7 @@ def turned_picture(picture: Tensor, words: str) -> Tensor:
         lambda p: p.mT,
         lambda p: p.flip(-1, -2).mT,
     ]
-    return dict(zip(TURNS, changes))[words](picture)
+    return dict(zip(TURNS, changes))[words](image)
 
 
 def exchanged(rig: Rig, images: Images, g: Random) -> Made:
@@ -144,15 +144,15 @@ def lens(rig: Rig, images: Images, g: Random) -> Made:
         return on_cameras(
             rig, rig.names, lambda c: c.replace(distortion=Distortion(c.distortion.model, -c.distortion.coefficients))
         ), images
-    return rig, {name: undistorted(rig, name, picture) for name, picture in images.items()}
+    return rig, {name: undistorted(rig, name, image) for name, image in images.items()}
 
 
-def undistorted(rig: Rig, name: str, picture: Tensor) -> Tensor:
+def undistorted(rig: Rig, name: str, image: Tensor) -> Tensor:
     camera = rig[name]
     straight = camera.replace(distortion=None)
     rays, _ = straight.rays(pixel_grid(camera.hw, dtype=torch.float64))
     where = camera.project_local(rays.reshape(-1, 3)).x.reshape(*camera.hw, 2)
-    return sample(picture[None], where[None].float()).values[0]
+    return sample(image[None], where[None].float()).values[0]
 
 
 MISTAKES: dict[str, Callable[[Rig, Images, Random], Made]] = {
@@ -171,7 +171,7 @@ MISTAKES: dict[str, Callable[[Rig, Images, Random], Made]] = {
 
 
 def subjects(data: Path) -> Iterator[Subject]:
-    """The real pairs that fit their own pictures, with the depth range of what both see."""
+    """The real pairs that fit their own images, with the depth range of what both see."""
     for pair in every_pair(data):
         try:
             matches = match_cameras(pair.images)
@@ -248,7 +248,7 @@ def main() -> None:
     text = confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only)
     print(text)
     if options.out:
-        told = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their pictures."
+        told = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their images."
         write_text(options.out, f"# Which mistakes the doctor names\n\n{told}\n\n{text}")
 
 

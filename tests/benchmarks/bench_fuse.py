@@ -1,6 +1,6 @@
 """Measures fusing a whole frame: `python -m tests.benchmarks.bench_fuse [--scale 0.5] [--threads 2]`.
 
-The array "wide field - narrow field" at a part of its size, with smooth random pictures: seconds of the survey and of
+The array "wide field - narrow field" at a part of its size, with smooth random images: seconds of the survey and of
 the network, what part of the latter convolutions take, and at what rate, beside the rate of this machine's matrix
 products with as many threads in the same run. `--full-runs` instead fuses the rendered frame of 4024x3036 under caps
 (`--caps 4GiB 8GiB 2GiB`; `pat systems run wide-narrow --full --max-memory ...`), in 4 to 6 minutes of a core each on
@@ -18,12 +18,12 @@ import time
 from pathlib import Path
 from statistics import median
 
-import pat.fusion.fuse
 import torch
 from torch.nn.functional import interpolate
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
+import pat.fusion.fuse
 from arraygeom import Rig
 from arraygeom.atomic import write_text
 from pat.fusion.fuse import fuse
@@ -45,7 +45,7 @@ def rig(scale: float) -> Rig:
     return found
 
 
-def picture(channels: int, hw: tuple[int, int], seed: int) -> torch.Tensor:
+def image(channels: int, hw: tuple[int, int], seed: int) -> torch.Tensor:
     """Blobs of some pixels."""
     rough = torch.rand(1, channels, hw[0] // 6, hw[1] // 6, generator=torch.Generator().manual_seed(seed))
     return interpolate(rough, hw, mode="bicubic", align_corners=False)[0].clamp(0, 1)
@@ -66,11 +66,11 @@ def measure(scale: float) -> dict[str, str]:
     """Survey and network by themselves, then convolutions within the latter."""
     array, network = rig(scale), load_weights("mono-colour")
     hw = array["narrow"].hw
-    images = {"narrow": picture(1, hw, 0), "wide": picture(3, array["wide"].hw, 1)}
+    images = {"narrow": image(1, hw, 0), "wide": image(3, array["wide"].hw, 1)}
     own = images["narrow"][None]
     beta = pat.fusion.fuse._prepare(network, array.pair("narrow", "wide"), images["wide"][None], None, None, "wide")
     small = rig(0.1)
-    fuse(network, small, {n: picture(i.shape[0], small[n].hw, 2) for n, i in images.items()}, alpha="narrow")
+    fuse(network, small, {n: image(i.shape[0], small[n].hw, 2) for n, i in images.items()}, alpha="narrow")
     begin = time.perf_counter()
     beta = surveyed(network, own, beta, survey_tiles(network, hw))
     surveying = time.perf_counter() - begin

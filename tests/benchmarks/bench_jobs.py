@@ -1,8 +1,8 @@
 """A job of forty frames: how fast, and what it survives. `python -m tests.benchmarks.bench_jobs [--frames 40]`.
 
-Forty pictures of the sample array, each a little brighter, fused by `pat fuse`: with one and with two workers; with a
-worker killed (kill -9) in the middle; with the whole command killed and begun again; with a corrupt picture, and one
-that disappears under way; and onto a disk that fills up (a small tmpfs, where mounting is allowed). Every picture of
+Forty images of the sample array, each a little brighter, fused by `pat fuse`: with one and with two workers; with a
+worker killed (kill -9) in the middle; with the whole command killed and begun again; with a corrupt image, and one
+that disappears under way; and onto a disk that fills up (a small tmpfs, where mounting is allowed). Every image of
 every run is compared, byte for byte, with that of the first run. Exits with 1 if anything differs.
 """
 
@@ -33,22 +33,22 @@ ROOT = Path(__file__).parents[2]
 
 @dataclass
 class Job:
-    """The pictures to fuse in `folder`, the pictures that should come of them, and what was found wrong."""
+    """The images to fuse in `folder`, the images that should come of them, and what was found wrong."""
 
     folder: Path
     frames: int
     wanted: dict[str, bytes] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
 
-    def make_pictures(self, scale: float) -> None:
+    def make_images(self, scale: float) -> None:
         """Forty of each camera."""
         rig = Rig.load(SAMPLE / "rig.yaml")
         for name in rig.names:
             hw = tuple(round(n * scale / 2) * 2 for n in rig[name].hw)
             rig = rig.resize(name, hw)
-            picture = interpolate(read_image(SAMPLE / f"{name}.png")[None], hw, mode="area")[0]
+            image = interpolate(read_image(SAMPLE / f"{name}.png")[None], hw, mode="area")[0]
             for i in range(self.frames):
-                write_image(self.folder / name / f"{i:03d}.png", picture * (0.7 + 0.3 * i / self.frames))
+                write_image(self.folder / name / f"{i:03d}.png", image * (0.7 + 0.3 * i / self.frames))
         rig.save(self.folder / "rig.yaml")
 
     def start(self, out: Path, *more: str) -> subprocess.Popen:
@@ -69,7 +69,7 @@ class Job:
         wanted = {name: content for name, content in self.wanted.items() if name[:3] not in gone}
         if found != wanted:
             other = sorted(n for n in found.keys() | wanted.keys() if found.get(n) != wanted.get(n))
-            self.wrong.append(f"{what}: {len(other)} pictures differ, such as {other[:3]}")
+            self.wrong.append(f"{what}: {len(other)} images differ, such as {other[:3]}")
         self.expect(all(p.name == ".keys" for p in out.glob(".*")), f"{what}: pieces of files")
 
     def expect(self, right: bool, what: str) -> None:
@@ -78,7 +78,7 @@ class Job:
 
 
 def fused(out: Path) -> dict[str, bytes]:
-    """The fused pictures by name."""
+    """The fused images by name."""
     return {p.name: p.read_bytes() for p in sorted(out.glob("*_fused.png"))}
 
 
@@ -135,8 +135,8 @@ def kill_the_command(job: Job) -> str:
     return f"the command killed after {len(before)} frames and resumed: {count(out)} frames, the same bits"
 
 
-def bad_pictures(job: Job) -> str:
-    """One picture cut in half, one that is removed while the job runs."""
+def bad_images(job: Job) -> str:
+    """One image cut in half, one that is removed while the job runs."""
     corrupt, gone = job.folder / "mono" / "007.png", job.folder / "colour" / f"{job.frames - 2:03d}.png"
     kept, out = {p: p.read_bytes() for p in (corrupt, gone)}, job.folder / "bad"
     try:
@@ -147,8 +147,8 @@ def bad_pictures(job: Job) -> str:
         wait_for(process, lambda: count(out) > 9)
         gone.unlink()
         job.expect(process.wait() == 1, f"skip: {job.said(out)[-200:]}")
-        job.compare(out, "bad pictures", without=(7, job.frames - 2))
-        for file, words in ((corrupt, "not a picture"), (gone, "no such picture")):
+        job.compare(out, "bad images", without=(7, job.frames - 2))
+        for file, words in ((corrupt, "not an image"), (gone, "no such image")):
             job.expect(f"{file.name}: {words}" in job.said(out), f"{file} is not named")
     finally:
         for file, content in kept.items():
@@ -156,7 +156,7 @@ def bad_pictures(job: Job) -> str:
     done = job.start(out, "--resume").wait() == 0
     job.expect(done, f"mended: {job.said(out)[-200:]}")
     job.compare(out, "mended")
-    return f"stopped at the corrupt picture, or skipped it and the vanished one: {job.frames - 2} right; mended: all"
+    return f"stopped at the corrupt image, or skipped it and the vanished one: {job.frames - 2} right; mended: all"
 
 
 def full_disk(job: Job) -> str:
@@ -184,10 +184,10 @@ def full_disk(job: Job) -> str:
 def run(folder: Path, *, frames: int, scale: float, say: Callable[[str], None] = print) -> list[str]:
     """All of it; what is wrong."""
     job = Job(folder, frames)
-    job.make_pictures(scale)
+    job.make_images(scale)
     for workers in (1, 2):
         say(throughput(job, workers))
-    for part in (kill_a_worker, kill_the_command, bad_pictures, full_disk):
+    for part in (kill_a_worker, kill_the_command, bad_images, full_disk):
         say(part(job))
     return job.wrong
 
@@ -196,7 +196,7 @@ def main() -> None:
     """Print what happened."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--frames", type=int, default=40)
-    parser.add_argument("--scale", type=float, default=0.5, help="size of the pictures, of the sample's")
+    parser.add_argument("--scale", type=float, default=0.5, help="size of the images, of the sample's")
     given = parser.parse_args()
     print(f"{os.cpu_count()} cores, load before: {os.getloadavg()[0]:.1f}", flush=True)
     with tempfile.TemporaryDirectory() as folder:

@@ -1,6 +1,6 @@
 """What the choices of the small network's recipe are worth: loss, parts and numbers, each changed alone.
 
-    python -m tests.benchmarks.bench_recipe --photos ~/pictures
+    python -m tests.benchmarks.bench_recipe --photos ~/images
 
 Every variant is trained from nothing on the same samples, for the same few steps, and validated on the same held-out
 scenes. The base is trained with several seeds (of its weights and of its samples): a difference within their range
@@ -131,7 +131,7 @@ class Bench:
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:
     """No loss on the match."""
-    return given.truth.new_zeros(())
+    return given.ground_truth.new_zeros(())
 
 
 def lines(args: Args) -> Iterator[str]:

@@ -112,15 +112,17 @@ def fast_and_slow(data: Path) -> Iterator[str]:
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
     """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at alpha's view."""
-    head = "| rendered | draw | true rig | made worse | by points | and by the fusion's error | from pictures alone |"
+    head = "| rendered | draw | true rig | made worse | by points | and by the fusion's error | from images alone |"
     yield head + "\n| --- | " + "---: | " * 6
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
-    ours = Case("sample array", sample.rig, sample.images, sample.truth, torch.empty(0))
+    ours = Case("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))
     for case in chain([ours], found):
 
         def psnr(rig: Rig, case: Case = case) -> float:
-            return score(fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.truth)[0]
+            return score(fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.ground_truth)[
+                0
+            ]
 
         true, alone = psnr(case.rig), psnr(start(case.images).rig)
         for draw in range(1, draws + 1):

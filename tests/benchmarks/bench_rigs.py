@@ -59,11 +59,11 @@ class Args:
 def ahead(networks: dict[str, FusionNetwork], case: Case) -> dict[str, float] | None:
     """By how many dB each is ahead of the classical baseline; and the baseline's PSNR. None if nothing rectifies."""
     try:
-        base = score(classical(case.rig, case.images, ALPHA, BETA), case.truth).psnr
+        base = score(classical(case.rig, case.images, ALPHA, BETA), case.ground_truth).psnr
     except ValueError:
         return None
     fused = {name: fuse(net, case.rig, case.images, alpha=ALPHA).image.clamp(0, 1) for name, net in networks.items()}
-    return {"classical": base} | {name: score(image, case.truth).psnr - base for name, image in fused.items()}
+    return {"classical": base} | {name: score(image, case.ground_truth).psnr - base for name, image in fused.items()}
 
 
 def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:

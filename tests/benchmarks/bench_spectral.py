@@ -3,7 +3,7 @@
     python -m tests.benchmarks.bench_spectral --photos DIR
 
 Layered scenes of photographs that training holds out. The classical baseline sees red, green and blue at one place as
-one colour picture, and all other bands one by one. Table 2 on real pairs is `pat evaluate --protocol table2`.
+one colour image, and all other bands one by one. Table 2 on real pairs is `pat evaluate --protocol table2`.
 """
 
 from __future__ import annotations
@@ -57,24 +57,24 @@ class Args:
 
 
 def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str, Tensor], Tensor]]:
-    """A rig, its pictures (alpha and one of each band) and the truth."""
+    """A rig, its images (alpha and one of each band) and the truth."""
     _, unseen = photographs(TrainConfig(photos=args.photos, cache=args.cache))
     scenes, g = LayeredScenes(unseen, replace(RIGS, betas=places), hw=HW, seed=args.seed), Generator()
     g.manual_seed(args.seed)
     for _ in range(args.scenes):
         made = scenes.sample(1, g)
         spectra = Spectra.drawn(1, random, g) if random else None
-        pictures = [spectra.of(image) if spectra else image for image in made.images]
+        seen = [spectra.of(image) if spectra else image for image in made.images]
         cameras = [_single(camera) for camera in made.cameras]
         count = random or 3
         at = {f"band {i}": 1 + i % places for i in range(count)}
         images = {"alpha": luminance(made.images[0])} | {
-            name: pictures[place][:, i : i + 1] for i, (name, place) in enumerate(at.items())
+            name: seen[place][:, i : i + 1] for i, (name, place) in enumerate(at.items())
         }
         near, far = (float(d) for d in made.depth_range[0])
         rig = Rig({"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far))
         steps = [Noise(8000, 3), Clip(), Quantise(8)]
-        yield rig, {name: record(p, steps, g).image[0] for name, p in images.items()}, pictures[0][0]
+        yield rig, {name: record(p, steps, g).image[0] for name, p in images.items()}, seen[0][0]
 
 
 def _single(camera: Camera) -> Camera:
@@ -95,13 +95,13 @@ def baseline(rig: Rig, images: dict[str, Tensor], places: int, random: int) -> T
 
 def row(args: Args, networks: dict[str, FusionNetwork], places: int, random: int) -> list[str]:
     found: dict[str, list[tuple[float, float]]] = {}
-    for rig, images, truth in cases(args, places, random):
+    for rig, images, ground_truth in cases(args, places, random):
         answers = {"classical": baseline(rig, images, places, random)}
         for name, network in networks.items():
-            if name == "mono-spectral" or len(truth) == 3:
+            if name == "mono-spectral" or len(ground_truth) == 3:
                 answers[name] = fuse(network, rig, images, alpha="alpha").image
         for name, image in answers.items():
-            found.setdefault(name, []).append(tuple(score(image.clamp(0, 1), truth)))
+            found.setdefault(name, []).append(tuple(score(image.clamp(0, 1), ground_truth)))
     cells = {name: "{:.2f} / {:.4f}".format(*np.mean(values, 0)) for name, values in found.items()}
     return [cells.get(name, "") for name in ("classical", *networks)]
 

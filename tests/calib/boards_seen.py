@@ -83,14 +83,14 @@ def errors_of(fit, rig):
     """Estimate minus truth of every free number, in the order of `fit.names`."""
     found = []
     for name, camera_found in fit.scene.cameras.items():
-        truth = rig[name]
-        R = (camera_found.R @ truth.R.T).numpy()
+        ground_truth = rig[name]
+        R = (camera_found.R @ ground_truth.R.T).numpy()
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
         K, lens = (
-            (camera_found.K - truth.K).numpy(),
-            camera_found.distortion.coefficients - truth.distortion.coefficients,
+            (camera_found.K - ground_truth.K).numpy(),
+            camera_found.distortion.coefficients - ground_truth.distortion.coefficients,
         )
-        values = [*turn, *(camera_found.t - truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
+        values = [*turn, *(camera_found.t - ground_truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
         entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
         found += [v for v, entry in zip(values, entries) if entry in fit.names]
     return np.array(found)

@@ -1,4 +1,4 @@
-"""Real pairs whose cameras are known, from the folder of real pictures."""
+"""Real pairs whose cameras are known, from the folder of real images."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MIDDLEBURY = {"2006_third/Cloth1": 3, "2006_third/Midd1": 3, "2006_half/Wood2": 
 
 
 class RealPair(NamedTuple):
-    """A rig of two cameras and a picture of each."""
+    """A rig of two cameras and an image of each."""
 
     name: str
     rig: Rig

@@ -2,7 +2,7 @@
 
     python -m tests.calib.rendered --out out/boards
 
-renders them (some minutes on one core; needs `make synthesis`), as a folder of PNG pictures for each camera with the
+renders them (some minutes on one core; needs `make synthesis`), as a folder of PNG images for each camera with the
 true rig beside them. Four cameras of different sizes, focal lengths and lenses stand 0.2 m apart and look at about
 2 m. The board is at 0.9 to 2.6 m, tilted by up to 40 degrees, so that every camera has it near, at its corners and
 in its middle.
@@ -46,7 +46,7 @@ def rig() -> Rig:
 
 
 def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose]:
-    """`world_from_board`: held by each camera in turn to some place of its picture, in view of the others too."""
+    """`world_from_board`: held by each camera in turn to some place of its image, in view of the others too."""
     random = np.random.default_rng(seed)
     found: list[Pose] = []
     while len(found) < count:
@@ -57,13 +57,13 @@ def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose
 
 
 def _seen(view: Camera, pose: Pose) -> float:
-    """The share of the board's corners in the picture."""
+    """The share of the board's corners in the image."""
     x, _, valid = view.project(pose.apply(torch.from_numpy(inner_corners(SHEET))))
     return float((valid & view.contains(x)).double().mean())
 
 
 def _pose(view: Camera, random: np.random.Generator) -> Pose:
-    """A board that would fill 0.45 to 1.05 of the picture's width, its middle in the picture's middle 60 %."""
+    """A board that would fill 0.45 to 1.05 of the image's width, its middle in the image's middle 60 %."""
     h, w = view.hw
     columns, rows = SHEET.squares
     depth = float(np.clip(view.K[0, 0] * SHEET.wh[0] / (w * random.uniform(0.45, 1.05)), *DEPTHS))
@@ -75,7 +75,7 @@ def _pose(view: Camera, random: np.random.Generator) -> Pose:
 
 
 def photograph(out: Path, *, count: int = POSES, samples: int = 8) -> None:
-    """The pictures, `out/<camera>/<frame>.png` (8 bits), and `out/true.yaml`."""
+    """The images, `out/<camera>/<frame>.png` (8 bits), and `out/true.yaml`."""
     from pat.synthesis.blender import RenderSettings
     from pat.synthesis.blender.client import render
     from pat.synthesis.generators import board

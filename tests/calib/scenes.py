@@ -1,4 +1,4 @@
-"""Rigs, points and pictures whose truth is known."""
+"""Rigs, points and images whose truth is known."""
 
 import cv2
 import numpy as np
@@ -13,8 +13,8 @@ HW = (240, 320)
 def texture(hw=HW, seed=0):
     """Blobs of many sizes, (1, H, W)."""
     noise = np.random.default_rng(seed).standard_normal(hw).astype(np.float32)
-    picture = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
-    return torch.from_numpy((picture - picture.min()) / np.ptp(picture))[None]
+    image = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
+    return torch.from_numpy((image - image.min()) / np.ptp(image))[None]
 
 
 def vector(*numbers) -> torch.Tensor:
@@ -47,7 +47,7 @@ def rectified_pair() -> Rig:
 
 
 def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dict[tuple[str, str], Matches]:
-    """Points of the first two cameras, between two depths and in both pictures, good to `noise` pixels in beta."""
+    """Points of the first two cameras, between two depths and in both images, good to `noise` pixels in beta."""
     g = torch.Generator().manual_seed(seed)
     (a, alpha), (b, beta) = list(rig.cameras.items())[:2]
     h, w = alpha.hw
@@ -59,7 +59,7 @@ def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dic
     return {(a, b): Matches(x, y + noise * torch.randn(len(y), 2, generator=g, dtype=torch.float64))}
 
 
-def rectified_pictures(seed=0) -> dict[str, torch.Tensor]:
+def rectified_images(seed=0) -> dict[str, torch.Tensor]:
     """What `rectified_pair` sees of two planes, one above the other, at 60 / 20 = 3 m and 60 / 11 m."""
     wide = texture((HW[0], HW[1] + 60), seed)
     near, far = (wide[..., d : d + HW[1]] for d in (20, 11))

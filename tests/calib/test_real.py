@@ -1,4 +1,4 @@
-"""Real and rendered pictures of rigs: what the benchmarks measure at length."""
+"""Real and rendered images of rigs: what the benchmarks measure at length."""
 
 from importlib.util import find_spec
 
@@ -31,7 +31,7 @@ def test_mistakes_with_a_stereo_head_are_named(shared_data, kind):
 
 @pytest.mark.slow
 def test_the_rig_of_another_experiment_is_found_out(shared_data):
-    """The published poses of SYNTIM's BatSynt fit its pictures only when inverted."""
+    """The published poses of SYNTIM's BatSynt fit its images only when inverted."""
     (pair,) = syntim(shared_data, ("BatSynt",))
     found = diagnose(pair.rig, pair.images)
     assert found.named.kind == "pose inverted"

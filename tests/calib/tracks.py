@@ -23,7 +23,7 @@ CALISCOPE_RMS, FIFTEEN_RMS = 1.6625, 0.8070
 
 
 class Tracks(NamedTuple):
-    """A published rig, and its corners as the pictures' own points."""
+    """A published rig, and its corners as the images' own points."""
 
     rig: Rig
     scene: Scene

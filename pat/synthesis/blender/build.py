@@ -49,7 +49,7 @@ def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> Stage:
 
 
 def colour(spectrum: Spectrum, rgb: tuple[float, float, float], nir: float) -> tuple[float, float, float]:
-    """What a spectrum's picture shows: near infrared in all three channels."""
+    """What a spectrum's image shows: near infrared in all three channels."""
     return rgb if spectrum == "rgb" else (nir, nir, nir)
 
 
@@ -175,9 +175,9 @@ def _principled(material: Material) -> dict[str, float]:
 
 
 def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> tuple[Any, Any]:
-    """The output that has the paint, and the one that has the height of bumps (None for pictures)."""
-    if texture.kind in ("picture", "board"):
-        return _picture(bpy, nodes, texture, stage, scratch), None
+    """The output that has the paint, and the one that has the height of bumps (None for images)."""
+    if texture.kind in ("image", "board"):
+        return _image(bpy, nodes, texture, stage, scratch), None
     height = _PATTERNS[texture.kind](nodes, texture)
     ramp = nodes.new("ValToRGB")
     nodes.give(ramp.inputs[0], height)
@@ -273,7 +273,7 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 }
 
 
-def _picture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> Any:
+def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> Any:
     image = _image(bpy, texture, scratch)
     node = nodes.new("TexImage", image=image, extension=_MIRRORED)
     (w, h), (left, top) = _laid(image.size, texture)
@@ -294,7 +294,7 @@ def _picture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: P
 
 
 def _laid(wh: tuple[int, int], texture: Texture) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Metres that a picture covers, and where on it the surface's corner is. Boards are centred, true to scale."""
+    """Metres that an image covers, and where on it the surface's corner is. Boards are centred, true to scale."""
     if texture.board is None:
         return (1 / texture.scale, wh[1] / wh[0] / texture.scale), (0, 0)
     w, h = (n * texture.board.square / PIXELS for n in wh)
@@ -315,10 +315,10 @@ def _infrared(nodes: _Nodes, rgb: Any) -> Any:
 
 
 def _image(bpy: Any, texture: Texture, scratch: Path) -> Any:
-    if texture.kind == "picture":
-        if not Path(texture.picture).is_file():
-            raise ValueError(f"{texture.picture or 'a texture without a file'}: no such picture for a texture")
-        return bpy.data.images.load(str(Path(texture.picture).resolve()), check_existing=True)
+    if texture.kind == "image":
+        if not Path(texture.image).is_file():
+            raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")
+        return bpy.data.images.load(str(Path(texture.image).resolve()), check_existing=True)
     if texture.board is None:
         raise ValueError("a texture of kind 'board' needs a board")
     path = scratch / f"board-{len(bpy.data.images)}.png"

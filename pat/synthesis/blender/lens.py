@@ -1,4 +1,4 @@
-"""What Blender can render of a camera: a pinhole with square axes; and how its picture becomes the camera's."""
+"""What Blender can render of a camera: a pinhole with square axes; and how its image becomes the camera's."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from arraygeom.sampling import sample
 from ..surfaces import depth_between
 
 WIDEST = math.radians(80)
-"""The largest angle off axis that a plane picture can cover at all sensibly."""
+"""The largest angle off axis that a plane image can cover at all sensibly."""
 
 _MARGIN = 3
 _MOST_PIXELS = 64e6
@@ -27,13 +27,13 @@ _STEP = 0.01
 
 
 class Lens(NamedTuple):
-    """A pinhole camera, and where the pixels of the true camera are in its picture (None: the same pixels)."""
+    """A pinhole camera, and where the pixels of the true camera are in its image (None: the same pixels)."""
 
     pinhole: Camera
     x: Float[Tensor, "h w 2"] | None
     valid: Bool[Tensor, "h w"] | None
 
-    def picture(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
+    def resampled(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
         """Colours, by cubic splines; 0 where the lens sees nothing.
 
         (The bicubic kernel of `grid_sample` moves straight slopes by up to 0.05 pixels, splines do not.)
@@ -112,7 +112,7 @@ def _upright(camera: Camera, name: str) -> Camera:
             "set it to 0, or calibrate without skew"
         )
     if not (K[0, 0] > 0 and K[1, 1] > 0):
-        raise ValueError(f"camera '{name}' mirrors its picture (K has determinant below 0): flip the picture instead")
+        raise ValueError(f"camera '{name}' mirrors its image (K has determinant below 0): flip the image instead")
     K = K.clone()
     K[0, 1] = K[1, 0] = 0
     return camera.replace(K=K, cam_from_world=Pose(Q @ camera.R, Q @ camera.t), distortion=None)
@@ -127,7 +127,7 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     angle = torch.atan2(rays[..., :2].norm(dim=-1), rays[..., 2])[valid].max()
     if angle > WIDEST:
         raise ValueError(
-            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; a plane picture covers at most "
+            f"camera '{name}' sees {math.degrees(angle):.0f} degrees off its axis; a plane image covers at most "
             f"{math.degrees(WIDEST):.0f}: crop the camera"
         )
     plane = rays[..., :2] / rays[..., 2:].clamp(min=1e-6)
@@ -135,7 +135,7 @@ def _wide(camera: Camera, upright: Camera, name: str) -> Lens:
     low, high = (f * plane[valid].amin(0)).floor() - _MARGIN, (f * plane[valid].amax(0)).ceil() + _MARGIN
     w, h = (int(n) for n in high - low + 1)
     if w * h > _MOST_PIXELS:
-        raise ValueError(f"camera '{name}': its lens needs an undistorted picture of {w}x{h} pixels: crop the camera")
+        raise ValueError(f"camera '{name}': its lens needs an undistorted image of {w}x{h} pixels: crop the camera")
     K = torch.tensor([[f, 0, -float(low[0])], [0, f, -float(low[1])], [0, 0, 1]], dtype=torch.float64)
     x = map_homogeneous(K[:2], plane)
     return Lens(upright.replace(K=K, hw=(h, w)), x, valid)
@@ -149,5 +149,5 @@ def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[
 
 
 def resized(camera: View, hw: HW) -> View:
-    """The camera with pictures of another size; as it is if they have that."""
+    """The camera with images of another size; as it is if they have that."""
     return camera if camera.hw == hw else camera.resize(hw)

@@ -37,8 +37,8 @@ class Optics:
 class RenderSettings:
     """What is rendered, and how well.
 
-    `width` resizes the rig so that its widest picture has that many pixels; None leaves it as it is. `passes` are
-    made beside colour, depth and index ("alpha" leaves the world's light out of the pictures). `duration` seconds
+    `width` resizes the rig so that its widest image has that many pixels; None leaves it as it is. `passes` are
+    made beside colour, depth and index ("alpha" leaves the world's light out of the images). `duration` seconds
     are rendered at each camera's own frame rate and time offset; 0 renders one frame a camera. `optics` is by
     camera name. `threads` of 0 uses all cores. `limits` are what the self-check holds the first frames to. `device`
     "auto" takes a GPU where one is usable.

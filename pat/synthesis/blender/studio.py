@@ -68,7 +68,7 @@ class Studio:
             layer.material_override = None
 
     def close(self) -> None:
-        """Let Blender forget what it kept for the next picture: until then a thread of it spins, half a core."""
+        """Let Blender forget what it kept for the next image: until then a thread of it spins, half a core."""
         self.blender.render.use_persistent_data = False
 
     # Settings --------------------------------------------------------------------------------------------
@@ -123,7 +123,7 @@ class Studio:
         name = "plain"
         return self.bpy.data.materials.get(name) or self.bpy.data.materials.new(name)
 
-    # One picture -----------------------------------------------------------------------------------------
+    # One image -----------------------------------------------------------------------------------------
 
     def _expose(self, time: float, shutter: float | None) -> None:
         """Put objects where they are at a time, or key them over the exposure: from frame 0 to 2, 1 the middle."""

@@ -26,7 +26,7 @@ from arraygeom.rig import Rig
 from ...support.schema import to_document
 from ..check import check_views
 from ..flow import flow
-from ..rendered import RENDER_FILE, Frame, Rendered, frame_file, save_frame
+from ..rendered import RENDER_FILE, Rendered, RenderedFrame, frame_file, save_frame
 from ..scene import Scene
 from ..shapes import inside
 from . import compat
@@ -62,7 +62,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     refuse_inside(scene, rig, planned)
     with _staged(out) as folder, _studio(scene, settings) as studio:
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
-        first: dict[str, Frame] = {}
+        first: dict[str, RenderedFrame] = {}
         for shot in planned:
             frame = take(studio, rig[shot.camera], lenses[shot.camera], shot)
             file = frame_file(rig, shot.camera, shot.number)
@@ -85,7 +85,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
 def fitted(rig: Rig, settings: RenderSettings) -> Rig:
     """The rig at the size that is rendered. Raises ValueError for optics of cameras it does not have."""
     for name in settings.optics:
-        rig.known(name)
+        rig.require(name)
     if settings.width is None:
         return rig
     scale = settings.width / max(camera.hw[1] for camera in rig.cameras.values())
@@ -118,7 +118,7 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
                 )
 
 
-def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> Frame:
+def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> RenderedFrame:
     """One frame with the passes that the settings ask for. Raises ValueError if the camera sees nothing."""
     assert isinstance(camera, Camera)
     settings = studio.settings
@@ -129,9 +129,9 @@ def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> Frame:
     depth = torch.where(exact["Depth.Z"] < NOTHING, exact["Depth.Z"], torch.inf)
     if not (index > 0).any():
         raise ValueError(f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: turn it or move it")
-    frame = Frame(
+    frame = RenderedFrame(
         time=shot.time,
-        rgb=lens.picture(_stack(colours, "Combined", "RGB")),
+        rgb=lens.resampled(_stack(colours, "Combined", "RGB")),
         depth=lens.depth(depth, index),
         index=lens.nearest(index[None].float())[0].int(),
     )
@@ -145,7 +145,7 @@ def _further(
     lens: Lens,
     shot: Shot,
     optics: Optics,
-    frame: Frame,
+    frame: RenderedFrame,
     colours: dict[str, Tensor],
     exact: dict[str, Tensor],
 ) -> dict[str, Tensor]:
@@ -156,15 +156,15 @@ def _further(
     if "flow" in wanted:
         found["flow"] = flow(studio.scene, camera, frame, shot.step)
     if "alpha" in wanted:
-        found["alpha"] = lens.picture(colours["Combined.A"][None]).clamp(0, 1)
+        found["alpha"] = lens.resampled(colours["Combined.A"][None]).clamp(0, 1)
     if "nir" in wanted:
         infrared = studio.colours(lens.pinhole, shot.time, optics, "nir")
-        found["nir"] = lens.picture(infrared["Combined.R"][None])
+        found["nir"] = lens.resampled(infrared["Combined.R"][None])
     return found
 
 
 def _is_exact(settings: RenderSettings, optics: Optics) -> bool:
-    """Whether a picture's own depth and normals are exact: no blur, no bumps asked for, and rendered by Cycles."""
+    """Whether an image's own depth and normals are exact: no blur, no bumps asked for, and rendered by Cycles."""
     blurred = optics.f_number is not None or optics.shutter is not None
     return not blurred and settings.engine == "cycles" and "normals" not in settings.passes
 

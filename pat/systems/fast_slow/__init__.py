@@ -28,7 +28,7 @@ def record_scene(stage: Stage) -> Recording:
     times = {name: frame_times(stage, name) for name in rig.names}
     velocity, layer = object_velocity(stage)
     raw: dict[str, list[Tensor]] = {name: [] for name in rig.names}
-    truth = []
+    ground_truth = []
     for name in rig.names:
         for time in times[name]:
             lit = record(stage.seen(name, stage.moved(layer, velocity * time))[0], (Linear(),), generator).image
@@ -36,8 +36,8 @@ def record_scene(stage: Stage) -> Recording:
             raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
             if name == stage.alpha:
                 bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
-                truth.append(coded(torch.cat(bands)))
-    return Recording(raw, truth)
+                ground_truth.append(coded(torch.cat(bands)))
+    return Recording(raw, ground_truth)
 
 
 def frame_times(stage: Stage, name: str) -> list[float]:
@@ -48,7 +48,7 @@ def frame_times(stage: Stage, name: str) -> list[float]:
 
 
 def object_velocity(stage: Stage) -> tuple[Tensor, int]:
-    """Metres a second in alpha's frame, and which layer moves: a thing that covers about a seventh of the picture."""
+    """Metres a second in alpha's frame, and which layer moves: a thing that covers about a seventh of the image."""
     things = stage.shares() * (~stage.scene.solid[0])
     layer = int((things - 0.14).abs().argmin())
     depth = float(stage.seen(stage.alpha)[1].median())

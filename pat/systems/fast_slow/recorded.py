@@ -10,7 +10,7 @@ from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
-from pat.fusion.results import FusedFrame, save_frame, save_panels
+from pat.fusion.results import Frame, save_frame, save_panels
 from pat.fusion.sequence import SequenceFusion, flicker
 from pat.media.colour import luminance_of
 from pat.media.images import read_image
@@ -27,11 +27,11 @@ DETAIL = (slice(300, 800), slice(600, 1200))
 
 
 def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], None]) -> Result:
-    """Fuse the seven frames with and without carrying colour; write pictures, a video and scores.md.
+    """Fuse the seven frames with and without carrying colour; write images, a video and scores.md.
 
     Frame 141 is taken to be of the time of slow frame 4, and the rates to be the paper's: offsets are not published.
     """
-    say("fitting the lines of each pair to points seen in both pictures")
+    say("fitting the lines of each pair to points seen in both images")
     array = fast_and_slow_array(folder)
     rig, frames = clocked(array.rig), recorded_frames(folder)
     field = HomographyDisplacement(array.displacement)
@@ -61,14 +61,14 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
     raw |= {name: [read_image(folder / SCENE / f"{name}_{i}.png") for i in SLOW_FRAMES] for name in SLOW}
     first = luminance_of(raw[FAST][0]).flatten()
     gain = 1 / float(first.sort().values[int(0.995 * len(first))])
-    return {n: [_coded(p, gain if n == FAST else 1.0) for p in pictures] for n, pictures in raw.items()}
+    return {n: [_coded(p, gain if n == FAST else 1.0) for p in images] for n, images in raw.items()}
 
 
-def _coded(picture: Tensor, gain: float) -> Tensor:
-    return record(luminance_of(picture)[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
+def _coded(image: Tensor, gain: float) -> Tensor:
+    return record(luminance_of(image)[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
 
 
-def _table(fused: list[FusedFrame], alone: list[FusedFrame], greys: list[Tensor]) -> str:
+def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:
     carried, single = (1000 * flicker([f.image for f in frames], greys) for frames in (fused, alone))
     return (
         "| | flicker x 1000 |\n| --- | ---: |\n"
@@ -78,7 +78,7 @@ def _table(fused: list[FusedFrame], alone: list[FusedFrame], greys: list[Tensor]
 
 
 def _write(
-    out: Path, array: Array, frames: dict[str, list[Tensor]], fused: list[FusedFrame], alone: list[FusedFrame]
+    out: Path, array: Array, frames: dict[str, list[Tensor]], fused: list[Frame], alone: list[Frame]
 ) -> list[Path]:
     for number, frame in zip(FAST_FRAMES, fused):
         save_frame(frame, out / "frames", name=str(number))

@@ -2,7 +2,7 @@
 
 The weights know nothing of the near infrared. Here each surface reflects it in a way of its own: the farthest (the
 sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes the visible
-picture alone. The truth is alpha's brightness with the colour differences that beta's colours have at alpha's view.
+image alone. The truth is alpha's brightness with the colour differences that beta's colours have at alpha's view.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ def record_scene(stage: Stage) -> Recording:
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
     colour = record(other, (Noise(6_000, 3), Clip()), generator).image
-    truth = from_luma_chroma(coded(infrared[0]), to_luma_chroma(coded(own[0]))[1])
-    return Recording({"nir": [nir[0]], "colour": [colour[0]]}, [truth.clamp(0, 1)])
+    ground_truth = from_luma_chroma(coded(infrared[0]), to_luma_chroma(coded(own[0]))[1])
+    return Recording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 
 
 def infrared_weights(stage: Stage) -> torch.Tensor:
@@ -44,7 +44,7 @@ def infrared_weights(stage: Stage) -> torch.Tensor:
     return weights
 
 
-def hazed(picture: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """Linear light of a visible picture, with the air's own light in it by distance."""
-    clear = record(picture, (Linear(),), torch.Generator()).image
+def hazed(image: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
+    """Linear light of a visible image, with the air's own light in it by distance."""
+    clear = record(image, (Linear(),), torch.Generator()).image
     return torch.lerp(torch.full_like(clear, 0.6), clear, torch.exp(-HAZE * depth))

@@ -23,17 +23,17 @@ FOCUS, FOCAL_LENGTH, F_NUMBER, PITCH = 7.0, 0.025, 4.0, 1.85e-6
 
 def record_scene(stage: Stage) -> Recording:
     """One frame."""
-    picture, depth = stage.seen("narrow")
+    image, depth = stage.seen("narrow")
     generator = stage.generator("record")
-    sharp = record(picture, (Linear(),), generator).image
-    truth = defocused(sharp, depth, stage.rig)
-    tele = record(luminance(truth), (Noise(10_000, 3), Clip()), generator).image
+    sharp = record(image, (Linear(),), generator).image
+    ground_truth = defocused(sharp, depth, stage.rig)
+    tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator).image
     wide = record(stage.seen("wide")[0], (Linear(), Noise(6_000, 3), Clip()), generator).image
-    return Recording({"narrow": [tele[0]], "wide": [mosaic(wide[0], "RGGB")]}, [coded(truth[0])])
+    return Recording({"narrow": [tele[0]], "wide": [mosaic(wide[0], "RGGB")]}, [coded(ground_truth[0])])
 
 
 def defocused(image: Tensor, depth: Tensor, rig: Rig) -> Tensor:
-    """The picture through alpha's lens: blurred by the thin lens's circle for each pixel's depth."""
+    """The image through alpha's lens: blurred by the thin lens's circle for each pixel's depth."""
     scale = rig["narrow"].hw[1] / 4024
     circle = FOCAL_LENGTH**2 / F_NUMBER / (FOCUS - FOCAL_LENGTH) * (depth - FOCUS).abs() / depth
     sigma = circle / PITCH * scale / 4

@@ -92,8 +92,8 @@ def test_derivatives_of_blocks(kind):
 
 def test_perfect_corners_give_back_the_truth():
     rig, boards = four_cameras(), board_poses(10)
-    truth = scene_of(rig, boards, see(rig, boards))
-    fit = adjust(shaken(truth, 1.0), free_of(truth))
+    ground_truth = scene_of(rig, boards, see(rig, boards))
+    fit = adjust(shaken(ground_truth, 1.0), free_of(ground_truth))
     assert fit.converged
     assert fit.scene.rms() < 1e-6
     for name, c in fit.scene.cameras.items():
@@ -188,8 +188,8 @@ def test_the_covariance_is_true():
     rig, boards = four_cameras(), board_poses(24)
     squares, relative, worst = [], [], []
     for draw in range(30):
-        truth = scene_of(rig, boards, see(rig, boards, noise=0.15, seed=draw))
-        fit = adjust(truth, free_of(truth))
+        ground_truth = scene_of(rig, boards, see(rig, boards, noise=0.15, seed=draw))
+        fit = adjust(ground_truth, free_of(ground_truth))
         error = errors_of(fit, rig)
         squares.append(error @ np.linalg.solve(fit.covariance, error))
         relative.append(error / np.sqrt(fit.covariance.diagonal()))

@@ -47,11 +47,11 @@ def test_a_pair_is_found_within_its_uncertainty(pair, found):
     rig, deviations = pair[0], found.deviations()
     assert found.rms == pytest.approx(0.1 * 2**0.5, rel=0.1)
     for name in rig.names:
-        c, truth = found.rig[name], rig[name]
+        c, ground_truth = found.rig[name], rig[name]
         for entry, a, b in (
-            *((f"focal.{i}", c.K[i, i], truth.K[i, i]) for i in range(2)),
-            *((f"centre.{i}", c.K[i, 2], truth.K[i, 2]) for i in range(2)),
-            *((f"translation.{i}", c.t[i], truth.t[i]) for i in range(3)),
+            *((f"focal.{i}", c.K[i, i], ground_truth.K[i, i]) for i in range(2)),
+            *((f"centre.{i}", c.K[i, 2], ground_truth.K[i, 2]) for i in range(2)),
+            *((f"translation.{i}", c.t[i], ground_truth.t[i]) for i in range(3)),
         ):
             assert abs(float(a - b)) <= 4 * deviations.get(f"{name}.{entry}", 0.0), (name, entry)
 
@@ -98,7 +98,7 @@ def test_the_report_holds_the_figures_and_escapes_names(found):
 
 
 def test_chessboards_that_are_numbered_from_either_end(pair):
-    """Half a turn of the numbering in some pictures of one camera is found out."""
+    """Half a turn of the numbering in some images of one camera is found out."""
     rig, boards, _ = pair
     turn = CHESS.symmetries[1]
     views = see(rig, boards, CHESS, noise=0.1)
@@ -157,7 +157,7 @@ def test_mirrored_sets_are_refused(pair):
 
 
 def test_boards_that_move_between_the_exposures_do_not_bend_the_lenses(pair):
-    """Frames a moment apart: intrinsics stay what each camera's own pictures tell, and the note says so."""
+    """Frames a moment apart: intrinsics stay what each camera's own images tell, and the note says so."""
     rig, boards, views = pair
     moved = Pose(boards.R, boards.t + torch.from_numpy(np.random.default_rng(0).normal(0, 0.004, (10, 3))))
     views = {"mono": views["mono"], "colour": see(rig, moved, noise=0.1)["colour"]}
@@ -171,8 +171,8 @@ def test_boards_that_move_between_the_exposures_do_not_bend_the_lenses(pair):
     assert len(set(result.fit.sigma.values())) == 1
 
 
-def test_one_picture_is_too_few(pair):
-    with pytest.raises(ValueError, match=re.escape("mono: the board is found in 1 of its pictures")):
+def test_one_image_is_too_few(pair):
+    with pytest.raises(ValueError, match=re.escape("mono: the board is found in 1 of its images")):
         calibrate(kept(pair[2], mono=[0]), BOARD)
 
 
@@ -183,7 +183,7 @@ def test_parallel_boards_are_refused():
         calibrate(see(Rig({"cam": c}), boards), BOARD)
 
 
-def test_what_pictures_do_not_tell_is_left_alone():
+def test_what_images_do_not_tell_is_left_alone():
     """A long lens hardly bends: k2 and k3 stay 0, and the sentence says so; the coverage names what is missing."""
     c = camera(4000.0, (480, 640), lens=(0.0, 0.0, 0.0, 0.0, 0.0))
     board = parse_board("charuco:9x7:20mm")
@@ -192,7 +192,7 @@ def test_what_pictures_do_not_tell_is_left_alone():
     views = see(Rig({"tele": c}), Pose(boards.R, boards.t + shift), board, noise=0.1)
     result = calibrate(views, board)
     assert result.rig["tele"].distortion.coefficients[[1, 4]].tolist() == [0, 0]
-    assert any("tele: the lens's k3 is kept at 0: the pictures do not tell it" in note for note in result.notes)
+    assert any("tele: the lens's k3 is kept at 0: the images do not tell it" in note for note in result.notes)
     assert "tele.distortion.4" not in result.deviations()
 
 
@@ -227,7 +227,7 @@ def test_coverage_names_what_is_missing():
     assert found.depths == pytest.approx((2.0, 2.0))
     assert found.tilts[1] == pytest.approx(0, abs=1e-6)
     assert [m.split(" (")[0].split(":")[0] for m in found.missing] == [
-        "no points at the top left, top, top right, left, right, bottom left, bottom, bottom right of the picture",
+        "no points at the top left, top, top right, left, right, bottom left, bottom, bottom right of the image",
         "boards at one depth only",
         "boards tilted by 0 degrees at most",
     ]

@@ -21,11 +21,11 @@ def seen(text, *, noise=1.5):
     board = parse_board(text)
     R = rotation_from_vector(torch.deg2rad(tensor(24.0, -28.0, 9.0)))
     pose = Pose(R, tensor(0.01, -0.005, 0.34) - R @ tensor(*board.points.mean(0)))
-    picture = photograph(CAMERA, pose, board, dpi=240).astype(float)
-    grey = (picture + RANDOM.normal(0, noise, picture.shape)).round().clip(0, 255).astype(np.uint8)
-    truth = CAMERA.project(pose.apply(torch.from_numpy(board.points))).x.numpy()
-    inside = ((truth > 12) & (truth < np.array(grey.shape)[::-1] - 13)).all(1)
-    return grey, truth[inside], board.points[inside, :2] / board.spacing
+    image = photograph(CAMERA, pose, board, dpi=240).astype(float)
+    grey = (image + RANDOM.normal(0, noise, image.shape)).round().clip(0, 255).astype(np.uint8)
+    ground_truth = CAMERA.project(pose.apply(torch.from_numpy(board.points))).x.numpy()
+    inside = ((ground_truth > 12) & (ground_truth < np.array(grey.shape)[::-1] - 13)).all(1)
+    return grey, ground_truth[inside], board.points[inside, :2] / board.spacing
 
 
 def rms(error):
@@ -34,51 +34,51 @@ def rms(error):
 
 @pytest.mark.parametrize("text", list(CLEAR))
 def test_corners_return_from_a_pixel_off(text):
-    grey, truth, p = seen(text)
-    start = truth + RANDOM.normal(0, 0.5, truth.shape)
+    grey, ground_truth, p = seen(text)
+    start = ground_truth + RANDOM.normal(0, 0.5, ground_truth.shape)
     found, good = refine_corners(grey, start, p, clear=CLEAR[text])
     by_gradients = cv2.cornerSubPix(
-        grey, truth.astype(np.float32)[:, None].copy(), (3, 3), (-1, -1), (3, 60, 1e-4)
+        grey, ground_truth.astype(np.float32)[:, None].copy(), (3, 3), (-1, -1), (3, 60, 1e-4)
     ).reshape(-1, 2)
     assert good.mean() > 0.95
-    off = np.linalg.norm((found - truth)[good], axis=1)
+    off = np.linalg.norm((found - ground_truth)[good], axis=1)
     assert np.median(off) < 0.012
-    assert rms((found - truth)[good]) < 0.04
-    assert np.abs((found - truth)[good].mean(0)).max() < 0.01
-    assert np.median(off) < 0.3 * np.median(np.linalg.norm(by_gradients - truth, axis=1))
+    assert rms((found - ground_truth)[good]) < 0.04
+    assert np.abs((found - ground_truth)[good].mean(0)).max() < 0.01
+    assert np.median(off) < 0.3 * np.median(np.linalg.norm(by_gradients - ground_truth, axis=1))
 
 
 @pytest.mark.parametrize(("change", "pixels"), [(lambda v: 255 * (v / 255) ** 0.4, 0.04), (lambda v: 255 - v, 0.012)])
 def test_gamma_and_inversion_hardly_move_corners(change, pixels):
-    grey, truth, p = seen("chessboard:9x6:25mm", noise=0.0)
-    found, good = refine_corners(change(grey.astype(float)).round().astype(np.uint8), truth, p)
+    grey, ground_truth, p = seen("chessboard:9x6:25mm", noise=0.0)
+    found, good = refine_corners(change(grey.astype(float)).round().astype(np.uint8), ground_truth, p)
     assert good.all()
-    assert np.median(np.linalg.norm(found - truth, axis=1)) < pixels
+    assert np.median(np.linalg.norm(found - ground_truth, axis=1)) < pixels
 
 
 def test_a_hidden_corner_is_named_and_the_others_stay():
-    grey, truth, p = seen("charuco:9x7:25mm")
-    hidden = len(truth) // 2
-    cv2.circle(grey, np.rint(truth[hidden]).astype(int).tolist(), 9, 120, -1)
-    found, good = refine_corners(grey, truth, p, clear=0.125)
+    grey, ground_truth, p = seen("charuco:9x7:25mm")
+    hidden = len(ground_truth) // 2
+    cv2.circle(grey, np.rint(ground_truth[hidden]).astype(int).tolist(), 9, 120, -1)
+    found, good = refine_corners(grey, ground_truth, p, clear=0.125)
     assert not good[hidden]
     assert good.sum() >= len(good) - 3
-    assert rms((found - truth)[good]) < 0.04
-    assert (found[hidden] == truth[hidden]).all()
+    assert rms((found - ground_truth)[good]) < 0.04
+    assert (found[hidden] == ground_truth[hidden]).all()
 
 
 def test_corners_too_close_to_see_are_left_alone():
     small = cv2.resize(seen("chessboard:9x6:25mm")[0], (60, 45), interpolation=cv2.INTER_AREA)
-    _, truth, p = seen("chessboard:9x6:25mm")
-    x = truth * 60 / 640
+    _, ground_truth, p = seen("chessboard:9x6:25mm")
+    x = ground_truth * 60 / 640
     found, good = refine_corners(small, x, p)
     assert not good.any()
     assert (found == x).all()
 
 
 def test_the_map_of_the_board_is_smooth_and_minds_no_outlier():
-    _, truth, p = seen("charuco:9x7:25mm")
-    off = truth.copy()
+    _, ground_truth, p = seen("charuco:9x7:25mm")
+    off = ground_truth.copy()
     off[5] += 20
     board = smooth_map(p, off, np.ones(len(p), dtype=bool))
-    assert rms(board(p) - truth) < 0.1
+    assert rms(board(p) - ground_truth) < 0.1

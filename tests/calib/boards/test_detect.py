@@ -1,4 +1,4 @@
-"""Finding boards: exact under perspective and lens, in dim, inverted and 16-bit pictures; why they are not found."""
+"""Finding boards: exact under perspective and lens, in dim, inverted and 16-bit images; why they are not found."""
 
 import cv2
 import numpy as np
@@ -19,7 +19,7 @@ def pose(board, turn=(18.0, -22.0, 7.0), depth=0.5):
     return Pose(R, tensor(0.01, -0.01, depth) - R @ tensor(*board.points.mean(0)))
 
 
-def picture(text, **changes):
+def image(text, **changes):
     board = parse_board(text)
     return photograph(CAMERA, pose(board, **changes), board), board
 
@@ -34,12 +34,12 @@ def picture(text, **changes):
     ],
 )
 def test_points_are_where_the_lens_puts_them(text, pixels):
-    grey, board = picture(text)
+    grey, board = image(text)
     found = detect(grey, board)
     assert found is not None
     assert len(found.ids) == len(board.points)
-    truth = CAMERA.project(pose(board).apply(torch.from_numpy(board.points))).x.numpy()
-    errors = [np.linalg.norm(found.x - truth[image[found.ids]], axis=1) for image in board.symmetries]
+    ground_truth = CAMERA.project(pose(board).apply(torch.from_numpy(board.points))).x.numpy()
+    errors = [np.linalg.norm(found.x - ground_truth[order[found.ids]], axis=1) for order in board.symmetries]
     assert min(np.sqrt((e**2).mean()) for e in errors) < pixels
 
 
@@ -58,8 +58,8 @@ def test_points_are_where_the_lens_puts_them(text, pixels):
         ("colour", lambda g: np.stack([g, g // 2, g // 3], -1)),
     ],
 )
-def test_pictures_of_odd_cameras(text, name, change):
-    grey, board = picture(text)
+def test_images_of_odd_cameras(text, name, change):
+    grey, board = image(text)
     found = detect(to_grey(change(grey)), board)
     assert found is not None, name
     reference = detect(grey, board)
@@ -67,7 +67,7 @@ def test_pictures_of_odd_cameras(text, name, change):
 
 
 def test_a_part_of_a_charuco_board_is_enough():
-    grey, board = picture("charuco:8x6:30mm", depth=0.25)
+    grey, board = image("charuco:8x6:30mm", depth=0.25)
     found = detect(grey, board)
     assert 8 <= len(found.ids) < len(board.points)
 
@@ -88,14 +88,14 @@ def test_no_board_is_no_board():
     ],
 )
 def test_another_board_is_named(shown, asked, words):
-    grey, _ = picture(shown, turn=(8.0, -8.0, 0.0))
+    grey, _ = image(shown, turn=(8.0, -8.0, 0.0))
     board = parse_board(asked)
     assert detect(grey, board) is None
     assert words in explain([grey], board)
 
 
-def test_causes_in_the_picture_are_named():
-    grey, board = picture("charuco:8x6:30mm")
+def test_causes_in_the_image_are_named():
+    grey, board = image("charuco:8x6:30mm")
     mirrored = np.ascontiguousarray(grey[:, ::-1])
     assert detect(mirrored, board) is None
     assert "mirrored" in explain([mirrored], board)
@@ -105,7 +105,7 @@ def test_causes_in_the_picture_are_named():
 
 
 def test_a_larger_chessboard_is_noticed_though_a_part_of_it_is_found():
-    grey, board = picture("chessboard:9x6:25mm", turn=(8.0, -8.0, 0.0))
+    grey, board = image("chessboard:9x6:25mm", turn=(8.0, -8.0, 0.0))
     assert other_size([grey, grey], parse_board("chessboard:8x6:25mm")) == "9x6"
     assert other_size([grey, grey], board) is None
     assert other_size([grey, grey], parse_board("chessboard:6x9:25mm")) is None

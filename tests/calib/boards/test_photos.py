@@ -1,4 +1,4 @@
-"""Which picture belongs to which camera and moment."""
+"""Which image belongs to which camera and moment."""
 
 import re
 
@@ -13,9 +13,9 @@ from calib.boards.photos import find_photos, frame_keys
 
 def write(path, value=0, hw=(48, 64)):
     path.parent.mkdir(parents=True, exist_ok=True)
-    picture = np.full(hw, value, np.uint8)
-    picture[::8] = 255
-    cv2.imwrite(str(path), picture)
+    image = np.full(hw, value, np.uint8)
+    image[::8] = 255
+    cv2.imwrite(str(path), image)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_patterns_say_it_outright(tmp_path):
         write(tmp_path / f"{name}.png")
     photos = find_photos(tmp_path, patterns={"l": "*_L.png", "r": "*_R.png"})
     assert {n: list(m) for n, m in photos.items()} == {"l": [1, 2], "r": [1, 2]}
-    with pytest.raises(ValueError, match=re.escape("q: no picture or video in")):
+    with pytest.raises(ValueError, match=re.escape("q: no image or video in")):
         find_photos(tmp_path, patterns={"q": "*_Q.png"})
 
 
@@ -82,8 +82,8 @@ def test_videos_are_read_frame_by_frame(tmp_path):
 @pytest.mark.parametrize(
     ("files", "message"),
     [
-        ([], "no pictures or videos here"),
-        (["a/x01.png", "a/x1.png", "a/y.txt"], "a: two pictures have the same number"),
+        ([], "no images or videos here"),
+        (["a/x01.png", "a/x1.png", "a/y.txt"], "a: two images have the same number"),
     ],
 )
 def test_mistakes(files, message, tmp_path):
@@ -93,12 +93,12 @@ def test_mistakes(files, message, tmp_path):
         find_photos(tmp_path)
 
 
-def test_missing_folders_and_broken_pictures(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no such folder of pictures"):
+def test_missing_folders_and_broken_images(tmp_path):
+    with pytest.raises(FileNotFoundError, match="no such folder of images"):
         find_photos(tmp_path / "none")
     for i in (1, 2):
-        (tmp_path / f"a{i}.png").write_bytes(b"not a picture")
-    with pytest.raises(ValueError, match=re.escape("a1.png: not a picture that can be read")):
+        (tmp_path / f"a{i}.png").write_bytes(b"not an image")
+    with pytest.raises(ValueError, match=re.escape("a1.png: not an image that can be read")):
         find_photos(tmp_path)["a"][1].read()
     (tmp_path / "v").mkdir()
     (tmp_path / "v" / "x.mp4").write_bytes(b"not a video")

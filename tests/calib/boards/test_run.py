@@ -30,8 +30,8 @@ def photos(tmp_path_factory):
     for name, c in cameras.items():
         (folder / name).mkdir()
         for i in range(6):
-            picture = photograph(c, c.cam_from_world @ Pose(boards.R[i], boards.t[i]), parse_board(BOARD), dpi=60)
-            cv2.imwrite(str(folder / name / f"shot_{i:02d}.png"), picture)
+            image = photograph(c, c.cam_from_world @ Pose(boards.R[i], boards.t[i]), parse_board(BOARD), dpi=60)
+            cv2.imwrite(str(folder / name / f"shot_{i:02d}.png"), image)
     return folder
 
 
@@ -78,7 +78,7 @@ def test_no_board(mine, capsys):
         cv2.imwrite(str(path), np.full((220, 300), 90, np.uint8))
     message = fails(mine, capsys)
     assert "b: the board charuco:9x7:60mm" in message
-    assert "none of 6 pictures (shot_00.png, shot_01.png" in message
+    assert "none of 6 images (shot_00.png, shot_01.png" in message
     assert "hardly any contrast" in message
 
 
@@ -89,33 +89,31 @@ def test_wrong_size(mine, capsys):
 def test_mirrored(mine, capsys):
     for path in (mine / "b").iterdir():
         cv2.imwrite(str(path), cv2.imread(str(path))[:, ::-1])
-    assert "found once the picture is mirrored" in fails(mine, capsys)
+    assert "found once the image is mirrored" in fails(mine, capsys)
 
 
 def test_mixed_sizes(mine, capsys):
     path = mine / "a" / "shot_03.png"
     cv2.imwrite(str(path), cv2.resize(cv2.imread(str(path)), (640, 480)))
     message = fails(mine, capsys)
-    assert "a: its pictures differ in size" in message
+    assert "a: its images differ in size" in message
     assert "640x480 (shot_03.png)" in message
 
 
-def test_one_picture(mine, capsys):
+def test_one_image(mine, capsys):
     for path in sorted((mine / "a").iterdir())[1:]:
         path.unlink()
-    assert "a: the board is found in 1 of its pictures and 3 is the least" in fails(mine, capsys)
+    assert "a: the board is found in 1 of its images and 3 is the least" in fails(mine, capsys)
 
 
-def test_a_few_bad_pictures_are_named_and_left_out(mine, capsys):
+def test_a_few_bad_images_are_named_and_left_out(mine, capsys):
     cv2.imwrite(str(mine / "a" / "shot_02.png"), np.full((240, 320), 90, np.uint8))
     run(mine)
-    assert (
-        "a: no board in 1 of 6 pictures (shot_02.png): the pictures have hardly any contrast" in capsys.readouterr().out
-    )
+    assert "a: no board in 1 of 6 images (shot_02.png): the images have hardly any contrast" in capsys.readouterr().out
 
 
 def test_other_mistakes(mine, capsys):
-    assert "no such folder of pictures" in fails(mine / "none", capsys)
+    assert "no such folder of images" in fails(mine / "none", capsys)
     assert "--camera: 'left' is not NAME=FILE" in fails(mine, capsys, "--camera", "left")
     assert "0 < near <= far" in fails(mine, capsys, "--depth", "3", "1")
     assert "is not understood: write it like" in fails(mine, capsys, board="charuko:8x6:30mm")
@@ -123,12 +121,12 @@ def test_other_mistakes(mine, capsys):
 
 def test_videos(mine):
     for name in ("a", "b"):
-        pictures = [cv2.imread(str(p)) for p in sorted((mine / name).iterdir())]
+        images = [cv2.imread(str(p)) for p in sorted((mine / name).iterdir())]
         shutil.rmtree(mine / name)
-        video = cv2.VideoWriter(str(mine / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, pictures[0].shape[1::-1])
+        video = cv2.VideoWriter(str(mine / f"{name}.avi"), cv2.VideoWriter_fourcc(*"MJPG"), 5, images[0].shape[1::-1])
         video.set(cv2.VIDEOWRITER_PROP_QUALITY, 98)
-        for picture in pictures:
-            video.write(picture)
+        for image in images:
+            video.write(image)
         video.release()
     run(mine)
     assert float(Rig.load(mine / "out" / "rig.yaml")["b"].centre[0]) == pytest.approx(0.15, abs=5e-3)
@@ -146,8 +144,8 @@ def test_photographs_of_four_cameras(tmp_path):
         rays = fine_rays(c)
         for i in range(16):
             pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
-            picture = photograph(c, pose, parse_board(BOARD), dpi=100, rays=rays) + random.normal(0, 2, c.hw)
-            cv2.imwrite(str(tmp_path / name / f"{i}.png"), picture.clip(0, 255).round().astype(np.uint8))
+            image = photograph(c, pose, parse_board(BOARD), dpi=100, rays=rays) + random.normal(0, 2, c.hw)
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image.clip(0, 255).round().astype(np.uint8))
     found = collect_folder(tmp_path, parse_board(BOARD))
     result = calibrate({name: found.views[name] for name in rig.names}, parse_board(BOARD))
     error = errors_of(result.fit, rig) / np.sqrt(result.fit.covariance.diagonal())

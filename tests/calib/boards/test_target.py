@@ -116,7 +116,7 @@ def test_files_have_the_true_size(tmp_path):
     assert sorted(float(v) for v in size.groups() if v) == pytest.approx(sorted([width, height]), abs=0.01)
 
 
-def test_a_picture_is_no_print(tmp_path):
+def test_a_image_is_no_print(tmp_path):
     with pytest.raises(ValueError, match="keep its true size"):
         write_board("charuco:8x6:30mm", tmp_path / "b.png")
 

@@ -12,7 +12,7 @@ from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.mistakes import TRANSPOSE, on_cameras, swap
 from pat.cli.main import main
 from pat.media.images import write_image
-from tests.calib.scenes import rectified_pair, rectified_pictures, seen_points, texture, unlike_pair, vector
+from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
 
 
 def sizes(rig):
@@ -49,7 +49,7 @@ MISTAKES = {
 
 
 def same_size(rig: Rig) -> Rig:
-    """The pair with pictures of one size, so that swapping them does not show in their sizes."""
+    """The pair with images of one size, so that swapping them does not show in their sizes."""
     return rig.with_camera("second", rig["second"].replace(hw=rig["first"].hw))
 
 
@@ -112,7 +112,7 @@ def test_drift_is_no_mistake():
 
 
 def test_what_cannot_be_told_apart_is_said():
-    """Equal cameras side by side: an inverted pose is the same as pictures swapped."""
+    """Equal cameras side by side: an inverted pose is the same as images swapped."""
     rig = rectified_pair()
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
     kinds = {found.named.kind, *(remedy.kind for remedy in found.equal)}
@@ -134,7 +134,7 @@ def test_an_f_of_which_one_side_counts_from_one():
 
 
 @pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "turned or mirrored")])
-def test_pictures_of_another_size(hw, kind):
+def test_images_of_another_size(hw, kind):
     rig = unlike_pair()
     true = rig.resize("first", hw) if kind == "resized" else rig.turn("first", 1)
     found = diagnose_matches(rig, sizes(true), seen_points(true))
@@ -143,8 +143,8 @@ def test_pictures_of_another_size(hw, kind):
     assert found.after.misfit < 0.1
 
 
-def test_pictures_tell_a_mirrored_one():
-    rig, images = rectified_pair(), rectified_pictures()
+def test_images_tell_a_mirrored_one():
+    rig, images = rectified_pair(), rectified_images()
     assert diagnose(rig, images).healthy
     found = diagnose(rig, images | {"right": images["right"].flip(-2)})
     assert "mirrored top to bottom" in found.named.words
@@ -152,10 +152,10 @@ def test_pictures_tell_a_mirrored_one():
 
 
 def test_bad_input_is_one_clear_line():
-    rig, images = rectified_pair(), rectified_pictures()
+    rig, images = rectified_pair(), rectified_images()
     with pytest.raises(ValueError, match="two cameras or more"):
         diagnose(rig, {"left": images["left"]})
-    with pytest.raises(ValueError, match="same picture"):
+    with pytest.raises(ValueError, match="same image"):
         diagnose(rig, {"left": images["left"], "right": images["left"]})
     with pytest.raises(ValueError, match="do the cameras see the same things"):
         diagnose(rig, images | {"right": texture(seed=5)})
@@ -164,10 +164,10 @@ def test_bad_input_is_one_clear_line():
 
 
 def test_command_line(tmp_path, capsys):
-    rig, images = rectified_pair(), rectified_pictures()
+    rig, images = rectified_pair(), rectified_images()
     files = [f"--image={name}={tmp_path / name}.png" for name in images]
-    for name, picture in images.items():
-        write_image(tmp_path / f"{name}.png", picture)
+    for name, image in images.items():
+        write_image(tmp_path / f"{name}.png", image)
     each(posed(Pose.inverse))(rig).save(tmp_path / "rig.yaml")
     main(["rig", "doctor", str(tmp_path / "rig.yaml"), *files, "--fix", str(tmp_path / "fixed.yaml")])
     assert "likely mistake" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Rigs from pictures alone."""
+"""Rigs from images alone."""
 
 import pytest
 
@@ -7,11 +7,11 @@ from calib.images.from_images import start
 from calib.images.refine import line_distances
 from pat.cli.main import main
 from pat.media.images import write_image
-from tests.calib.scenes import rectified_pair, rectified_pictures, seen_points, texture
+from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture
 
 
-def test_lines_and_map_come_from_pictures_alone():
-    images = rectified_pictures()
+def test_lines_and_map_come_from_images_alone():
+    images = rectified_images()
     found = start(images)
     points = seen_points(rectified_pair(), near=3.0, far=5.5, noise=0.0)
     assert line_distances(found.rig, points).abs().median() < 0.5
@@ -21,24 +21,24 @@ def test_lines_and_map_come_from_pictures_alone():
 
 
 def test_focal_lengths_are_used_where_they_help():
-    found = start(rectified_pictures(), focal={"left": 310.0, "right": 290.0})
+    found = start(rectified_images(), focal={"left": 310.0, "right": 290.0})
     points = seen_points(rectified_pair(), near=3.0, far=5.5, noise=0.0)
     assert line_distances(found.rig, points).abs().median() < 0.5
 
 
 def test_bad_input_is_one_clear_line():
-    images = rectified_pictures()
+    images = rectified_images()
     with pytest.raises(ValueError, match="two cameras or more"):
         start({"left": images["left"]})
     with pytest.raises(ValueError, match="do the cameras see the same things"):
         start(images | {"right": texture(seed=5)})
-    with pytest.raises(ValueError, match="no camera with a picture"):
+    with pytest.raises(ValueError, match="no camera with an image"):
         start(images, focal={"middle": 300.0})
 
 
 def test_command_line(tmp_path, capsys):
-    for name, picture in rectified_pictures().items():
-        write_image(tmp_path / f"{name}.png", picture)
+    for name, image in rectified_images().items():
+        write_image(tmp_path / f"{name}.png", image)
     files = [f"--image={name}={tmp_path / name}.png" for name in ("left", "right")]
     main(["rig", "start", *files, "--out", str(tmp_path / "rig.yaml")])
     assert "left > right" in capsys.readouterr().out

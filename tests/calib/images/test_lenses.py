@@ -27,7 +27,7 @@ from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import read_image
 from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW_FRAME, published_matrices
-from tests.calib.scenes import rectified_pair, rectified_pictures, seen_points, vector
+from tests.calib.scenes import rectified_images, rectified_pair, seen_points, vector
 
 HW = (480, 640)
 NAMES = ("a", "b")
@@ -108,7 +108,7 @@ def test_bending_is_what_no_straight_camera_does():
     assert float(bending(rig["a"])) < 1e-6
     view = rig["a"].replace(distortion=Distortion("brown-conrady", vector(0.05, 0, 0, 0)))
     corner = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
-    moved = float((view.straighten(corner)[0] - corner).norm())
+    moved = float((view.undistort(corner)[0] - corner).norm())
     assert 0.1 * moved < float(bending(view)) < 0.7 * moved
 
 
@@ -121,7 +121,7 @@ def test_the_doctor_takes_lenses_of_uncalibrated_cameras_as_they_are():
 
 def test_the_fusions_error_sees_through_lenses():
     """The rectified pair behind a lens, known by F alone: its error is least for the true lens, and says which way."""
-    images = rectified_pictures()
+    images = rectified_images()
     rig = rectified_pair()
     F = rig.pair("left", "right").fundamental
     H = torch.tensor([[1, 0, -15.0], [0, 1, 0], [0, 0, 1]], dtype=torch.float64)
@@ -145,7 +145,7 @@ def test_the_fusions_error_sees_through_lenses():
 
 @pytest.mark.slow
 def test_the_papers_array_through_the_commands(shared_data, tmp_path, capsys):
-    """Published F's are 1.5 to 2 px off; no F fits these pictures to less than 0.4: their lenses bend."""
+    """Published F's are 1.5 to 2 px off; no F fits these images to less than 0.4: their lenses bend."""
     folder = shared_data / "hfr_lfr"
     files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
     links = {}
@@ -154,10 +154,10 @@ def test_the_papers_array_through_the_commands(shared_data, tmp_path, capsys):
         links[FAST, name] = Link(F)
     images = {name: read_image(file) for name, file in files.items()}
     Rig({n: View(hw=tuple(p.shape[1:])) for n, p in images.items()}, links=links).save(tmp_path / "published.yaml")
-    pictures = [f"--image={name}={file}" for name, file in files.items()]
-    main(["rig", "refine", str(tmp_path / "published.yaml"), *pictures, "--out", str(tmp_path / "better.yaml")])
+    arguments = [f"--image={name}={file}" for name, file in files.items()]
+    main(["rig", "refine", str(tmp_path / "published.yaml"), *arguments, "--out", str(tmp_path / "better.yaml")])
     assert "lenses bend lines" in capsys.readouterr().out
-    main(["rig", "start", *pictures, "--out", str(tmp_path / "started.yaml")])
+    main(["rig", "start", *arguments, "--out", str(tmp_path / "started.yaml")])
     points = match_cameras(images)
     for file in ("better.yaml", "started.yaml"):
         rig = Rig.load(tmp_path / file)

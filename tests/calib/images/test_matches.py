@@ -14,8 +14,8 @@ HW = (240, 320)
 def texture(hw=HW, seed=0):
     """Blobs of many sizes, (1, H, W)."""
     noise = np.random.default_rng(seed).standard_normal(hw).astype(np.float32)
-    picture = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
-    return torch.from_numpy((picture - picture.min()) / np.ptp(picture))[None]
+    image = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
+    return torch.from_numpy((image - image.min()) / np.ptp(image))[None]
 
 
 def rig_of(depth=(1.0, 9.0)) -> Rig:
@@ -40,16 +40,16 @@ def seen_points(rig, *, count=300, near=2.0, far=6.0, noise=0.0):
 
 def test_matches_follow_a_known_map():
     H = np.array([[0.8, 0.05, 20.0], [-0.05, 0.8, 30.0], [0, 0, 1.0]])
-    picture = texture()
-    moved = torch.from_numpy(cv2.warpPerspective(picture[0].numpy(), H, (300, 220), flags=cv2.INTER_AREA))[None]
-    matches = match_points(picture, 0.3 + 0.5 * moved)
+    image = texture()
+    moved = torch.from_numpy(cv2.warpPerspective(image[0].numpy(), H, (300, 220), flags=cv2.INTER_AREA))[None]
+    matches = match_points(image, 0.3 + 0.5 * moved)
     assert len(matches.alpha) > 50
     off = apply_homography(torch.from_numpy(H), matches.alpha).x - matches.beta
     assert off.norm(dim=-1).median() < 0.5
     assert off.mean(0).abs().max() < 0.15
 
 
-def test_flat_pictures_have_no_matches():
+def test_flat_images_have_no_matches():
     assert len(match_points(torch.full((1, 60, 60), 0.5), texture()).alpha) == 0
 
 

@@ -14,11 +14,11 @@ RANDOM = np.random.default_rng(0)
 
 
 def warped(hw=(240, 320)):
-    """A picture and how a second camera sees it: y = A x + shift, darker and flatter, with noise."""
-    picture = (texture(hw, seed=3)[0].numpy() * 255).astype(np.float32)
-    there = cv2.warpAffine(picture, np.c_[A, SHIFT], hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
-    pictures = picture, 0.6 * there + 20
-    return [(p + RANDOM.normal(0, 0.7, hw)).round().clip(0, 255).astype(np.uint8) for p in pictures]
+    """An image and how a second camera sees it: y = A x + shift, darker and flatter, with noise."""
+    image = (texture(hw, seed=3)[0].numpy() * 255).astype(np.float32)
+    there = cv2.warpAffine(image, np.c_[A, SHIFT], hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
+    images = image, 0.6 * there + 20
+    return [(p + RANDOM.normal(0, 0.7, hw)).round().clip(0, 255).astype(np.uint8) for p in images]
 
 
 def points():
@@ -28,9 +28,9 @@ def points():
 def test_points_return_to_where_they_are_seen():
     alpha, beta = warped()
     x = points()
-    truth = x @ A.T + SHIFT
-    found = sharpened(alpha, beta, x, truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1))).y
-    off = np.linalg.norm(found - truth, axis=1)
+    ground_truth = x @ A.T + SHIFT
+    found = sharpened(alpha, beta, x, ground_truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1))).y
+    off = np.linalg.norm(found - ground_truth, axis=1)
     assert np.median(off) < 0.05
     assert (off < 0.15).mean() > 0.95
 
@@ -59,11 +59,11 @@ def test_deviations_tell_good_points_from_bad_ones():
     flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]
     noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]
     x = points()
-    truth = x @ A.T + SHIFT
-    found = sharpened(*noisy, x, truth + RANDOM.normal(0, 0.3, x.shape), np.tile(A, (60, 1, 1)))
-    left = (x[:, 0] < 140) & (truth[:, 0] < 140) & np.isfinite(found.deviation)
-    right = (x[:, 0] > 180) & (truth[:, 0] > 180)
+    ground_truth = x @ A.T + SHIFT
+    found = sharpened(*noisy, x, ground_truth + RANDOM.normal(0, 0.3, x.shape), np.tile(A, (60, 1, 1)))
+    left = (x[:, 0] < 140) & (ground_truth[:, 0] < 140) & np.isfinite(found.deviation)
+    right = (x[:, 0] > 180) & (ground_truth[:, 0] > 180)
     assert np.median(found.deviation[right]) > 4 * np.median(found.deviation[left])
-    assert np.median(np.linalg.norm(found.y - truth, axis=1)[left]) < 3 * np.median(found.deviation[left])
+    assert np.median(np.linalg.norm(found.y - ground_truth, axis=1)[left]) < 3 * np.median(found.deviation[left])
     alike, *_ = warped()
     assert np.isinf(sharpened(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean() > 0.9

@@ -15,7 +15,7 @@ from calib.images.residuals import epipolar_residuals
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import write_image
-from tests.calib.scenes import HW, rectified_pair, rectified_pictures, seen_points, texture, unlike_pair, vector
+from tests.calib.scenes import HW, rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
 
 
 def worse(rig: Rig, *, seed=0) -> Rig:
@@ -63,7 +63,7 @@ def test_several_frames_hold_a_whole_one_out():
     assert found.accepted
 
 
-def test_what_pictures_cannot_tell_is_left_alone_and_named():
+def test_what_images_cannot_tell_is_left_alone_and_named():
     """Side by side and alike, a shift of both principal points along the rows moves no line."""
     rig = rectified_pair()
     bad = rig.perturbed({"right.rotation": vector(0.003, 0, 0.004)})
@@ -164,7 +164,7 @@ def test_a_fundamental_matrix_is_refined():
 
 
 def test_photometric_error_is_least_for_the_true_rig():
-    rig, images = rectified_pair(), rectified_pictures()
+    rig, images = rectified_pair(), rectified_images()
     rig = rig.replace(depth=(2.5, 6.5))
     views = Views.of(images)
 
@@ -184,7 +184,7 @@ def test_photometric_error_is_least_for_the_true_rig():
 
 
 def test_the_fusions_error_brings_a_rig_nearer_its_truth():
-    rig, images = rectified_pair(), rectified_pictures()
+    rig, images = rectified_pair(), rectified_images()
     bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
     found = refine(bad, [images], free=["rotation"], attend=attend_with_statistics)
     assert found.accepted
@@ -195,27 +195,27 @@ def test_the_fusions_error_brings_a_rig_nearer_its_truth():
 
 def test_the_fusions_error_alone_does_too():
     """No point is used: the gradient through attention's segments moves the rig."""
-    rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_pictures()
+    rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
     fit = Fit.of(
         rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}),
         [match_cameras(images)],
         free=["right.rotation"],
         sigma=None,
     )
-    truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
-    before = median_off(fit.rig, truth)
+    ground_truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
+    before = median_off(fit.rig, ground_truth)
     found, errors = polish(fit, fit.prior(), [images], attend_with_statistics)
     assert before > 1
-    assert median_off(fit.after(found.z), truth) < 0.3 * before
+    assert median_off(fit.after(found.z), ground_truth) < 0.3 * before
     assert errors.accepted
     assert errors.after < errors.before
 
 
 def test_bad_input_is_one_clear_line():
-    rig, images = rectified_pair(), rectified_pictures()
+    rig, images = rectified_pair(), rectified_images()
     with pytest.raises(ValueError, match="two cameras or more"):
         refine(rig, [{"left": images["left"]}])
-    with pytest.raises(ValueError, match="same picture"):
+    with pytest.raises(ValueError, match="same image"):
         refine(rig, [{"left": images["left"], "right": images["left"]}])
     with pytest.raises(ValueError, match="do the cameras see the same things"):
         refine(rig, [images | {"right": texture(seed=5)}])
@@ -233,10 +233,10 @@ def test_bad_input_is_one_clear_line():
 
 
 def test_command_line(tmp_path, capsys):
-    rig, images = rectified_pair(), rectified_pictures()
+    rig, images = rectified_pair(), rectified_images()
     files = [f"--image={name}={tmp_path / name}.png" for name in images]
-    for name, picture in images.items():
-        write_image(tmp_path / f"{name}.png", picture)
+    for name, image in images.items():
+        write_image(tmp_path / f"{name}.png", image)
     rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}).save(tmp_path / "rig.yaml")
     command = ["rig", "refine", str(tmp_path / "rig.yaml"), *files, "--free", "rotation"]
     main([*command, "--no-photometric", "--out", str(tmp_path / "better.yaml")])
@@ -247,5 +247,5 @@ def test_command_line(tmp_path, capsys):
     assert median_off(better, seen_points(rig, noise=0.0)) < 0.15
     with pytest.raises(SystemExit):
         main([*command, f"--image=left={tmp_path / 'left.png'}", "--out", str(tmp_path / "none.yaml")])
-    assert "every camera needs a picture of every frame" in capsys.readouterr().err
+    assert "every camera needs an image of every frame" in capsys.readouterr().err
     assert not (tmp_path / "none.yaml").exists()

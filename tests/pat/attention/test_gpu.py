@@ -1,4 +1,4 @@
-"""The Triton backend: on a GPU if there is one, else through Triton's interpreter, on very small pictures."""
+"""The Triton backend: on a GPU if there is one, else through Triton's interpreter, on very small images."""
 
 import os
 

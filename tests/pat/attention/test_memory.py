@@ -12,7 +12,7 @@ RESETS_PEAK = Path("/proc/self/clear_refs").exists()
 @pytest.mark.skipif(not RESETS_PEAK, reason="peak memory is read as Linux tells it")
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 @pytest.mark.parametrize(("backward", "most"), [(False, 1.2), (True, 3.0)])
-def test_memory_is_that_of_the_pictures(interpolation, backward, most):
+def test_memory_is_that_of_the_images(interpolation, backward, most):
     few, many = (
         measure(job("cpu", "cpu", interpolation, 128, 512, samples, backward) | {"repeats": 1}) for samples in (40, 640)
     )

@@ -8,8 +8,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import attend, attend_with_statistics, reference
-from pat.attention import torch_op 
+from pat.attention import attend, attend_with_statistics, reference, torch_op
 from tests.pat.attention.cases import call, random_case
 
 
@@ -17,13 +16,13 @@ def by_hand(q, key, value, xy, counts):
     """One alpha pixel, bilinear, in plain Python: output, position, spread, peak."""
     h, w = key.shape[1:]
 
-    def at(picture, x, y):
+    def at(image, x, y):
         x, y = min(max(x, 0.0), w - 1.0), min(max(y, 0.0), h - 1.0)
         x0, y0 = math.floor(x), math.floor(y)
         x1, y1 = min(x0 + 1, w - 1), min(y0 + 1, h - 1)
         u, v = x - x0, y - y0
-        upper = (1 - u) * picture[:, y0, x0] + u * picture[:, y0, x1]
-        return (1 - v) * upper + v * ((1 - u) * picture[:, y1, x0] + u * picture[:, y1, x1])
+        upper = (1 - u) * image[:, y0, x0] + u * image[:, y0, x1]
+        return (1 - v) * upper + v * ((1 - u) * image[:, y1, x0] + u * image[:, y1, x1])
 
     seen = [(x, y) for (x, y), c in zip(xy.tolist(), counts) if c and -0.5 <= x <= w - 0.5 and -0.5 <= y <= h - 0.5]
     if not seen:

@@ -16,7 +16,7 @@ from pat.media.images import read_image, write_image
 
 @pytest.fixture
 def small(tmp_path):
-    """The sample array, its rig and pictures cut small so that fusing takes a moment."""
+    """The sample array, its rig and images cut small so that fusing takes a moment."""
     sample = load_sample()
     rig = sample.rig
     for name in rig.names:
@@ -61,8 +61,8 @@ def test_fuse_writes_everything(small):
 def test_demo_beats_alpha_alone(tmp_path, capsys):
     main(["demo", "--out", str(tmp_path)])
     sample = load_sample()
-    alone = score(sample.images["mono"].expand(3, -1, -1), sample.truth)
-    fused = score(read_image(tmp_path / "fused.png"), sample.truth)
+    alone = score(sample.images["mono"].expand(3, -1, -1), sample.ground_truth)
+    fused = score(read_image(tmp_path / "fused.png"), sample.ground_truth)
     assert fused.psnr > alone.psnr + 5
     assert fused.ssim > alone.ssim
     assert "classical" in capsys.readouterr().out
@@ -122,7 +122,7 @@ def test_views_that_do_not_overlap(small, capsys):
     assert "'colour's views do not overlap" in fails(arguments(small), capsys)
 
 
-def test_pictures_with_an_alpha_channel_or_nan(small, capsys):
+def test_images_with_an_alpha_channel_or_nan(small, capsys):
     transparent = torch.rand(4, 96, 128)
     import cv2
 

@@ -72,13 +72,13 @@ def test_the_papers_windows_reach_from_edge_to_edge():
     assert corners[0] == (0, 0)
     assert corners[-1] == (1536 - 128, 2048 - 384)
     assert Patches.like_the_papers((1536, 2048)) == Patches()
-    with pytest.raises(ValueError, match="patches of 384x128 do not fit into a picture of 300x200"):
+    with pytest.raises(ValueError, match="patches of 384x128 do not fit into an image of 300x200"):
         Patches().corners((200, 300))
     with pytest.raises(ValueError, match="cannot be reduced 3 times"):
         Patches(reduce=3)
 
 
-def test_points_of_the_whole_picture_are_where_the_patches_cameras_project_them(rendered):
+def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(rendered):
     stack = cut(rendered / "scenes" / "000000", SMALL, alpha="mono")
     X = torch.tensor([[0.1, -0.2, 5.0], [-0.4, 0.3, 8.0]]).double()
     whole = make_rig()["mono"].project(X).x
@@ -134,13 +134,13 @@ def test_patches_are_recorded_as_responses_say_and_anew_each_epoch(rendered):
     patch = data[7]
     assert list(patch.images) == ["mono", "colour"]
     assert patch.images["mono"].shape == (1, 16, 24)
-    assert patch.images["colour"].shape[0] == patch.truth.shape[0] == 3
-    grey = (patch.truth * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0)
+    assert patch.images["colour"].shape[0] == patch.ground_truth.shape[0] == 3
+    grey = (patch.ground_truth * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(0)
     assert (patch.images["mono"][0] - grey).abs().mean() < 0.06
     assert torch.equal(data[7].images["mono"], patch.images["mono"])
     data.set_epoch(1)
     assert not torch.equal(data[7].images["mono"], patch.images["mono"])
-    assert torch.equal(data[7].truth, patch.truth)
+    assert torch.equal(data[7].ground_truth, patch.ground_truth)
     with pytest.raises(IndexError):
         data[18]
 
@@ -206,16 +206,16 @@ def test_scenes_that_cannot_be_read_are_told(broken):
     file = broken / "scenes/000001/colour-0000.npz"
     file.write_bytes(file.read_bytes()[:500])
     data = ScenePatches(broken, patches=SMALL)
-    assert data[0].truth.shape == (3, 16, 24)
+    assert data[0].ground_truth.shape == (3, 16, 24)
     with pytest.raises(ValueError, match=r"000001: cannot be read \(.*\): remove it and run 'pat render' again"):
         data[6]
 
 
-def test_pictures_of_changing_size_are_told(broken):
+def test_images_of_changing_size_are_told(broken):
     shutil.rmtree(broken / "scenes/000002")
     LayeredSettings(oversampling=1).renderer(make_rig(160), Limits()).render(2, broken / "scenes/000002")
     with pytest.raises(
-        ValueError, match=r"000002: has pictures of other sizes than the first \(mono 160x96, .*mono 128x96"
+        ValueError, match=r"000002: has images of other sizes than the first \(mono 160x96, .*mono 128x96"
     ):
         ScenePatches(broken, patches=SMALL)[12]
 

@@ -25,7 +25,7 @@ from pat.media.images import read_image
 from pat.networks.paper import PAT, PATConfig
 from pat.networks.weights import load_weights
 from pat.sensors import Linear, record
-from pat.synthesis.rendered import Frame, save_frame
+from pat.synthesis.rendered import RenderedFrame, save_frame
 
 CHOSEN = ("calibrated", "rectified assumption", "turned by 1 deg", "centre off by 10 px", "local 5x5", "dense")
 
@@ -41,7 +41,7 @@ def test_cases_are_unrectified_rigs_that_see_the_same_scene(case):
     assert alpha.K[0, 0] / beta.K[0, 0] == pytest.approx(case.ratio)
     baseline = classical(case.rig, case.images, ALPHA, BETA)
     grey = case.images[ALPHA].expand(3, -1, -1)
-    assert score(baseline, case.truth).psnr > score(grey, case.truth).psnr + 3
+    assert score(baseline, case.ground_truth).psnr > score(grey, case.ground_truth).psnr + 3
 
 
 def test_every_family_is_there():
@@ -106,7 +106,7 @@ def test_the_true_depth_is_nowhere_off(case):
 
 
 def test_rendered_folders(tmp_path, case):
-    """What a renderer would leave, with the pictures of a layered scene."""
+    """What a renderer would leave, with the images of a layered scene."""
     folder = tmp_path / "scenes" / "one"
     folder.mkdir(parents=True)
     with pytest.raises(ValueError, match="holds no rendered scene"):
@@ -115,15 +115,15 @@ def test_rendered_folders(tmp_path, case):
     with pytest.raises(ValueError, match=r"one is not whole \(render.json is missing\): render it"):
         rendered_cases(tmp_path)
     case.rig.save(folder / "rig.yaml")
-    pictures = {ALPHA: case.truth, BETA: case.images[BETA]}
-    for name, picture in pictures.items():
-        linear = record(picture[None], [Linear()], torch.Generator()).image[0]
-        index = torch.ones(picture.shape[1:], dtype=torch.long)
-        save_frame(folder / f"{name}.npz", Frame(time=0.0, rgb=linear, depth=case.depth, index=index))
-    frames = {name: [{"file": f"{name}.npz", "time": 0.0}] for name in pictures}
+    images = {ALPHA: case.ground_truth, BETA: case.images[BETA]}
+    for name, image in images.items():
+        linear = record(image[None], [Linear()], torch.Generator()).image[0]
+        index = torch.ones(image.shape[1:], dtype=torch.long)
+        save_frame(folder / f"{name}.npz", RenderedFrame(time=0.0, rgb=linear, depth=case.depth, index=index))
+    frames = {name: [{"file": f"{name}.npz", "time": 0.0}] for name in images}
     (folder / "render.json").write_text(json.dumps({"frames": frames}))
     (read,) = rendered_cases(tmp_path)
-    assert (read.truth - case.truth).abs().max() < 2e-3
+    assert (read.ground_truth - case.ground_truth).abs().max() < 2e-3
     assert read.ratio == pytest.approx(case.ratio)
     assert torch.equal(read.depth, case.depth)
     shutil.copytree(folder, tmp_path / "others" / "one")

@@ -10,12 +10,12 @@ from pat.media.colour import luminance, to_luma_chroma
 
 
 def patches(height=96, width=160, *, seed=0):
-    """A smooth colour picture with texture that can be matched, away from black and white."""
+    """A smooth colour image with texture that can be matched, away from black and white."""
     rng = np.random.default_rng(seed)
     coarse = cv2.resize(rng.random((8, 12, 3)).astype(np.float32), (width, height), interpolation=cv2.INTER_CUBIC)
     grain = cv2.GaussianBlur(rng.random((height, width)).astype(np.float32), (0, 0), 1.5) - 0.5
-    picture = 0.25 + 0.5 * coarse.clip(0, 1) + 0.5 * grain[..., None]
-    return torch.from_numpy(picture.clip(0, 1)).permute(2, 0, 1).contiguous()
+    image = 0.25 + 0.5 * coarse.clip(0, 1) + 0.5 * grain[..., None]
+    return torch.from_numpy(image.clip(0, 1)).permute(2, 0, 1).contiguous()
 
 
 def shifted_pair(disparity):
@@ -24,12 +24,12 @@ def shifted_pair(disparity):
 
 
 @pytest.mark.parametrize(("rate", "least"), [(1, 45), (2, 38), (4, 30)])
-def test_a_shifted_picture_gives_its_colours_back(rate, least):
-    alpha, beta, truth = mono_colour_task(shifted_pair(9), rate)
+def test_a_shifted_image_gives_its_colours_back(rate, least):
+    alpha, beta, ground_truth = mono_colour_task(shifted_pair(9), rate)
     result = classical_fusion(alpha, beta, max_disparity=20.0)
     away = (slice(None), slice(None), slice(12, None))
-    assert score(result[away], truth[away]).psnr > least
-    assert score(result, truth).psnr > score(alpha.expand(3, -1, -1), truth).psnr + 3
+    assert score(result[away], ground_truth[away]).psnr > least
+    assert score(result, ground_truth).psnr > score(alpha.expand(3, -1, -1), ground_truth).psnr + 3
 
 
 def test_the_result_has_alphas_luminance():
@@ -41,15 +41,15 @@ def test_the_result_has_alphas_luminance():
 
 
 def test_a_darker_colour_camera_is_matched_too():
-    alpha, beta, truth = mono_colour_task(shifted_pair(9), 2)
+    alpha, beta, ground_truth = mono_colour_task(shifted_pair(9), 2)
     darker = classical_fusion(alpha, 0.2 * beta, max_disparity=20.0)
-    expected = 0.2 * to_luma_chroma(truth)[1][:, :, 12:]
+    expected = 0.2 * to_luma_chroma(ground_truth)[1][:, :, 12:]
     assert (to_luma_chroma(darker)[1][:, :, 12:] - expected).abs().mean() < 0.004
 
 
 @pytest.mark.parametrize("hw", [(1, 1), (2, 3), (5, 40), (40, 5), (17, 33)])
 @pytest.mark.parametrize("beta_hw", [(1, 1), (8, 16), (50, 70)])
-def test_tiny_and_featureless_pictures_are_served(hw, beta_hw):
+def test_tiny_and_featureless_images_are_served(hw, beta_hw):
     for alpha, beta in (
         (torch.rand(1, *hw), torch.rand(3, *beta_hw)),
         (torch.full((1, *hw), 0.5), torch.tensor([0.5, 0.4, 0.3])[:, None, None].expand(3, *beta_hw)),
@@ -123,22 +123,22 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
     K_alpha, K_beta = camera(200.0, hw), camera(140.0, beta_hw)
     normal, distance = torch.tensor([0.1, 0.2, -1.0]).double(), 3.0
     H = K_beta @ (R - t[:, None] * normal / distance) @ K_alpha.inverse()
-    truth = patches(*hw)
+    ground_truth = patches(*hw)
     beta = cv2.warpPerspective(
-        truth.permute(1, 2, 0).numpy(),
+        ground_truth.permute(1, 2, 0).numpy(),
         H.numpy(),
         beta_hw[::-1],
         flags=cv2.INTER_AREA,
         borderMode=cv2.BORDER_REFLECT,
     )
     beta = torch.from_numpy(beta).permute(2, 0, 1)
-    alpha = luminance(truth)
+    alpha = luminance(ground_truth)
     result = classical_fusion_calibrated(alpha, beta, K_alpha, K_beta, R, t, depth=(2.0, 6.0))
     seen = cv2.warpPerspective(np.ones(beta_hw, np.uint8), H.inverse().numpy(), hw[::-1]) > 0
     seen = torch.from_numpy(cv2.erode(seen.astype(np.uint8), np.ones((9, 9)), borderValue=1)) > 0
-    error = (result - truth)[:, seen].square().mean().sqrt()
+    error = (result - ground_truth)[:, seen].square().mean().sqrt()
     assert seen.float().mean() > 0.5
-    assert error < 0.25 * (alpha - truth)[:, seen].square().mean().sqrt()
+    assert error < 0.25 * (alpha - ground_truth)[:, seen].square().mean().sqrt()
 
 
 @pytest.mark.parametrize(
@@ -161,10 +161,10 @@ def test_rigs_that_cannot_be_rectified_are_refused(t, depth, complaint):
 
 def test_teddy_keeps_its_colours(shared_data):
     pair = next(pair for pair in middlebury_pairs(shared_data / "middlebury") if "teddy" in pair.name)
-    alpha, beta, truth = mono_colour_task(pair, 2)
+    alpha, beta, ground_truth = mono_colour_task(pair, 2)
     result, grey = (
-        score(classical_fusion(alpha, beta, max_disparity=64.0), truth),
-        score(alpha.expand(3, -1, -1), truth),
+        score(classical_fusion(alpha, beta, max_disparity=64.0), ground_truth),
+        score(alpha.expand(3, -1, -1), ground_truth),
     )
     assert result.psnr > grey.psnr + 10
     assert result.ssim > grey.ssim + 0.1

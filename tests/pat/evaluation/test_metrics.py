@@ -23,8 +23,8 @@ def ssim_of_wang(a, b):
 
 
 def test_psnr_is_the_closed_form():
-    truth = torch.rand(3, 20, 30)
-    assert score(truth + 0.1, truth).psnr == pytest.approx(20, abs=1e-5)
+    ground_truth = torch.rand(3, 20, 30)
+    assert score(ground_truth + 0.1, ground_truth).psnr == pytest.approx(20, abs=1e-5)
 
 
 def test_ssim_is_wangs():
@@ -35,27 +35,27 @@ def test_ssim_is_wangs():
     assert score(torch.from_numpy(b), torch.from_numpy(a)).ssim == pytest.approx(expected, abs=1e-9)
 
 
-def test_equal_pictures_score_best():
+def test_equal_images_score_best():
     image = torch.rand(1, 11, 11)
     assert score(image, image) == (math.inf, 1.0)
 
 
 @pytest.mark.parametrize(("shape", "complaint"), [((3, 20, 21), "equal shapes"), ((3, 20, 10), "11 pixels")])
 def test_what_cannot_be_compared_is_refused(shape, complaint):
-    truth = torch.rand(3, 20, 20 if complaint == "equal shapes" else 10)
+    ground_truth = torch.rand(3, 20, 20 if complaint == "equal shapes" else 10)
     with pytest.raises(ValueError, match=complaint):
-        score(torch.rand(shape), truth)
+        score(torch.rand(shape), ground_truth)
 
 
 def test_disparity_errors_count_only_where_valid():
-    truth = torch.zeros(2, 2)
+    ground_truth = torch.zeros(2, 2)
     found = torch.tensor([[0.5, 1.0], [4.5, 100.0]])
     valid = torch.tensor([[True, True], [True, False]])
-    result = disparity_score(found, truth, valid)
+    result = disparity_score(found, ground_truth, valid)
     assert result.end_point_error == pytest.approx(2.0)
     assert result.within_one == pytest.approx(2 / 3)
     with pytest.raises(ValueError, match="no pixel"):
-        disparity_score(found, truth, torch.zeros_like(valid))
+        disparity_score(found, ground_truth, torch.zeros_like(valid))
 
 
 def test_the_interval_of_a_mean_is_scipys():

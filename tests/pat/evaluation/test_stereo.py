@@ -25,7 +25,7 @@ from pat.evaluation.stereo import (
     write_markdown,
 )
 from pat.media.images import read_image, write_image
-from pat.networks.protocol import Fused
+from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
 
 
@@ -53,9 +53,9 @@ def test_a_method_gets_the_protocols_inputs():
     assert seen == [((1, 16, 24), (3, 8, 12), 120), ((1, 16, 24), (3, 4, 6), 120)]
 
 
-def test_baselines_run_and_pictures_lie_side_by_side(tmp_path):
+def test_baselines_run_and_images_lie_side_by_side(tmp_path):
     (pair,) = pairs(1)
-    rows = evaluate_pairs([pair], BASELINES, [2], pictures=tmp_path)
+    rows = evaluate_pairs([pair], BASELINES, [2], images=tmp_path)
     assert [row.method for row in rows] == ["alpha", "beta", "classical"]
     strip = read_image(tmp_path / "set-0_x2.png")
     assert strip.shape == (3, 16, 24 * 5)
@@ -65,7 +65,7 @@ def test_baselines_run_and_pictures_lie_side_by_side(tmp_path):
 
 @pytest.mark.parametrize(
     ("result", "complaint"),
-    [(torch.zeros(1, 16, 24), "wanted a picture"), (torch.full((3, 16, 24), math.nan), "NaN")],
+    [(torch.zeros(1, 16, 24), "wanted an image"), (torch.full((3, 16, 24), math.nan), "NaN")],
 )
 def test_a_result_that_cannot_be_scored_names_method_and_pair(result, complaint):
     with pytest.raises(ValueError, match=f"ours on set/0: .*{complaint}"):
@@ -119,7 +119,7 @@ class Matcher:
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
 
-    def balance(self, alpha, beta, look):
+    def normalisation(self, alpha, beta, look):
         return look
 
     def survey(self, alpha, beta, look):
@@ -133,7 +133,7 @@ class Matcher:
             - torch.tensor([self.disparity, 0.0])[:, None, None]
         )
         sure = torch.ones_like(alpha[:, 0])
-        return Fused(alpha.expand(-1, 3, -1, -1), [grid] * len(betas), [sure] * len(betas), [sure] * len(betas))
+        return FusionOutput(alpha.expand(-1, 3, -1, -1), [grid] * len(betas), [sure] * len(betas), [sure] * len(betas))
 
 
 def test_depth_is_compared_where_it_is_known():
@@ -213,7 +213,7 @@ class Onlooker:
 
     halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
 
-    def balance(self, alpha, beta, look):
+    def normalisation(self, alpha, beta, look):
         return look
 
     def survey(self, alpha, beta, look):
@@ -224,7 +224,7 @@ class Onlooker:
         self.start, self.end = found.start[0].tolist(), found.end[0].tolist()
         self.beta = tuple(betas[0].shape)
         none = alpha[:, 0] * 0
-        return Fused(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
+        return FusionOutput(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
 
 
 def test_fusion_looks_along_the_row_in_alphas_pixels():

@@ -31,9 +31,9 @@ const titled = (title) => { for (const m of doc._all_models.values()) if (m.titl
 @pytest.fixture(scope="module")
 def page():
     command = [sys.executable, "-c", "from pat.cli.main import main; main()", "explore", str(SAMPLE / "rig.yaml")]
-    pictures = [a for n in ("mono", "colour") for a in ("--image", f"{n}={SAMPLE / n}.png")]
+    images = [a for n in ("mono", "colour") for a in ("--image", f"{n}={SAMPLE / n}.png")]
     server = subprocess.Popen(
-        [*command, *pictures, "--no-browser"], cwd=Path(__file__).parents[3], stdout=subprocess.PIPE, text=True
+        [*command, *images, "--no-browser"], cwd=Path(__file__).parents[3], stdout=subprocess.PIPE, text=True
     )
     try:
         address = re.search(r"http://\S+", server.stdout.readline())[0]
@@ -140,7 +140,7 @@ def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
     slower = max(1.0, min(slower, slowed_by_others()))
     record_property("milliseconds", times)
     record_property("slower", slower)
-    print(f"ms from slider to picture: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
+    print(f"ms from slider to image: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
     assert min(times) < 100 * slower
 
 

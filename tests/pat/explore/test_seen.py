@@ -1,4 +1,4 @@
-"""What the explorer works out agrees with the fields, with attention and with the true picture."""
+"""What the explorer works out agrees with the fields, with attention and with the true image."""
 
 import math
 import time
@@ -62,8 +62,10 @@ def test_the_windows_find_the_colour_and_the_depth(scene, sample):
     for x in range(60, 600, 90):
         for y in range(50, 380, 90):
             seen = look_at(scene, state().replace(x=(float(x), float(y)), sharpness=60.0))
-            truth = sample.truth[:, y, x].double()
-            errors.append([float((colour - truth).abs().max()) for colour in (seen.colour, truth.mean().expand(3))])
+            ground_truth = sample.ground_truth[:, y, x].double()
+            errors.append(
+                [float((colour - ground_truth).abs().max()) for colour in (seen.colour, ground_truth.mean().expand(3))]
+            )
     found, grey = torch.tensor(errors).median(0).values
     assert found < 0.5 * grey
 
@@ -109,12 +111,12 @@ def test_a_turned_camera_moves_the_segment_as_the_rig_says(scene, sample):
 def test_lenses_are_followed(scene, sample):
     lens = Distortion("brown-conrady", torch.tensor([-0.2, 0.05, 0.0, 0.0, 0.0], dtype=torch.float64))
     camera = sample.rig["colour"].replace(distortion=lens)
-    bent = Scene(sample.rig.with_camera("colour", camera), sample.images)
-    seen = look_at(bent, state()).betas["colour"]
+    has_lens = Scene(sample.rig.with_camera("colour", camera), sample.images)
+    seen = look_at(has_lens, state()).betas["colour"]
     assert seen.ends is None
-    found = Curved(256)(bent.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
+    found = Curved(256)(has_lens.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
     torch.testing.assert_close(seen.xy, found.xy[0])
-    assert "colour.distortion" in core.numbers_of(bent.rig)
+    assert "colour.distortion" in core.numbers_of(has_lens.rig)
 
 
 def test_cameras_known_by_F_or_by_size_alone(sample):
@@ -138,7 +140,7 @@ def test_what_cannot_be_is_told(scene, sample):
         Scene(sample.rig, {"mono": torch.zeros(1, 40, 64)})
 
 
-def test_an_answer_for_pictures_of_megapixels_takes_milliseconds(sample):
+def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
     """The time of the processor, 1280x1024 against two colour betas of the same size."""
     rig, images = sample.rig, dict(sample.images)
     for name in rig.names:

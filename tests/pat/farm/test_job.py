@@ -113,7 +113,7 @@ def fails(arguments, capfd) -> str:
         ({"layered": {"layer": [1, 2]}}, "layered.layer: unknown key; did you mean 'layers'?"),
         ({"limits": {"timeout": -1}}, "limits: timeout must be above 0"),
         ({"rig": "rg.yaml"}, "rg.yaml: no such file or folder"),
-        ({"layered": {"photos": ["pictures"]}}, "pictures: no such file or folder"),
+        ({"layered": {"photos": ["images"]}}, "images: no such file or folder"),
         ({"blender": {"generator": "photographs"}}, "blender: the generator 'photographs' needs a folder `photos`"),
         ({"blender": {"settings": {"sample": 3}}}, "settings.sample: unknown key; did you mean 'samples'?"),
     ],

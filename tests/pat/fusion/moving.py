@@ -29,7 +29,7 @@ WALL, SQUARE = texture(0), texture(1, (48, 48))
 
 
 def seen(time: float, position: float) -> torch.Tensor:
-    """The picture (3, H, W) of a camera `position` metres to the right of alpha."""
+    """The image (3, H, W) of a camera `position` metres to the right of alpha."""
     x = pixel_grid(HW)
     wall = x + x.new_tensor([FOCAL * position / FAR + 150, 60])
     square = x + x.new_tensor([FOCAL * position / NEAR - 25 - SPEED * time, -24])
@@ -54,11 +54,11 @@ def rig(offset: float = 0.0) -> Rig:
 
 def recording(count: int, offset: float = 0.0) -> tuple[dict[str, list[torch.Tensor]], list[torch.Tensor]]:
     """Frames of both cameras, and alpha's in true colour."""
-    truth = [seen(i / RATE, 0.0) for i in range(count)]
+    ground_truth = [seen(i / RATE, 0.0) for i in range(count)]
     g = torch.Generator().manual_seed(3)
 
-    def noisy(picture: torch.Tensor) -> torch.Tensor:
-        return (picture + 0.01 * torch.randn(picture.shape, generator=g)).clamp(0, 1)
+    def noisy(image: torch.Tensor) -> torch.Tensor:
+        return (image + 0.01 * torch.randn(image.shape, generator=g)).clamp(0, 1)
 
     slow = [noisy(seen(offset + j / SLOW, BASELINE)) for j in range(int((count / RATE - offset) * SLOW) + 1)]
-    return {"fast": [noisy(luminance(t)) for t in truth], "slow": slow}, truth
+    return {"fast": [noisy(luminance(t)) for t in ground_truth], "slow": slow}, ground_truth

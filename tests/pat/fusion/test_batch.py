@@ -1,17 +1,17 @@
-"""Many frames and sequences on disk: resumed to the same bits, whole files only, one bad picture costs one frame."""
+"""Many frames and sequences on disk: resumed to the same bits, whole files only, one bad image costs one frame."""
 
 import errno
 import os
 from dataclasses import replace
 from pathlib import Path
 
-import arraygeom.atomic
 import pytest
 import torch
 
+import arraygeom.atomic
 from arraygeom import Rig
 from pat.cli.main import main
-from pat.fusion.batch import Batch, find_pictures
+from pat.fusion.batch import Batch, find_images
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.networks.guided import GuidedPAT, GuidedPATConfig
@@ -22,21 +22,21 @@ from tests.pat.fusion import moving
 
 @pytest.fixture(scope="module")
 def material(tmp_path_factory) -> Path:
-    """A folder with weights of a tiny network, a rig, and seven fast and two slow pictures."""
+    """A folder with weights of a tiny network, a rig, and seven fast and two slow images."""
     folder = tmp_path_factory.mktemp("material")
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))
     save_weights(network, folder / "tiny.safetensors")
     frames, _ = moving.recording(7, 0.003)
-    for name, pictures in frames.items():
-        for i, picture in enumerate(pictures):
-            write_image(folder / name / f"{name}_{i + 8}.png", picture)
+    for name, images in frames.items():
+        for i, image in enumerate(images):
+            write_image(folder / name / f"{name}_{i + 8}.png", image)
     moving.rig(0.003).save(folder / "rig.yaml")
     return folder
 
 
 def batch(material, out, **options) -> Batch:
-    files = {name: find_pictures(material / name) for name in ("fast", "slow")}
+    files = {name: find_images(material / name) for name in ("fast", "slow")}
     if not options.get("sequence"):
         files["slow"] = [files["slow"][0]] * len(files["fast"])
     options = {"weights": str(material / "tiny.safetensors"), "files": files, **options}
@@ -47,11 +47,11 @@ def contents(out: Path) -> dict[str, bytes]:
     return {p.name: p.read_bytes() for p in sorted(out.iterdir()) if p.suffix in (".png", ".tif")}
 
 
-def test_pictures_are_found_in_the_order_of_their_numbers(material, tmp_path):
-    assert [p.name for p in find_pictures(material / "fast")] == [f"fast_{i}.png" for i in range(8, 15)]
-    assert [p.name for p in find_pictures(f"{material}/fast/*_1?.png")] == [f"fast_{i}.png" for i in range(10, 15)]
-    with pytest.raises(FileNotFoundError, match=r"mono: .*no pictures there"):
-        find_pictures(tmp_path, name="mono")
+def test_images_are_found_in_the_order_of_their_numbers(material, tmp_path):
+    assert [p.name for p in find_images(material / "fast")] == [f"fast_{i}.png" for i in range(8, 15)]
+    assert [p.name for p in find_images(f"{material}/fast/*_1?.png")] == [f"fast_{i}.png" for i in range(10, 15)]
+    with pytest.raises(FileNotFoundError, match=r"mono: .*no images there"):
+        find_images(tmp_path, name="mono")
 
 
 def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monkeypatch):
@@ -79,22 +79,22 @@ def test_a_stopped_sequence_is_resumed_to_the_same_bits(material, tmp_path, monk
 
 
 def test_other_settings_are_not_mixed_in(material, tmp_path):
-    batch(material, tmp_path / "out", files={n: find_pictures(material / n)[:1] for n in ("fast", "slow")}).run()
+    batch(material, tmp_path / "out", files={n: find_images(material / n)[:1] for n in ("fast", "slow")}).run()
     with pytest.raises(ValueError, match=r"settings.yaml: the frames there were made with other settings"):
         batch(material, tmp_path / "out", match_levels=True).run(resume=True)
 
 
 def spoiled(material, tmp_path, i) -> dict[str, list[Path]]:
     """The files, one of alpha's cut in half."""
-    files = {"fast": find_pictures(material / "fast"), "slow": [find_pictures(material / "slow")[0]] * 7}
+    files = {"fast": find_images(material / "fast"), "slow": [find_images(material / "slow")[0]] * 7}
     half = tmp_path / files["fast"][i].name
     half.write_bytes(files["fast"][i].read_bytes()[:900])
     return files | {"fast": [half if k == i else f for k, f in enumerate(files["fast"])]}
 
 
-def test_a_corrupt_picture_costs_its_frame_or_stops_the_job(material, tmp_path):
+def test_a_corrupt_image_costs_its_frame_or_stops_the_job(material, tmp_path):
     bad = batch(material, tmp_path / "bad", files=spoiled(material, tmp_path, 2))
-    with pytest.raises(JobError, match=r"fast_10_fused.png: fast: .*fast_10.png: not a picture"):
+    with pytest.raises(JobError, match=r"fast_10_fused.png: fast: .*fast_10.png: not an image"):
         bad.run()
     report = bad.run(resume=True, on_error="skip")
     assert [p.name for p in report.failed] == ["fast_10_fused.png"]
@@ -105,12 +105,12 @@ def test_a_corrupt_picture_costs_its_frame_or_stops_the_job(material, tmp_path):
 
 
 def test_a_missing_beta_of_a_key_frame_leaves_the_other_key_frames(material, tmp_path):
-    files = {name: find_pictures(material / name) for name in ("fast", "slow")}
+    files = {name: find_images(material / name) for name in ("fast", "slow")}
     gone = tmp_path / "gone.png"
     job = batch(material, tmp_path / "out", sequence=True, files=files | {"slow": [files["slow"][0], gone]})
     report = job.run(on_error="skip")
     assert len(report.made) == 7
-    with pytest.raises(JobError, match=r"slow: .*gone.png: no such picture"):
+    with pytest.raises(JobError, match=r"slow: .*gone.png: no such image"):
         job.run()
 
 
@@ -127,8 +127,8 @@ def test_a_full_disk_leaves_whole_files_only(material, tmp_path, monkeypatch):
     job = batch(material, tmp_path / "out")
     with pytest.raises(JobError, match="No space left"):
         job.run()
-    pictures = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
-    assert len(pictures) == 2
+    images = [p for p in (tmp_path / "out").iterdir() if p.name.endswith("fused.png")]
+    assert len(images) == 2
     assert not [p for p in os.listdir(tmp_path / "out") if p.startswith(".") and p != ".keys"]
     assert len(job.run(resume=True).made) == 5
 
@@ -149,7 +149,7 @@ def test_the_command_line_fuses_a_sequence(material, tmp_path, capsys):
     assert "near one of alpha in time" in " ".join(capsys.readouterr().err.split())
     with pytest.raises(SystemExit):
         main([a for a in given if a != "--sequence"])
-    assert "as many pictures of each camera" in " ".join(capsys.readouterr().err.split())
+    assert "as many images of each camera" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_path):

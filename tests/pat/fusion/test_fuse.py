@@ -2,11 +2,11 @@
 
 import math
 
-import pat.fusion.fuse
-import pat.fusion.tiles
 import pytest
 import torch
 
+import pat.fusion.fuse
+import pat.fusion.tiles
 from arraygeom import (
     Camera,
     Distortion,
@@ -19,7 +19,7 @@ from arraygeom import (
     Sensor,
     View,
     intrinsics,
-    retaken,
+    resampled,
     rotation_from_vector,
 )
 from calib.images.matches import match_points, seen_depths
@@ -106,8 +106,8 @@ def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     monkeypatch.setattr(pat.fusion.tiles, "SURVEY_REACH", 128)
     assert len(pat.fusion.tiles.survey_tiles(network, sample.rig["mono"].hw)) > 1
     pieces = fuse(network, sample.rig, images, alpha="mono")
-    truth = sample.truth
-    assert score(pieces.image.clamp(0, 1), truth).psnr > score(whole.image.clamp(0, 1), truth).psnr - 0.1
+    ground_truth = sample.ground_truth
+    assert score(pieces.image.clamp(0, 1), ground_truth).psnr > score(whole.image.clamp(0, 1), ground_truth).psnr - 0.1
     off = (pieces.image - whole.image).abs().amax(0)
     assert (off > 0.005).float().mean() < 1e-3
     hw = sample.rig["mono"].hw
@@ -120,10 +120,10 @@ def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
 @pytest.mark.slow
 @pytest.mark.parametrize(("folder", "pairs"), [("kitti", kitti_pairs), ("flickr1024/train", flickr_pairs)])
 def test_halos_are_wide_enough_for_the_weights(folder, pairs, shared_data):
-    """Tiles of real pictures equal the whole with the weights that are shipped."""
+    """Tiles of real images equal the whole with the weights that are shipped."""
     pair, network = next(pairs(shared_data / folder)), load_weights("mono-colour")
     images = {"left": luminance(pair.left), "right": pair.right}
-    rig = Rig({name: View(hw=picture.shape[1:]) for name, picture in images.items()})
+    rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
     field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
     whole = fuse(network, rig, images, alpha="left", field=field)
     h, w = rig["left"].hw
@@ -136,7 +136,7 @@ def test_halos_are_wide_enough_for_the_weights(folder, pairs, shared_data):
     assert (tiled.confidence - whole.confidence).abs().max() < 1e-5
 
 
-def test_pictures_are_asked_for_once_and_only_when_they_are_needed():
+def test_images_are_asked_for_once_and_only_when_they_are_needed():
     hw, beta_hw = (64, 96), (60, 80)
     given = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
     asked = []
@@ -190,11 +190,11 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
     rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
     pair = rig.pair("mono", "colour")
     beta = pat.fusion.fuse._prepare(network, pair, texture(3, wide)[None], None, None, "colour")
-    assert beta.picture.shape[-1] * beta.picture.shape[-2] < 0.6 * 9 * math.prod(wide)
+    assert beta.image.shape[-1] * beta.image.shape[-2] < 0.6 * 9 * math.prod(wide)
     images = {"mono": texture(1, hw), "colour": texture(3, wide)}
     cut = fuse(network, rig, images, alpha="mono")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(pat.fusion.fuse, "_common_part", lambda pair, picture, field, network: (pair, picture))
+        patched.setattr(pat.fusion.fuse, "_common_part", lambda pair, image, field, network: (pair, image))
         whole = fuse(network, rig, images, alpha="mono")
     # What the views have in common sets the levels at which they are compared: that is where the two differ.
     assert (cut.image - whole.image).abs().mean() < 2e-2
@@ -237,13 +237,17 @@ def test_colour_comes_from_where_the_field_says():
     rig = rig_of(hw, hw, focal=100.0, beta_focal=100.0)
     g = torch.Generator().manual_seed(0)
     side = (torch.arange(96) < 48).float().expand(1, *hw)
-    truth = torch.cat([side, 0 * side, 1 - side]) * (0.5 + 0.5 * torch.rand(1, *hw, generator=g))
+    ground_truth = torch.cat([side, 0 * side, 1 - side]) * (0.5 + 0.5 * torch.rand(1, *hw, generator=g))
     network = network_of("GuidedPAT")
     torch.nn.init.zeros_(network.head.last.weight)
     torch.nn.init.zeros_(network.head.last.bias)
-    upright = fuse(network, rig, {"mono": truth, "colour": truth}, alpha="mono", depth=(5, 20)).image
+    upright = fuse(network, rig, {"mono": ground_truth, "colour": ground_truth}, alpha="mono", depth=(5, 20)).image
     turned = fuse(
-        network, rig.turn("colour", 1), {"mono": truth, "colour": truth.rot90(1, (-2, -1))}, alpha="mono", depth=(5, 20)
+        network,
+        rig.turn("colour", 1),
+        {"mono": ground_truth, "colour": ground_truth.rot90(1, (-2, -1))},
+        alpha="mono",
+        depth=(5, 20),
     ).image
     for image in (upright, turned):
         assert image[0, :, 10:40].mean() > image[2, :, 10:40].mean() + 0.1
@@ -302,12 +306,12 @@ def test_views_must_overlap():
         fuse(network_of("PAT"), rig, {"mono": images["mono"]}, alpha="mono")
 
 
-def bent(lens_of, rig, images):
-    """The rig with lenses, and the pictures those would have taken."""
+def has_lens(lens_of, rig, images):
+    """The rig with lenses, and the images those would have taken."""
     for name, coefficients in lens_of.items():
         lens = Distortion("brown-conrady", torch.tensor(coefficients, dtype=torch.float64))
         camera = rig[name].replace(distortion=lens)
-        images = images | {name: retaken(images[name], rig[name], camera).values[0]}
+        images = images | {name: resampled(images[name], rig[name], camera).values[0]}
         rig = rig.with_camera(name, camera)
     return rig, images
 
@@ -324,18 +328,18 @@ def test_lenses_are_seen_through(with_lens):
         dict(sample.images),
         load_weights("mono-colour"),
     )
-    images["mono"], truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.truth))
-    lensed, taken = bent({name: LENSES[name] for name in with_lens}, rig, images)
-    clean = (fuse(network, rig, images, alpha="mono").image - truth).square().mean()
+    images["mono"], ground_truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.ground_truth))
+    lensed, taken = has_lens({name: LENSES[name] for name in with_lens}, rig, images)
+    clean = (fuse(network, rig, images, alpha="mono").image - ground_truth).square().mean()
     frame = fuse(network, lensed, taken, alpha="mono")
     if "mono" in with_lens:
-        truth = retaken(truth, rig["mono"], lensed["mono"]).values[0]
-    seen = truth.sum(0) > 0
-    error = (frame.image - truth)[:, seen].square().mean()
+        ground_truth = resampled(ground_truth, rig["mono"], lensed["mono"]).values[0]
+    seen = ground_truth.sum(0) > 0
+    error = (frame.image - ground_truth)[:, seen].square().mean()
     assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
     blind = fuse(network, rig, taken, alpha="mono")
     assert error < 1.3 * clean
-    assert error < 0.85 * (blind.image - truth)[:, seen].square().mean()
+    assert error < 0.85 * (blind.image - ground_truth)[:, seen].square().mean()
     assert torch.isfinite(frame.image).all()
     assert 0.7 < float((frame.depth.isfinite() & seen).float().sum() / seen.float().sum()) <= 1
 
@@ -344,18 +348,18 @@ def test_lenses_of_cameras_known_by_f_are_seen_through():
     """No pose and no focal length: F between straightened pixels, and lenses with a unit of their own."""
     sample, network = load_sample(), load_weights("mono-colour")
     rig, images = sample.rig.crop("mono", 80, 160, (240, 320)), dict(sample.images)
-    images["mono"], truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.truth))
-    lensed, taken = bent({"mono": LENSES["mono"], "colour": [-0.1, 0.01, 0.001, 0.0]}, rig, images)
+    images["mono"], ground_truth = (p[:, 80:320, 160:480] for p in (images["mono"], sample.ground_truth))
+    lensed, taken = has_lens({"mono": LENSES["mono"], "colour": [-0.1, 0.01, 0.001, 0.0]}, rig, images)
     pair = rig.pair("mono", "colour")
     links = {("mono", "colour"): Link(pair.fundamental, pair.homography)}
     views = {name: LensView(hw=c.hw, K=c.K, distortion=c.distortion) for name, c in lensed.cameras.items()}
     frame = fuse(network, Rig(views, links=links), taken, alpha="mono")
     blind = fuse(network, Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links), taken, alpha="mono")
     clean = fuse(network, Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links), images, alpha="mono")
-    errors = [(clean.image - truth).square().mean()]
-    truth = retaken(truth, rig["mono"], lensed["mono"]).values[0]
-    seen = truth.sum(0) > 0
-    errors += [(f.image - truth)[:, seen].square().mean() for f in (frame, blind)]
+    errors = [(clean.image - ground_truth).square().mean()]
+    ground_truth = resampled(ground_truth, rig["mono"], lensed["mono"]).values[0]
+    seen = ground_truth.sum(0) > 0
+    errors += [(f.image - ground_truth)[:, seen].square().mean() for f in (frame, blind)]
     assert errors[1] < 1.3 * errors[0]
     assert errors[1] < 0.85 * errors[2]
     assert frame.depth.isnan().all()

@@ -1,18 +1,18 @@
-"""Files of a fusion: bands that no picture holds together are written one by one."""
+"""Files of a fusion: bands that no image holds together are written one by one."""
 
 import pytest
 import torch
 
-from pat.fusion.results import FusedFrame, save_frame
+from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image
 
 
-def frame_of(bands: int) -> FusedFrame:
-    return FusedFrame(torch.rand(bands, 6, 8), torch.full((6, 8), torch.nan), torch.rand(6, 8))
+def frame_of(bands: int) -> Frame:
+    return Frame(torch.rand(bands, 6, 8), torch.full((6, 8), torch.nan), torch.rand(6, 8))
 
 
 @pytest.mark.parametrize("bands", [1, 3])
-def test_one_band_and_three_are_one_picture(bands, tmp_path):
+def test_one_band_and_three_are_one_image(bands, tmp_path):
     frame = frame_of(bands)
     written = save_frame(frame, tmp_path, bits=16)
     assert [p.name for p in written] == ["fused.png", "confidence.png"]

@@ -81,16 +81,16 @@ def test_colours_mix_by_confidence_and_disagreement_is_doubt():
 def fused():
     """Seven frames, two of them key frames, and four fused alone; beta is 3 ms off alpha's clock."""
     offset = 0.003
-    frames, truth = moving.recording(7, offset)
+    frames, ground_truth = moving.recording(7, offset)
     network = load_weights("mono-colour")
     rig = moving.rig(offset)
     job = SequenceFusion(network, rig, frames, "fast")
     carried_frames = list(fuse_sequence(network, rig, frames, alpha="fast"))
-    return frames, truth, carried_frames, {i: job.alone(i) for i in (1, 2, 3, 4)}
+    return frames, ground_truth, carried_frames, {i: job.alone(i) for i in (1, 2, 3, 4)}
 
 
-def error(frame, truth):
-    return (frame.image - truth).square().mean(0)
+def error(frame, ground_truth):
+    return (frame.image - ground_truth).square().mean(0)
 
 
 def square(i):
@@ -101,9 +101,9 @@ def square(i):
 
 
 def test_what_moves_keeps_its_colour(fused):
-    _, truth, frames, alone = fused
-    ours = torch.stack([error(f, t)[square(i)].mean() for i, (f, t) in enumerate(zip(frames, truth))])
-    single = torch.stack([error(f, truth[i])[square(i)].mean() for i, f in alone.items()])
+    _, ground_truth, frames, alone = fused
+    ours = torch.stack([error(f, t)[square(i)].mean() for i, (f, t) in enumerate(zip(frames, ground_truth))])
+    single = torch.stack([error(f, ground_truth[i])[square(i)].mean() for i, f in alone.items()])
     assert ours[1:5].mean() < 0.7 * single.mean()
     assert ours.max() < 0.4 * single.max()
 
@@ -117,10 +117,10 @@ def test_colour_flickers_less_than_frame_by_frame(fused):
 
 def test_confidence_knows_where_colour_is_wrong(fused):
     """Also about what moves: among the pixels around the square, the sure ones are right and the wrong ones unsure."""
-    _, truth, ours, _ = fused
+    _, ground_truth, ours, _ = fused
     x = pixel_grid(moving.HW)
     around = [(x[..., 0] > 15 + 2.5 * i) & (x[..., 0] < 85 + 2.5 * i) for i in range(7)]
-    off = torch.cat([error(f, t)[m].sqrt() for f, t, m in zip(ours, truth, around)])
+    off = torch.cat([error(f, t)[m].sqrt() for f, t, m in zip(ours, ground_truth, around)])
     sure = torch.cat([f.confidence[m] for f, m in zip(ours, around)])
     third = len(sure) // 3
     order = sure.argsort()

@@ -12,7 +12,7 @@ from pat.media.images import read_image, write_image
 RED = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
 
 
-def picture(*, channels=3, seed=0):
+def make_image(*, channels=3, seed=0):
     return torch.rand(channels, 7, 9, generator=torch.Generator().manual_seed(seed))
 
 
@@ -23,7 +23,7 @@ def picture(*, channels=3, seed=0):
 def test_what_is_written_is_read_back(tmp_path, channels, suffix, bits):
     if suffix == "ppm" and channels == 1:
         suffix = "pgm"
-    image = picture(channels=channels)
+    image = make_image(channels=channels)
     write_image(tmp_path / f"a.{suffix}", image, bits=bits)
     again = read_image(tmp_path / f"a.{suffix}")
     assert again.dtype == torch.float32
@@ -63,24 +63,24 @@ def test_an_opaque_alpha_channel_is_dropped_and_any_other_refused(tmp_path, kind
         read_image(tmp_path / "glass.png")
 
 
-def test_a_missing_picture_is_named_with_its_camera(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"^mono: .*nothing.png: no such picture"):
+def test_a_missing_image_is_named_with_its_camera(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"^mono: .*nothing.png: no such image"):
         read_image(tmp_path / "nothing.png", name="mono")
 
 
 @pytest.mark.parametrize("content", [b"", b"words", b"\x89PNG\r\n\x1a\n"])
-def test_a_file_that_is_no_picture_is_refused(tmp_path, content, capfd):
+def test_a_file_that_is_no_image_is_refused(tmp_path, content, capfd):
     (tmp_path / "a.png").write_bytes(content)
-    with pytest.raises(ValueError, match=r"a.png: not a picture"):
+    with pytest.raises(ValueError, match=r"a.png: not an image"):
         read_image(tmp_path / "a.png")
     assert not capfd.readouterr().err
 
 
-def test_half_a_picture_is_refused(tmp_path):
+def test_half_a_image_is_refused(tmp_path):
     write_image(tmp_path / "a.png", torch.rand(3, 64, 64))
     content = (tmp_path / "a.png").read_bytes()
     (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match=r"a.png: not a picture"):
+    with pytest.raises(ValueError, match=r"a.png: not an image"):
         read_image(tmp_path / "a.png")
 
 
@@ -139,7 +139,7 @@ def test_the_written_file_takes_the_place_of_the_former_and_makes_its_folder(tmp
 
 
 def test_luminance_is_opencvs():
-    image = picture()
+    image = make_image()
     theirs = cv2.cvtColor(image.permute(1, 2, 0).numpy(), cv2.COLOR_RGB2GRAY)
     torch.testing.assert_close(luminance(image)[0], torch.from_numpy(theirs), atol=1e-5, rtol=0)
 
@@ -152,7 +152,7 @@ def test_luma_and_chroma_come_back():
     assert to_luma_chroma(grey)[1].abs().max() < 1e-14
 
 
-def test_the_luminance_of_a_recoloured_picture_is_the_given_one():
+def test_the_luminance_of_a_recoloured_image_is_the_given_one():
     luma, chroma = torch.rand(1, 5, 6, dtype=torch.float64), torch.randn(2, 5, 6, dtype=torch.float64)
     torch.testing.assert_close(luminance(from_luma_chroma(luma, chroma)), luma, atol=1e-14, rtol=0)
 

@@ -1,4 +1,4 @@
-"""Counts to pictures: black level, bits, filter mosaic, coding and exposure undo what the camera did."""
+"""Counts to images: black level, bits, filter mosaic, coding and exposure undo what the camera did."""
 
 import cv2
 import numpy as np
@@ -95,9 +95,9 @@ def test_exposures_and_gains_are_brought_to_alphas():
     torch.testing.assert_close(develop(2 * scene, no_exposure, like=alpha), coded(scene), atol=1e-5, rtol=0)
 
 
-def test_ordinary_pictures_pass_unchanged():
-    picture = light()
-    assert develop(picture, Sensor()) is picture
+def test_ordinary_images_pass_unchanged():
+    image = light()
+    assert develop(image, Sensor()) is image
 
 
 @pytest.mark.parametrize(
@@ -117,33 +117,33 @@ def test_what_does_not_fit_the_rig_is_named(tmp_path, sensor, values, message):
 
 def test_exr_is_written_and_holds_the_floats(tmp_path):
     OpenEXR = pytest.importorskip("OpenEXR")
-    picture = torch.rand(3, *HW) * 3 - 1
-    write_image(tmp_path / "a.exr", picture, bits=32)
+    image = torch.rand(3, *HW) * 3 - 1
+    write_image(tmp_path / "a.exr", image, bits=32)
     planes = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
-    for name, plane in zip("RGB", picture):
+    for name, plane in zip("RGB", image):
         assert np.array_equal(planes[name].pixels, plane.numpy())
     with pytest.raises(ValueError, match="32-bit"):
-        write_image(tmp_path / "b.exr", picture, bits=16)
+        write_image(tmp_path / "b.exr", image, bits=16)
     assert [p.name for p in tmp_path.iterdir()] == ["a.exr"]
 
 
-def test_a_picture_is_as_bright_as_the_light_that_alpha_measured():
+def test_a_image_is_as_bright_as_the_light_that_alpha_measured():
     """The right chroma on alpha's values is too bright where colours are strong; then it is the truth again."""
     linear = light() ** torch.tensor([1.0, 3.0, 0.5]).view(3, 1, 1)
-    truth, alpha = coded(linear), coded(luminance(linear))
-    fused = truth - luminance(truth) + alpha
-    assert (fused - truth).abs().max() > 0.02
+    ground_truth, alpha = coded(linear), coded(luminance(linear))
+    fused = ground_truth - luminance(ground_truth) + alpha
+    assert (fused - ground_truth).abs().max() > 0.02
     measured = developed(Sensor(response="mono", coding="linear"))
-    assert (as_bright(fused, alpha, measured) - truth).abs().max() < 1e-4
+    assert (as_bright(fused, alpha, measured) - ground_truth).abs().max() < 1e-4
     for unknown in (Sensor(response="mono"), Sensor(response="nir", coding="linear"), Sensor(coding="linear")):
         assert as_bright(fused, alpha, developed(unknown)) is fused
 
 
 def test_a_mosaic_makes_little_false_colour():
-    """A grey picture with detail of two pixels: 30 % less colour than by interpolation alone."""
+    """A grey image with detail of two pixels: 30 % less colour than by interpolation alone."""
     grey = torch.rand(1, 1, 24, 32, generator=torch.Generator().manual_seed(1))
-    picture = torch.nn.functional.interpolate(grey, HW, mode="bicubic", align_corners=False)[0].clamp(0, 1)
-    raw = mosaic(picture.expand(3, -1, -1), "RGGB")
+    image = torch.nn.functional.interpolate(grey, HW, mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    raw = mosaic(image.expand(3, -1, -1), "RGGB")
     plain = cv2.demosaicing((raw[0].numpy() * 65535).round().astype(np.uint16), cv2.COLOR_BayerRGGB2RGB_EA) / 65535
     plain, ours = (np.abs(rgb - rgb[1:2]).mean() for rgb in (plain.transpose(2, 0, 1), demosaiced(raw, "RGGB").numpy()))
     assert ours < 0.7 * plain

@@ -17,10 +17,10 @@ def test_a_video_has_all_frames_in_their_colours(tmp_path):
     video = cv2.VideoCapture(str(tmp_path / "a.mp4"))
     assert video.get(cv2.CAP_PROP_FPS) == pytest.approx(30)
     for frame in frames(7):
-        there, picture = video.read()
+        there, image = video.read()
         assert there
-        assert picture.shape == (48, 64, 3)
-        assert abs(picture[20, 20, ::-1] / 255 - frame[:, 0, 0].numpy()).max() < 0.04
+        assert image.shape == (48, 64, 3)
+        assert abs(image[20, 20, ::-1] / 255 - frame[:, 0, 0].numpy()).max() < 0.04
     assert not video.read()[0]
 
 

@@ -83,9 +83,9 @@ def test_cameras_at_one_place_are_one_with_several_bands(network):
 def test_bands_come_out_in_the_order_of_their_cameras(network):
     """The second camera is elsewhere, the first and the third at one place."""
     bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
-    pictures = dict(zip("rgb", bands.split(1)))
-    mixed = fuse(network, rig_of("rgb", [1, 2, 1]), {"alpha": alpha, **pictures}, alpha="alpha")
-    sorted_ = fuse(network, rig_of("rbg", [1, 1, 2]), {"alpha": alpha, **pictures}, alpha="alpha")
+    images = dict(zip("rgb", bands.split(1)))
+    mixed = fuse(network, rig_of("rgb", [1, 2, 1]), {"alpha": alpha, **images}, alpha="alpha")
+    sorted_ = fuse(network, rig_of("rbg", [1, 1, 2]), {"alpha": alpha, **images}, alpha="alpha")
     assert torch.equal(mixed.image, sorted_.image[[0, 2, 1]])
     assert mixed.image.shape[0] == 3
 

@@ -51,8 +51,8 @@ def test_bands_must_add_up():
 def test_the_window_stays_around_the_match():
     end = torch.tensor([20.0, 3.0]).expand(1, 8, 8, 2)
     segments = Segments(end - torch.tensor([12.0, 0.0]), end, torch.ones(1, 8, 8, dtype=torch.bool))
-    for reach, middle in ((5.0, 15.0), (-3.0, 20.0), (50.0, 8.0)):
-        window = window_around(torch.full((1, 1, 4, 4), reach), segments, 4.0)
+    for disparity, middle in ((5.0, 15.0), (-3.0, 20.0), (50.0, 8.0)):
+        window = window_around(torch.full((1, 1, 4, 4), disparity), segments, 4.0)
         assert torch.allclose(window.start[..., 0], torch.tensor(middle - 4))
         assert torch.allclose(window.end[..., 0], torch.tensor(middle + 4))
 

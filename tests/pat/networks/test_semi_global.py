@@ -2,10 +2,10 @@
 
 import cv2
 import numpy as np
-import pat.networks.semi_global
 import pytest
 import torch
 
+import pat.networks.semi_global
 from arraygeom import (
     Camera,
     Epipolar,
@@ -21,7 +21,7 @@ from arraygeom import (
 )
 from pat.media.colour import luminance
 from pat.networks import semi_global_kernels as kernels
-from pat.networks.semi_global import Balance, Consensus, consensus, equalising_blurs, matches
+from pat.networks.semi_global import Normalisation, SemiGlobalMatches, equalising_blurs, matches, semi_global_matching
 
 HW = (64, 96)
 
@@ -58,12 +58,12 @@ def test_aggregation_is_that_of_its_slow_twin():
 
 
 def test_census_is_which_of_48_neighbours_are_darker():
-    picture = np.random.default_rng(1).random((9, 11)).astype(np.float32)
-    bits = np.empty(picture.shape, np.uint64)
-    kernels.census(picture, bits)
+    image = np.random.default_rng(1).random((9, 11)).astype(np.float32)
+    bits = np.empty(image.shape, np.uint64)
+    kernels.census(image, bits)
     y, x = 4, 5
-    window = picture[y - 3 : y + 4, x - 3 : x + 4].ravel()
-    darker = np.delete(window, 24) < picture[y, x]
+    window = image[y - 3 : y + 4, x - 3 : x + 4].ravel()
+    darker = np.delete(window, 24) < image[y, x]
     assert f"{int(bits[y, x]):048b}" == "".join(str(int(d)) for d in darker)
 
 
@@ -87,7 +87,7 @@ def looked_at(pair: Pair, step: int) -> Segments:
 
 
 def plane_seen(pair: Pair, depth: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Alpha and beta pictures (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in beta."""
+    """Alpha and beta images (1, 1, H, W) of a textured plane that faces alpha, and its pixels' places in beta."""
     rough = torch.rand(1, 1, 40, 60, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def texture(X):
@@ -114,8 +114,8 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     alpha, beta, where = plane_seen(pair, 2.0)
     colours = beta * torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1).double()
     segments = looked_at(pair, 1)
-    found = consensus(alpha, beta, colours, segments, looked_at(pair, 2))
-    position = matches(segments, found.reach)[0]
+    found = semi_global_matching(alpha, beta, colours, segments, looked_at(pair, 2))
+    position = matches(segments, found.disparity)[0]
     inner = torch.zeros(HW, dtype=torch.bool)
     inner[8:-8, 8:-8] = True
     seen = inner & (where > 4).all(-1) & (where < torch.tensor([107.0, 75.0])).all(-1)
@@ -132,26 +132,26 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
     call = alpha, beta, beta, looked_at(pair, 1), looked_at(pair, 2)
-    whole = consensus(*call)
+    whole = semi_global_matching(*call)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1 if threads > 1 else 3)
-        again = consensus(*call)
+        again = semi_global_matching(*call)
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for a, b in zip(whole, again))
     monkeypatch.setattr(pat.networks.semi_global, "BLOCK", 16)
-    pieces = consensus(*call)
-    assert (pieces.reach - whole.reach).abs().median() < 1e-3
+    pieces = semi_global_matching(*call)
+    assert (pieces.disparity - whole.disparity).abs().median() < 1e-3
 
 
-def test_a_batch_is_its_pictures_one_by_one():
+def test_a_batch_is_its_images_one_by_one():
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
     fine, coarse = looked_at(pair, 1), looked_at(pair, 2)
-    one = consensus(alpha, beta, beta, fine, coarse)
-    other = consensus(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
-    both = consensus(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
+    one = semi_global_matching(alpha, beta, beta, fine, coarse)
+    other = semi_global_matching(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
+    both = semi_global_matching(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
     for a, b, c in zip(one, other, both):
         assert torch.equal(torch.cat([a, b]), c)
 
@@ -159,15 +159,15 @@ def test_a_batch_is_its_pictures_one_by_one():
 def test_nowhere_to_look_is_nothing_found():
     x = torch.zeros(1, 32, 48, 2)
     nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
-    found = consensus(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
-    assert found.reach.abs().max() == 0
+    found = semi_global_matching(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
+    assert found.disparity.abs().max() == 0
     assert found.colour.isfinite().all()
 
 
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
-    cut = Consensus(half, half, whole + 1, whole).cut((4, 10, 2, 16))
-    assert torch.equal(cut.reach, half[..., 2:5, 1:8])
+    cut = SemiGlobalMatches(half, half, whole + 1, whole).cut((4, 10, 2, 16))
+    assert torch.equal(cut.disparity, half[..., 2:5, 1:8])
     assert torch.equal(cut.colour, whole[..., 4:10, 2:16])
     assert torch.equal(cut.matched, whole[..., 4:10, 2:16] + 1)
 
@@ -184,16 +184,16 @@ def test_what_nothing_sees_varies_with_brightness_as_nearby():
     assert np.abs(found - colour)[:, :, 16:].mean() < 0.6 * np.abs(colour - colour.mean()).mean()
 
 
-def blurred(picture: torch.Tensor, blur: float) -> torch.Tensor:
-    return torch.from_numpy(cv2.GaussianBlur(picture[0, 0].numpy(), (0, 0), blur))[None, None]
+def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
+    return torch.from_numpy(cv2.GaussianBlur(image[0, 0].numpy(), (0, 0), blur))[None, None]
 
 
-def test_the_sharper_of_two_pictures_is_blurred_whichever_it_is():
+def test_the_sharper_of_two_images_is_blurred_whichever_it_is():
     sharp = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     soft = blurred(sharp, 1.25)
     own, its = equalising_blurs(sharp, soft)
     assert its == [0.0]
-    one, other = Balance(torch.zeros(3, 1, 1, 1, 1), (own, its)).equally_sharp(sharp, soft)
+    one, other = Normalisation(torch.zeros(3, 1, 1, 1, 1), (own, its)).equally_sharp(sharp, soft)
     assert torch.equal(other, soft)
     assert (one - soft).abs().mean() < 0.05 * (sharp - soft).abs().mean()
     assert equalising_blurs(soft, sharp) == (its, own)
@@ -205,27 +205,29 @@ def test_parts_are_balanced_as_the_whole_is():
     alpha = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     alpha[..., 40:] = 0.3 * blurred(alpha, 2.0)[..., 40:]
     beta = 0.5 * blurred(alpha, 1.0) + 0.2
-    balance = Balance.of(alpha, beta)
-    level = balance.levelled(beta)
+    normalisation = Normalisation.of(alpha, beta)
+    level = normalisation.normalised(beta)
     assert abs(float(level.mean() - alpha.mean())) < 1e-5
     assert abs(float(level.std() - alpha.std())) < 1e-5
-    assert balance.blurs[0] != [0.0]
-    assert torch.equal(balance.levelled(beta[..., 40:]), level[..., 40:])
-    sharp, part = (balance.equally_sharp(a, b) for a, b in ((alpha, level), (alpha[..., 40:], level[..., 40:])))
+    assert normalisation.blurs[0] != [0.0]
+    assert torch.equal(normalisation.normalised(beta[..., 40:]), level[..., 40:])
+    sharp, part = (normalisation.equally_sharp(a, b) for a, b in ((alpha, level), (alpha[..., 40:], level[..., 40:])))
     assert torch.allclose(part[0][..., 20:], sharp[0][..., 60:], atol=1e-6)
-    assert Balance.of(alpha[..., 40:], beta[..., 40:]).blurs != balance.blurs
+    assert Normalisation.of(alpha[..., 40:], beta[..., 40:]).blurs != normalisation.blurs
 
 
 def test_a_match_has_the_detail_that_beta_lost():
     """One view for both cameras: a quarter or more of the error of colour that beta's blur made is gone."""
     coarse = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(2))
     alpha = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
-    truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor([0.0, 0.1, 0.2]).view(1, 3, 1, 1)
-    beta = torch.cat([blurred(band, 1.0) for band in truth.split(1, 1)], 1)
+    ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor([0.0, 0.1, 0.2]).view(
+        1, 3, 1, 1
+    )
+    beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
     fine, coarse = (pixel_grid((48 // s, 64 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
     here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in (fine, coarse)]
-    found = consensus(alpha, luminance(beta), beta, *here)
-    chroma = [picture - luminance(picture) for picture in (found.matched, beta, truth)]
+    found = semi_global_matching(alpha, luminance(beta), beta, *here)
+    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
     left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].abs().mean() for c in chroma[:2])
     assert left < 0.75 * lost
 
@@ -238,18 +240,18 @@ def test_colour_that_does_not_follow_brightness_is_left_alone():
     )
     alpha = 0.35 + 0.3 * fine
     other = other.roll((2, 2), (-1, -2)) - 0.5
-    truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
-    beta = torch.cat([blurred(band, 1.0) for band in truth.split(1, 1)], 1)
+    ground_truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
+    beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
     places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
     here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
-    found = consensus(alpha, luminance(beta), beta, *here)
-    chroma = [picture - luminance(picture) for picture in (found.matched, beta, truth)]
+    found = semi_global_matching(alpha, luminance(beta), beta, *here)
+    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
     left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].square().mean() for c in chroma[:2])
     assert left < 1.05 * lost
 
 
 def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
-    """Two pictures of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
+    """Two images of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
     alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
     view = View(hw=(alpha.shape[-2], width))
     look = lazily(Rectified(64.0), Pair(view, view))
@@ -274,8 +276,8 @@ def test_what_lies_beyond_the_edge_of_beta_is_not_looked_for_within_it():
     """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
-    found = consensus(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
-    assert ((found.reach[..., 22:36] - 40).abs() < 2).float().mean() > 0.98
+    found = semi_global_matching(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
+    assert ((found.disparity[..., 22:36] - 40).abs() < 2).float().mean() > 0.98
     assert (found.facts[:, 0, :, :17] > pat.networks.semi_global.CONSISTENT).float().mean() > 0.845
 
 
@@ -289,19 +291,19 @@ def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut
     kernels.costs(own, bits, other, its, ends, along, length, edge, cost)
     unlike = 48 + int(kernels.TRUNCATED)
     assert cost.ravel().tolist() == [unlike] * 3 + [beyond] * 2
-    reach, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 3), np.float32)
-    kernels.winners(cost.astype(np.float32), ends, along, length, edge, 1, 9, reach, facts)
-    assert (reach[0, 0] > 2) == (cut == 1)
+    disparity, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 3), np.float32)
+    kernels.winners(cost.astype(np.float32), ends, along, length, edge, 1, 9, disparity, facts)
+    assert (disparity[0, 0] > 2) == (cut == 1)
     assert (facts[0, 0, 0] == 1) == (cut == 1)
 
 
-def test_colour_at_matches_does_not_hang_on_what_the_other_picture_shows_elsewhere():
-    """Alpha alone sees something dark on the left: whole pictures have other levels, what both see has the same."""
+def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere():
+    """Alpha alone sees something dark on the left: whole images have other levels, what both see has the same."""
     scene = faint(1, contrast=0.1, blur=3.0)
     scene[..., :48] -= 0.35
     tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
     alpha, beta, segments = beside(scene, 48)
-    found = consensus(alpha, beta, beta * tint, *segments)
+    found = semi_global_matching(alpha, beta, beta * tint, *segments)
     assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
 
 
@@ -310,14 +312,14 @@ def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
     g = torch.Generator().manual_seed(2)
     coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
     alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)
-    truth = 0.8 - 0.6 * alpha
-    beta = blurred(truth, 1.5)
+    ground_truth = 0.8 - 0.6 * alpha
+    beta = blurred(ground_truth, 1.5)
     places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
     here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
-    found = consensus(alpha, beta, beta, *here).matched + alpha
-    left, lost = ((p - truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
+    found = semi_global_matching(alpha, beta, beta, *here).matched + alpha
+    left, lost = ((p - ground_truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
     assert left < 0.7 * lost
 
 
-def enlarged(picture: torch.Tensor, times: int) -> torch.Tensor:
-    return picture.repeat_interleave(times, -1).repeat_interleave(times, -2)
+def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
+    return image.repeat_interleave(times, -1).repeat_interleave(times, -2)

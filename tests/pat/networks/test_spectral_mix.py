@@ -8,7 +8,7 @@ from arraygeom import Pair, Rectified, View
 from pat.networks.guided import segments_of
 from pat.networks.protocol import Look
 from pat.networks.semi_global import box_mean
-from pat.networks.spectral_mix import Mix, coarse_mix
+from pat.networks.spectral_mix import SpectralMix, coarse_mix
 
 WEIGHTS = torch.tensor([0.3, 0.6, 0.1])
 
@@ -29,7 +29,7 @@ def test_the_combination_is_that_of_least_squares_around_each_pixel():
     bands = texture(3, (48, 64))
     drift = torch.linspace(0, 0.2, 64).expand(1, 1, 48, 64)
     alpha = seen_in(bands) + 0.05 + 0.01 * torch.randn(1, 1, 48, 64, generator=torch.Generator().manual_seed(1))
-    mix = Mix.fitted(bands, alpha + drift, torch.ones_like(alpha))
+    mix = SpectralMix.fitted(bands, alpha + drift, torch.ones_like(alpha))
     local = [(p - box_mean(p, 16)).flatten(2)[0].double().numpy() for p in (bands, alpha + drift)]
     expected = np.linalg.lstsq(local[0].T, local[1][0], rcond=None)[0]
     assert np.abs(mix.weights[0].numpy() / np.sum(mix.weights[0].numpy()) - expected / expected.sum()).max() < 0.01
@@ -43,7 +43,7 @@ def test_slopes_are_those_of_detail_whatever_materials_do():
     pattern, left = 0.2 * torch.rand(48, 64, generator=g), torch.zeros(48, 64)
     left[:, :32] = 0.5
     bands = torch.stack([pattern + left, 2 * pattern + 0.5 - left, torch.full_like(left, 0.3)])[None]
-    mix = Mix.fitted(bands, bands.mean(1, keepdim=True), torch.ones(1, 1, 48, 64))
+    mix = SpectralMix.fitted(bands, bands.mean(1, keepdim=True), torch.ones(1, 1, 48, 64))
     assert (mix.slopes[0] - torch.tensor([1.0, 2.0, 0.0])).abs().max() < 0.1
 
 
@@ -51,14 +51,14 @@ def test_what_is_not_alpha_at_all_does_not_count():
     bands = texture(3, (48, 64))
     alpha = seen_in(bands)
     alpha[..., :8] = 1.0
-    mix = Mix.fitted(bands, alpha, torch.ones_like(alpha))
+    mix = SpectralMix.fitted(bands, alpha, torch.ones_like(alpha))
     assert (mix.weights[0] - WEIGHTS).abs().max() < 0.05
 
 
 def test_alpha_corrects_bands_only_where_these_explain_it():
     bands = texture(3, (48, 64))
     alpha, other = seen_in(bands), texture(1, (48, 64), seed=5)
-    known, foreign = (Mix.fitted(bands, a, torch.ones_like(a)) for a in (alpha, other))
+    known, foreign = (SpectralMix.fitted(bands, a, torch.ones_like(a)) for a in (alpha, other))
     assert float(known.gain) > 0.99
     assert float(foreign.gain) < 0.01
     wrong = bands + 0.05 * torch.randn(bands.shape, generator=torch.Generator().manual_seed(2))
@@ -71,7 +71,7 @@ def test_alpha_corrects_bands_only_where_these_explain_it():
 def test_the_order_of_bands_does_not_matter_to_the_last_bit():
     bands, order = texture(4, (48, 64)), [2, 0, 3, 1]
     alpha = bands[:, :2].mean(1, keepdim=True)
-    one, other = (Mix.fitted(b, alpha, torch.ones_like(alpha)) for b in (bands, bands[:, order]))
+    one, other = (SpectralMix.fitted(b, alpha, torch.ones_like(alpha)) for b in (bands, bands[:, order]))
     assert torch.equal(other.weights, one.weights[:, order])
     assert torch.equal(other.slopes, one.slopes[:, order])
     assert torch.equal(other.of(bands[:, order]), one.of(bands))

@@ -46,7 +46,7 @@ def test_a_mosaic_keeps_the_colours_its_name_says(pattern):
 
 @pytest.mark.parametrize("pattern", PATTERNS)
 @pytest.mark.parametrize(("method", "tolerance"), [("bilinear", 0.01), ("edge-aware", 0.01)])
-def test_smooth_pictures_come_back_from_mosaic_and_demosaic(pattern, method, tolerance):
+def test_smooth_images_come_back_from_mosaic_and_demosaic(pattern, method, tolerance):
     image = smooth(2, 3, 60, 80)
     back = record(image, [Mosaic(pattern), Demosaic(pattern, method)], generator()).image
     error = (back - image)[..., 3:-3, 3:-3].abs()
@@ -73,7 +73,7 @@ def test_bilinear_agrees_with_opencv():
 
 
 @pytest.mark.parametrize("steps", [[Mosaic("GRBG"), Demosaic("GRBG")], [Crop(1, 2, (3, 4))]], ids=["mosaic", "crop"])
-def test_gradients_in_the_picture(steps):
+def test_gradients_in_the_image(steps):
     image = torch.rand(1, 3, 4, 6, generator=generator(), dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: record(x, steps, generator()).image, image)
 
@@ -100,8 +100,8 @@ CHAINS = {
 
 @pytest.mark.parametrize("lens", [None, Distortion("brown-conrady", torch.tensor([-0.1, 0.02, 0.0, 0.0]).double())])
 @pytest.mark.parametrize("chain", CHAINS)
-def test_points_are_found_where_the_rig_of_the_recorded_pictures_projects_them(chain, lens):
-    """Soft dots are drawn where 3-D points project in the ideal pictures of two cameras, then recorded."""
+def test_points_are_found_where_the_rig_of_the_recorded_images_projects_them(chain, lens):
+    """Soft dots are drawn where 3-D points project in the ideal images of two cameras, then recorded."""
     turned = Pose(
         rotation_from_vector(torch.tensor([0.02, -0.05, 0.1]).double()), torch.tensor([0.1, 0.02, 0]).double()
     )
@@ -149,7 +149,7 @@ def test_each_camera_draws_for_itself():
 
 def test_mistakes_are_told():
     image = torch.rand(1, 3, 7, 8)
-    for step, words in ((Mosaic(), "even"), (Crop(4, 0, (5, 5)), "leaves the picture")):
+    for step, words in ((Mosaic(), "even"), (Crop(4, 0, (5, 5)), "leaves the image")):
         with pytest.raises(ValueError, match=words):
             record(image, [step], generator())
     rig = Rig({"mono": Camera(K=intrinsics(9.0, (8, 8)), cam_from_world=Pose.identity(), hw=(8, 8))})

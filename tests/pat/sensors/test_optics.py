@@ -62,7 +62,7 @@ def test_the_disc_is_an_ellipse_where_pixels_are_not_square():
     assert (y / x) ** 0.5 == pytest.approx(1.5, rel=0.03)
 
 
-def test_in_focus_nothing_changes_and_flat_pictures_stay_flat():
+def test_in_focus_nothing_changes_and_flat_images_stay_flat():
     image = torch.rand(2, 3, *HW, generator=generator(), dtype=torch.float64)
     torch.testing.assert_close(defocused(image, at(2.0).expand(2, -1, -1)), image)
     depth = 0.7 + 5 * torch.rand(2, *HW, generator=generator(), dtype=torch.float64)
@@ -106,7 +106,7 @@ def test_defocus_follows_the_resampled_camera():
     assert variances(seen.image)[0] == pytest.approx(variances(whole.image)[0] / 4, rel=0.1)
 
 
-def test_gradients_of_defocus_in_picture_and_depth():
+def test_gradients_of_defocus_in_image_and_depth():
     g = generator()
     image = torch.rand(1, 1, 7, 8, generator=g, dtype=torch.float64, requires_grad=True)
     depth = (1.2 + 0.1 * torch.rand(1, 7, 8, generator=g, dtype=torch.float64)).requires_grad_()
@@ -133,7 +133,7 @@ def test_motion_of_every_pixel_blurs_as_the_same_velocity():
     torch.testing.assert_close(one, other)
 
 
-def test_motion_follows_the_resampled_picture():
+def test_motion_follows_the_resampled_image():
     motion = torch.tensor([600.0, 0.0]).double()[:, None, None].expand(1, 2, *HW)
     spread = record(point(), [Resample((61, 162)), MotionBlur(0.02)], generator(), motion=motion).image
     assert (12 * variances(spread)[0]) ** 0.5 == pytest.approx(24, rel=0.05)
@@ -165,7 +165,7 @@ def test_vignetting_is_centred_on_the_principal_point():
 
 
 @pytest.mark.parametrize("step", [MotionBlur(1.0, (2.3, -1.1)), Vignetting((-0.3, 0.1)), GaussianBlur(1.0)], ids=str)
-def test_gradients_in_the_picture(step):
+def test_gradients_in_the_image(step):
     image = torch.rand(1, 2, 6, 8, generator=generator(), dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda x: record(x, [step], generator()).image, image)
 

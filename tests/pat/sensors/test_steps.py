@@ -31,7 +31,7 @@ def generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
 
 
-def noise_picture(*shape: int) -> torch.Tensor:
+def noise_image(*shape: int) -> torch.Tensor:
     return torch.rand(*shape, generator=generator(), dtype=torch.float64)
 
 
@@ -65,7 +65,7 @@ def test_poisson_counts_whole_electrons_and_passes_the_gradient_of_the_mean():
     assert (image.grad == 1000).all()
 
 
-def test_noise_is_seeded_and_differs_between_pictures():
+def test_noise_is_seeded_and_differs_between_images():
     flat = torch.full((2, 1, 4, 4), 0.5)
     a, b, c = (run(flat, Noise(100), seed=s) for s in (1, 1, 2))
     assert torch.equal(a, b)
@@ -75,18 +75,18 @@ def test_noise_is_seeded_and_differs_between_pictures():
 
 @pytest.mark.parametrize("to", [0.5, 0.25, (20, 33), (50, 90), 2.0])
 def test_area_resampling_keeps_the_mean(to):
-    image = noise_picture(2, 3, 40, 72)
+    image = noise_image(2, 3, 40, 72)
     torch.testing.assert_close(run(image, Resample(to)).mean((2, 3)), image.mean((2, 3)))
 
 
-def test_bicubic_resampling_keeps_the_mean_of_smooth_pictures():
-    image = run(noise_picture(1, 1, 80, 80), GaussianBlur(3.0))
+def test_bicubic_resampling_keeps_the_mean_of_smooth_images():
+    image = run(noise_image(1, 1, 80, 80), GaussianBlur(3.0))
     for to in (0.5, 2.0, (37, 61)):
         assert run(image, Resample(to, "bicubic")).mean() == pytest.approx(image.mean().item(), abs=1e-3)
 
 
 def test_area_resampling_agrees_with_opencv():
-    image = noise_picture(1, 1, 60, 90)
+    image = noise_image(1, 1, 60, 90)
     for hw in ((30, 45), (24, 60), (17, 29)):
         wanted = cv2.resize(image[0, 0].numpy(), hw[::-1], interpolation=cv2.INTER_AREA)
         np.testing.assert_allclose(run(image, Resample(hw))[0, 0].numpy(), wanted, atol=1e-6)
@@ -94,7 +94,7 @@ def test_area_resampling_agrees_with_opencv():
 
 @pytest.mark.parametrize("method", ["area", "bicubic"])
 @pytest.mark.parametrize("to", [0.5, 0.25, (31, 70), 2.0])
-def test_points_stay_where_the_camera_of_the_resampled_picture_puts_them(method, to):
+def test_points_stay_where_the_camera_of_the_resampled_image_puts_them(method, to):
     """A soft dot drawn where a point projects is found where the mapped camera projects the point."""
     K = intrinsics(90.0, (64, 96))
     camera = Camera(K=K, cam_from_world=Pose.identity(), hw=(64, 96))
@@ -103,20 +103,20 @@ def test_points_stay_where_the_camera_of_the_resampled_picture_puts_them(method,
     rows, columns = torch.meshgrid(torch.arange(64.0), torch.arange(96.0), indexing="ij")
     dot = torch.exp(-((columns - x) ** 2 + (rows - y) ** 2) / (2 * 4**2)).double()[None, None]
     image, pixels = record(dot, [GaussianBlur(1.0), Resample(to, method)], generator())
-    new = camera.mapped(pixels, tuple(image.shape[-2:]))
+    new = camera.transformed(pixels, tuple(image.shape[-2:]))
     rows, columns = torch.meshgrid(*(torch.arange(float(n)) for n in image.shape[-2:]), indexing="ij")
     found = [(image[0, 0] * c).sum() / image.sum() for c in (columns, rows)]
     torch.testing.assert_close(torch.stack(found), new.project(X).x, atol=0.01, rtol=0)
 
 
 def test_maps_of_several_steps_compose():
-    image = noise_picture(1, 1, 60, 80)
+    image = noise_image(1, 1, 60, 80)
     pixels = record(image, [Resample(0.5), BoxBlur(3), Resample((45, 20))], generator()).pixels
     direct = Resample((45, 20)).pixel_matrix((60, 80))
     torch.testing.assert_close(pixels, direct)
 
 
-def test_blurs_keep_flat_pictures_and_spread_a_point_as_stated():
+def test_blurs_keep_flat_images_and_spread_a_point_as_stated():
     point = torch.zeros(1, 1, 41, 41, dtype=torch.float64)
     point[..., 20, 20] = 1
     x = torch.arange(41.0).double() - 20
@@ -129,7 +129,7 @@ def test_blurs_keep_flat_pictures_and_spread_a_point_as_stated():
 
 
 def test_blurs_agree_with_opencv():
-    image = noise_picture(1, 1, 30, 40)
+    image = noise_image(1, 1, 30, 40)
     box = cv2.blur(image[0, 0].numpy(), (5, 5), borderType=cv2.BORDER_REPLICATE)
     np.testing.assert_allclose(run(image, BoxBlur(5))[0, 0].numpy(), box, atol=1e-12)
     gauss = cv2.GaussianBlur(image[0, 0].numpy(), (13, 13), 1.5, borderType=cv2.BORDER_REPLICATE)
@@ -137,7 +137,7 @@ def test_blurs_agree_with_opencv():
 
 
 def test_spectral_responses():
-    image = noise_picture(2, 3, 4, 5)
+    image = noise_image(2, 3, 4, 5)
     assert torch.equal(run(image, Spectral("rgb")), image)
     grey = run(image, Spectral("luminance"))
     wanted = np.stack([cv2.cvtColor(i.movedim(0, -1).float().numpy(), cv2.COLOR_RGB2GRAY) for i in image])
@@ -149,8 +149,8 @@ def test_spectral_responses():
     assert run(red, Spectral(Band(620, 20))).item() > 0.85 > 0.1 > run(red, Spectral(Band(450, 20))).item()
 
 
-def test_responses_of_a_picture_with_near_infrared():
-    image = noise_picture(2, 4, 4, 5)
+def test_responses_of_a_image_with_near_infrared():
+    image = noise_image(2, 4, 4, 5)
     assert torch.equal(run(image, Spectral("rgb")), image[:, :3])
     assert torch.equal(run(image, Spectral("nir")), image[:, 3:])
     torch.testing.assert_close(run(image, Spectral("luminance")), run(image[:, :3], Spectral("luminance")))
@@ -163,7 +163,7 @@ def test_a_curve_that_samples_a_band_weighs_as_the_band():
     band = Band(560, 50)
     nm = np.linspace(350, 1000, 651)
     curve = Curve(tuple(nm), tuple(np.exp(-4 * np.log(2) * ((nm - band.centre) / band.width) ** 2)))
-    image = noise_picture(2, 4, 4, 5)
+    image = noise_image(2, 4, 4, 5)
     torch.testing.assert_close(run(image, Spectral(curve)), run(image, Spectral(band)), atol=1e-6, rtol=0)
 
 
@@ -172,15 +172,15 @@ def test_gamma_is_a_power():
 
 
 def test_quantise_rounds_to_levels():
-    image = noise_picture(1, 1, 8, 8) * 1.2 - 0.1
+    image = noise_image(1, 1, 8, 8) * 1.2 - 0.1
     levels = run(image, Quantise(4)) * 15
     torch.testing.assert_close(levels, levels.round())
     assert (run(image, Quantise(8)) - image.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-12
 
 
-def test_jitter_changes_each_picture_by_about_what_is_asked():
+def test_jitter_changes_each_image_by_about_what_is_asked():
     grey = torch.full((4000, 3, 1, 1), 0.4)
-    jittered = run(grey, Jitter(gain=0.05, gamma=0.0, balance=0.0))
+    jittered = run(grey, Jitter(gain=0.05, gamma=0.0, normalisation=0.0))
     assert (jittered / 0.4).log().std().item() == pytest.approx(0.05, rel=0.05)
     assert (jittered.std(1) < 1e-6).all()
     assert (run(grey, Jitter(0.0, 0.0, 0.05)).std(1) > 1e-3).float().mean() > 0.9
@@ -195,14 +195,14 @@ def test_jitter_changes_each_picture_by_about_what_is_asked():
     ],
     ids=lambda s: type(s).__name__,
 )
-def test_gradients_in_the_picture(step):
-    image = (0.1 + 0.8 * noise_picture(1, 3, 6, 8)).requires_grad_()
+def test_gradients_in_the_image(step):
+    image = (0.1 + 0.8 * noise_image(1, 3, 6, 8)).requires_grad_()
     assert torch.autograd.gradcheck(lambda x: run(x, step), image)
 
 
 @pytest.mark.parametrize("step", [GaussianBlur, DiscBlur, Exposure])
 def test_gradients_in_the_parameter(step):
-    image = noise_picture(1, 1, 9, 9)
+    image = noise_image(1, 1, 9, 9)
     parameter = torch.tensor(1.23, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(lambda p: run(image, step(p)), parameter)
 
@@ -214,7 +214,7 @@ def test_quantise_lets_the_gradient_pass_where_not_clipped():
 
 
 def test_the_four_cases_are_equally_likely_and_do_what_they_say():
-    alpha, beta = noise_picture(400, 1, 8, 16), noise_picture(400, 3, 8, 16)
+    alpha, beta = noise_image(400, 1, 8, 16), noise_image(400, 3, 8, 16)
     pairs = augment(alpha, beta, paper_cases(), generator())
     assert (torch.bincount(pairs.case, minlength=4) - 100).abs().max() < 35
     changed = torch.stack([(a != b).flatten(1).any(1) for a, b in ((pairs.alpha, alpha), (pairs.beta, beta))], 1)
@@ -229,14 +229,12 @@ def test_mistakes_are_told():
     with pytest.raises(ValueError, match="odd"):
         BoxBlur(4)
     with pytest.raises(ValueError, match="900 nm"):
-        run(noise_picture(1, 3, 4, 4), Spectral(Band(900, 20)))
+        run(noise_image(1, 3, 4, 4), Spectral(Band(900, 20)))
     with pytest.raises(ValueError, match="NIR channel"):
-        run(noise_picture(1, 3, 4, 4), Spectral("nir"))
+        run(noise_image(1, 3, 4, 4), Spectral("nir"))
     with pytest.raises(ValueError, match="collects no light"):
-        run(noise_picture(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
+        run(noise_image(1, 3, 4, 4), Spectral(Curve((1500.0, 1600.0), (1.0, 1.0))))
     with pytest.raises(ValueError, match="full_well > 0"):
         Noise(0)
     with pytest.raises(ValueError, match="must keep the size"):
-        augment(
-            noise_picture(1, 1, 8, 8), noise_picture(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator()
-        )
+        augment(noise_image(1, 1, 8, 8), noise_image(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator())

@@ -61,7 +61,7 @@ def test_workers_do_the_same_and_say_the_same(tmp_path):
 
 
 def test_local_workers_keep_freed_memory(monkeypatch):
-    """With Dask's own setting glibc gives back every freed picture at once, and two workers were slower than one."""
+    """With Dask's own setting glibc gives back every freed image at once, and two workers were slower than one."""
     for name in ("MALLOC_TRIM_THRESHOLD_", "OMP_NUM_THREADS"):
         monkeypatch.delenv(name, raising=False)
     with Workers(2).client() as client:

@@ -7,28 +7,28 @@ from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from pat.synthesis.check import Limits, check_views
-from pat.synthesis.rendered import Frame
+from pat.synthesis.rendered import RenderedFrame
 from tests.pat.synthesis.scenes import LENS, posed
 
 HW = (60, 80)
 
 
-def seen(camera: Camera) -> Frame:
+def seen(camera: Camera) -> RenderedFrame:
     """A slanted wall with a smaller wall in front of its left part, both with smooth colours."""
     x = pixel_grid(camera.hw, dtype=torch.float64)
     rays = camera.unproject(x, torch.ones(camera.hw, dtype=torch.float64)) - camera.centre
 
-    def reach(normal, d):
+    def disparity(normal, d):
         n = torch.tensor(normal, dtype=torch.float64)
         return (d - n @ camera.centre) / (rays @ n)
 
-    wall, front = reach([0.3, 0.1, 1.0], 6.0), reach([-0.1, 0.2, 1.0], 3.0)
+    wall, front = disparity([0.3, 0.1, 1.0], 6.0), disparity([-0.1, 0.2, 1.0], 3.0)
     X = camera.centre + front[..., None] * rays
     near = (X[..., 0] < 0) & (X[..., 1].abs() < 0.8)
     depth = torch.where(near, front, wall)
     X = camera.centre + depth[..., None] * rays
     rgb = 0.5 + 0.3 * torch.sin(3 * X + near[..., None])
-    return Frame(time=0.0, rgb=rgb.movedim(-1, 0).float(), depth=depth.float(), index=near.long() + 1)
+    return RenderedFrame(time=0.0, rgb=rgb.movedim(-1, 0).float(), depth=depth.float(), index=near.long() + 1)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def rig() -> Rig:
 
 
 @pytest.fixture(scope="module")
-def frames(rig) -> dict[str, Frame]:
+def frames(rig) -> dict[str, RenderedFrame]:
     return {name: seen(camera) for name, camera in rig.cameras.items()}
 
 
@@ -87,10 +87,10 @@ def test_a_view_that_sees_through_surfaces_is_found(rig, frames):
     [
         (torch.zeros(3, *HW), "black"),
         (torch.full((3, *HW), 2.0), "saturated"),
-        (torch.full((3, *HW), 0.5), "0% of the picture has texture"),
+        (torch.full((3, *HW), 0.5), "0% of the image has texture"),
     ],
 )
-def test_poor_pictures_are_found(rig, frames, rgb, said):
+def test_poor_images_are_found(rig, frames, rgb, said):
     report = check_views(rig, {**frames, "a": dataclasses.replace(frames["a"], rgb=rgb)})
     assert any(reason.startswith("a: ") and said in reason for reason in report.reasons)
 

@@ -16,7 +16,7 @@ BOARD = Board(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50"
 
 
 def depths(scene: Scene, camera: Camera) -> torch.Tensor:
-    """Depths of all vertices that the camera's picture holds."""
+    """Depths of all vertices that the camera's image holds."""
     found = []
     for thing in scene.objects:
         place = thing.motion.at(0)
@@ -58,12 +58,12 @@ def test_photographs_come_from_the_folder(tmp_path):
     for name in ("a", "b"):
         write_image(tmp_path / f"{name}.png", torch.rand(3, 40, 60))
     scene = photographs(1, unlike_cameras(), tmp_path)
-    used = {o.material.texture.picture for o in scene.objects}
+    used = {o.material.texture.image for o in scene.objects}
     assert used == {str(tmp_path / "a.png"), str(tmp_path / "b.png")}
 
 
 def test_what_cannot_be_generated_is_said(tmp_path):
-    with pytest.raises(ValueError, match="no pictures"):
+    with pytest.raises(ValueError, match="no images"):
         photographs(0, unlike_cameras(), tmp_path)
     with pytest.raises(ValueError, match="no calibrated camera"):
         abstract(0, Rig({"a": View(hw=(4, 4))}))

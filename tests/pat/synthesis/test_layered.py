@@ -59,7 +59,7 @@ def test_no_shift_between_views_of_different_resolution(smooth, mode, resolution
 
 
 def test_occlusion_is_seen_from_both_sides(rich):
-    """What alpha sees and beta's picture covers is either visible there or behind something nearer."""
+    """What alpha sees and beta's image covers is either visible there or behind something nearer."""
     batch = draw(rich, RigDistribution(resolutions=(1.0,)), 8)
     across = look_across(batch)
     inside = batch.cameras[1].contains(across.x)

@@ -85,7 +85,7 @@ def test_solids_are_closed_and_face_outwards(shape, relief):
 
 
 @pytest.mark.parametrize("shape", [*SOLIDS, "plane"])
-def test_pictures_on_surfaces_are_not_mirrored(shape):
+def test_images_on_surfaces_are_not_mirrored(shape):
     """Seen from outside, u is right where v is down, and lengths are true on flat faces."""
     surface = mesh(thing(shape, (0, 0, 0), extent=(2.0, 1.0, 1.5)))
     a, b, c, _ = (x[:, 0] for x in corners(surface))

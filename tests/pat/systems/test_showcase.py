@@ -24,21 +24,21 @@ PLANE = 2.0
 def texture(hw, seed=0):
     """Colours (3, H, W) in blobs of many sizes."""
     noise = np.random.default_rng(seed).standard_normal((*hw, 3)).astype(np.float32)
-    picture = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.2, 2.5, 5))
-    return torch.from_numpy(((picture - picture.min()) / np.ptp(picture)).transpose(2, 0, 1).copy())
+    image = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.2, 2.5, 5))
+    return torch.from_numpy(((image - image.min()) / np.ptp(image)).transpose(2, 0, 1).copy())
 
 
-def moved(picture, H, hw):
-    """The picture in another camera, x' ~ H x."""
-    planes = np.ascontiguousarray(picture.movedim(0, -1).numpy())
+def moved(image, H, hw):
+    """The image in another camera, x' ~ H x."""
+    planes = np.ascontiguousarray(image.movedim(0, -1).numpy())
     warped = cv2.warpPerspective(planes, np.asarray(H), hw[::-1], flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
     return torch.from_numpy(np.atleast_3d(warped)).movedim(-1, 0).clamp(0, 1)
 
 
 def write_pair(left, right, *, disparity=4, seed=0):
-    picture = texture((48, 64 + disparity), seed)
-    write_image(left, picture[..., :-disparity])
-    write_image(right, picture[..., disparity:])
+    image = texture((48, 64 + disparity), seed)
+    write_image(left, image[..., :-disparity])
+    write_image(right, image[..., disparity:])
 
 
 def syntim_rig() -> Rig:

@@ -9,7 +9,7 @@ import torch
 import pat.systems.stage
 from arraygeom import Rig
 from pat.cli.main import main
-from pat.fusion.results import FusedFrame
+from pat.fusion.results import Frame
 from pat.fusion.steps import pitch_ratio
 from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb
@@ -89,7 +89,7 @@ def test_a_layer_moved_sideways_is_displaced_by_focal_over_depth(tiny):
     assert off[1] < min(off[0], off[2])
 
 
-def test_large_pictures_are_rendered_in_bands(tiny, monkeypatch):
+def test_large_images_are_rendered_in_bands(tiny, monkeypatch):
     s = stage("wide-narrow")
     image, depth = s.seen("wide")
     h, w = depth.shape
@@ -161,7 +161,7 @@ def test_merged_exposures_tell_more_than_alpha(tiny):
         rig = rig.with_camera(name, rig["alpha"].replace(cam_from_world=one_place, sensor=rig[name].sensor))
     limit = {"alpha": 1.0, "red": 1 / 0.9, "green": 1 / 0.54, "blue": 1 / 1.44}
     images = {name: coded(light.clamp(max=limit[name])) for name in rig.names}
-    frame = FusedFrame(images["alpha"].expand(3, -1, -1), torch.full((h, w), 5.0), torch.ones(h, w))
+    frame = Frame(images["alpha"].expand(3, -1, -1), torch.full((h, w), 5.0), torch.ones(h, w))
     told = linear_from_srgb(merged(frame, rig, images, "alpha").image)[1]
     off = ((told - light[0]) / light[0]).abs()
     assert off[:, light[0, 0] < 1.7].max() < 0.02

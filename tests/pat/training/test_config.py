@@ -73,9 +73,9 @@ def test_what_is_wrong_is_named_in_one_line(text, message):
 
 
 def test_numbers_as_people_write_them():
-    config = parse_config("{rate: 8e-4, minutes: inf, steps: 1e5, photos: ~/pictures, start: null}")
+    config = parse_config("{rate: 8e-4, minutes: inf, steps: 1e5, photos: ~/images, start: null}")
     assert (config.rate, config.minutes, config.steps) == (8e-4, float("inf"), 100_000)
-    assert config.photos == (Path.home() / "pictures",)
+    assert config.photos == (Path.home() / "images",)
 
 
 def test_the_command_line_goes_over_the_recipe(tmp_path):

@@ -75,7 +75,7 @@ def test_a_run_leaves_what_it_says(whole):
     lines = [json.loads(line) for line in (whole.out / "log.jsonl").read_text().splitlines()]
     assert [line["step"] for line in lines] == [4, 8]
     assert len(losses(whole.out)) == 1 + 8
-    assert sorted(p.name for p in (whole.out / "pictures").iterdir()) == ["step-000004.png", "step-000008.png"]
+    assert sorted(p.name for p in (whole.out / "images").iterdir()) == ["step-000004.png", "step-000008.png"]
     assert len(list((whole.out / "checkpoints").iterdir())) == 2
     again = load_weights(whole.out / "best.safetensors").state_dict()
     assert train(whole) == whole.out / "best.safetensors"
@@ -168,7 +168,7 @@ def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatc
     def poisoned(self, planned, step, group):
         given = ordinary(self, planned, step, group)
         if (step, group) == (4, 1):
-            given.truth[1, :, 5, 5] = torch.nan
+            given.ground_truth[1, :, 5, 5] = torch.nan
         return given
 
     monkeypatch.setattr(loop.Source, "sample", poisoned)
@@ -219,7 +219,7 @@ def test_starting_from_weights(folder, whole):
 
 def test_no_photographs(folder, whole):
     (folder / "empty").mkdir()
-    for photos, message in (((folder / "empty",), "no picture found under"), ((), "no photographs: give `photos`")):
+    for photos, message in (((folder / "empty",), "no image found under"), ((), "no photographs: give `photos`")):
         with pytest.raises(ValueError, match=message):
             train(replace(whole, photos=photos, cache=None, out=folder / "none"))
 

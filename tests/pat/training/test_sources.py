@@ -16,7 +16,7 @@ from arraygeom import Camera, Pose, Rig, intrinsics, rotation_from_vector
 from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
-from arraygeom.undistortion import retaken
+from arraygeom.undistortion import resampled
 from pat.farm.backends import LayeredSettings
 from pat.media.colour import luminance
 from pat.media.images import write_image
@@ -75,7 +75,7 @@ def broken(rendered, tmp_path):
 
 
 def stereo(folder, *, count: int = 4, hw: tuple[int, int] = (80, 120), disparity: int = 6):
-    """Pairs cut from wide smooth pictures: what left has at x, right has at x - disparity."""
+    """Pairs cut from wide smooth images: what left has at x, right has at x - disparity."""
     for i in range(count):
         coarse = torch.rand(1, 3, hw[0] // 6, hw[1] // 6, generator=generator(i))
         wide = torch.nn.functional.interpolate(coarse, (hw[0], hw[1] + disparity), mode="bicubic").clamp(0, 1)[0]
@@ -131,20 +131,20 @@ def test_all_items_have_their_turn_equally_often():
 
 
 def through(root):
-    """Put lenses in front of two cameras of every scene: their pictures bent, nothing known beyond the old ones."""
+    """Put lenses in front of two cameras of every scene: their images bent, nothing known beyond the old ones."""
     for folder in (root / "scenes").iterdir():
         source = Rendered(folder)
         rig = source.rig
         for name, k1 in (("mono", -0.4), ("wide", 0.3)):
             lens = Distortion(BROWN_CONRADY, torch.tensor([k1, 0.01, 0, 0]).double())
             camera, frame = rig[name], source.frame(name)
-            bent = camera.replace(distortion=lens)
-            depth = retaken(frame.depth[None], camera, bent, interpolation="nearest")
-            rgb = retaken(frame.rgb, camera, bent).values[0].clamp(min=0)
+            has_lens = camera.replace(distortion=lens)
+            depth = resampled(frame.depth[None], camera, has_lens, interpolation="nearest")
+            rgb = resampled(frame.rgb, camera, has_lens).values[0].clamp(min=0)
             known = torch.where(depth.valid[0], depth.values[0, 0], torch.nan)
             plain = replace(frame, rgb=rgb, depth=known, normals=None, flow=None)
             save_frame(folder / source.about["frames"][name][0]["file"], plain)
-            rig = rig.with_camera(name, bent)
+            rig = rig.with_camera(name, has_lens)
         rig.save(folder / "rig.yaml")
     return root
 
@@ -156,8 +156,10 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
     for number in range(4):
         given = degraded(crops.sample(4, generator(number), number=number), generator(), recording=EXACT)
         assert given.position[0].isfinite().all()
-        found = sample(given.betas[0], given.position[0].to(given.truth).flatten(1, 2)).values.unflatten(2, (32, 48))
-        for image, collected in ((given.truth, seen), (given.truth.roll(3, -1), moved)):
+        found = sample(given.betas[0], given.position[0].to(given.ground_truth).flatten(1, 2)).values.unflatten(
+            2, (32, 48)
+        )
+        for image, collected in ((given.ground_truth, seen), (given.ground_truth.roll(3, -1), moved)):
             collected.append((found - image).abs().mean(1)[given.visible[0]].quantile(0.8))
         visible.append(given.visible[0].float().mean())
     assert torch.stack(visible).mean() > 0.5
@@ -166,7 +168,7 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
 
 
 def test_scenes_behind_lenses_are_straightened(rendered, broken):
-    """Colours and depth are where the same ray was in the picture without a lens."""
+    """Colours and depth are where the same ray was in the image without a lens."""
     folder = through(broken) / "scenes" / "000001"
     before, view = Rendered(rendered / "scenes" / "000001"), read_view(folder, "mono")
     assert view.camera.distortion is None
@@ -180,7 +182,7 @@ def test_scenes_behind_lenses_are_straightened(rendered, broken):
     assert (error[3] < 0.1).float().mean() > 0.9
 
 
-def test_windows_reach_beyond_pictures():
+def test_windows_reach_beyond_images():
     camera = Camera(K=intrinsics(5.0, (4, 6)), cam_from_world=Pose.identity(), hw=(4, 6))
     view = View(torch.rand(3, 4, 6), torch.rand(4, 6) + 1, camera)
     beyond = window(view, -1, 3, (6, 6), (6, 6))
@@ -240,9 +242,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
 
     (tmp_path / "empty").mkdir()
     assert "holds no rendered scene" in said(tmp_path / "empty")
-    assert "000000: no picture is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(
-        broken, (128, 256)
-    )
+    assert "000000: no image is as large as the samples, 256x128 (mono 128x96, wide 112x80" in said(broken, (128, 256))
     assert "4 are too few to learn from some and to hold others out" in said(broken, choose=lambda i: i > 10)
     scene = broken / "scenes" / "000002"
     rig = Rig.load(scene / "rig.yaml")
@@ -250,7 +250,7 @@ def test_what_is_wrong_with_scenes(broken, tmp_path):
     for name in rig.names:
         rig = rig.with_camera(name, rig[name].resize((90, 120)))
     rig.save(scene / "rig.yaml")
-    assert "000002: the picture of '" in (error := said(broken))
+    assert "000002: the image of '" in (error := said(broken))
     assert "its rig says 120x90: remove it" in error
     (scene / frames["wide"][0]["file"]).write_bytes(b"half")
     (scene / frames["mono"][0]["file"]).write_bytes(b"half")
@@ -278,10 +278,10 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         reductions |= set((120 / (48 / near)).round().int().tolist())
         depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
         where, _ = truth_in(pair_of(batch, 1, generator()), depth, depth)
-        found = sample(given.betas[0], where.to(given.truth).flatten(1, 2)).values.unflatten(2, (32, 48))
-        assert (found - given.truth)[..., 8:-8].abs().max() < 0.03
-        assert (given.betas[0] - given.truth)[..., 8:-8].abs().max() > 0.1
-        torch.testing.assert_close(given.alpha, luminance(given.truth), atol=0.003, rtol=0)
+        found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(2, (32, 48))
+        assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
+        assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
+        torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
         held = given.looks[0].at(torch.tensor([[24.0, 16.0]]).double())
         assert held.valid.all()
     assert (sides, reductions) == ({-1.0, 1.0}, {1, 2})
@@ -302,7 +302,7 @@ def test_nobody_knows_where_a_pairs_points_are(tmp_path):
     network = new_network(config)
     fused, seen = explained(network, given)
     assert match_loss(seen, given) == 0
-    (fused.image - given.truth).square().mean().backward()
+    (fused.image - given.ground_truth).square().mean().backward()
     assert all(p.grad is not None for p in network.parameters())
     facts = validation(network, [given])
     assert math.isnan(facts["matched"])
@@ -335,11 +335,11 @@ def test_what_is_wrong_with_pairs(tmp_path):
     write_image(root / "2_L.png", torch.rand(1, 80, 120))
     assert "2_L.png is grey: pairs to train on must be in colour" in said(root)
     file.write_bytes(b"nothing")
-    assert "2_R.png: not a picture that can be read" in said(root)
+    assert "2_R.png: not an image that can be read" in said(root)
     for i in range(4):
         for side in "LR":
             (root / f"{i}_{side}.png").write_bytes(whole[: len(whole) // 2])
-    assert "not a picture that can be read: give a whole PNG" in said(root)
+    assert "not an image that can be read: give a whole PNG" in said(root)
 
 
 # Lenses ----------------------------------------------------------------------------------------------------
@@ -370,24 +370,24 @@ def test_a_lens_sees_all_that_the_pinhole_sees_but_for_what_is_lost(mode):
     assert max(map(abs, strengths)) <= 0.3
 
 
-def test_straightened_pictures_show_what_they_showed_and_say_what_they_lost(scene):
+def test_straightened_images_show_what_they_showed_and_say_what_they_lost(scene):
     smooth = torch.nn.functional.avg_pool2d(scene.images[1], 5, 1, 2)
-    kept = through_lenses(smooth, scene.cameras[1], lambda bent: bent, generator(1))
+    kept = through_lenses(smooth, scene.cameras[1], lambda has_lens: has_lens, generator(1))
     assert kept.valid[:, 1:-1, 1:-1].all()
     assert (kept.values - smooth)[..., 3:-3, 3:-3].abs().max() < 0.03
-    bent = []
-    cut = through_lenses(smooth, scene.cameras[1], lambda b: bent.append(b) or b, generator(1), lost=0.3)
-    assert (bent[0] - smooth).abs().max() > 0.1
+    has_lens = []
+    cut = through_lenses(smooth, scene.cameras[1], lambda b: has_lens.append(b) or b, generator(1), lost=0.3)
+    assert (has_lens[0] - smooth).abs().max() > 0.1
     assert 0.3 < cut.valid.float().mean() < 0.95
     assert ((cut.values - smooth).abs().amax(1)[cut.valid] < 0.05).float().mean() > 0.97
 
 
 def test_what_a_lens_lost_is_not_visible(scene):
-    plain, bent = (degraded(scene, generator(2), recording=replace(EXACT, lens=p)) for p in (0.0, 1.0))
-    torch.testing.assert_close(plain.truth, scene.images[0], atol=0.003, rtol=0)
-    assert not (bent.visible[0] & ~degraded(scene, generator(2), recording=EXACT).visible[0]).any()
-    assert bent.visible[0].float().mean() < plain.visible[0].float().mean()
-    assert (bent.truth - plain.truth)[..., 4:-4, 4:-4].abs().mean() < 0.01
+    plain, has_lens = (degraded(scene, generator(2), recording=replace(EXACT, lens=p)) for p in (0.0, 1.0))
+    torch.testing.assert_close(plain.ground_truth, scene.images[0], atol=0.003, rtol=0)
+    assert not (has_lens.visible[0] & ~degraded(scene, generator(2), recording=EXACT).visible[0]).any()
+    assert has_lens.visible[0].float().mean() < plain.visible[0].float().mean()
+    assert (has_lens.ground_truth - plain.ground_truth)[..., 4:-4, 4:-4].abs().mean() < 0.01
 
 
 # Runs ------------------------------------------------------------------------------------------------------

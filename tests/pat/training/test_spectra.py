@@ -18,11 +18,11 @@ from .runs import short_run
 
 def test_bands_are_mixtures_bent_and_stretched():
     spectra = Spectra.drawn(2, 5, Generator().manual_seed(0))
-    picture = torch.rand(2, 3, 6, 7)
-    bands = spectra.of(picture)
+    image = torch.rand(2, 3, 6, 7)
+    bands = spectra.of(image)
     for b in range(2):
         for c in range(5):
-            mixed = sum(float(spectra.mixture[b, c, k]) * picture[b, k] for k in range(3))
+            mixed = sum(float(spectra.mixture[b, c, k]) * image[b, k] for k in range(3))
             low, high = spectra.low[b, c], spectra.high[b, c]
             assert torch.allclose(bands[b, c], low + (high - low) * mixed ** spectra.gamma[b, c], atol=1e-6)
     assert bands.min() >= 0
@@ -41,19 +41,19 @@ def test_samples_have_random_bands_in_truth_and_beta_alike(tmp_path):
     counts = set()
     for given in scenes(replace(config, filtered=0.3))[0](12):
         counts.add(tuple(beta.shape[1] for beta in given.betas))
-        assert given.truth.shape[1] == sum(beta.shape[1] for beta in given.betas)
+        assert given.ground_truth.shape[1] == sum(beta.shape[1] for beta in given.betas)
         assert given.alpha.shape[1] == 1
         found = torch.cat([sample(b, x).values for b, x in zip(given.betas, given.position)], 1)
         seen = torch.stack(given.visible).all(0)
-        assert (found - given.truth).abs().mean(1)[seen].median() < 0.08
+        assert (found - given.ground_truth).abs().mean(1)[seen].median() < 0.08
     assert (1, 1, 1) in counts
     assert len(counts) > 2
 
 
 def test_without_them_samples_are_as_they_were(tmp_path):
     given = next(scenes(replace(short_run(tmp_path), filtered=0.0))[0](1))
-    assert given.truth.shape[1] == 3
-    assert (luminance(given.truth) - given.alpha).abs().max() < 1e-5
+    assert given.ground_truth.shape[1] == 3
+    assert (luminance(given.ground_truth) - given.alpha).abs().max() < 1e-5
 
 
 def test_a_network_of_any_bands_learns_from_them(tmp_path):

@@ -11,7 +11,7 @@ from pat.media.colour import luminance
 from pat.media.images import write_image
 from pat.networks.guided import GuidedPATConfig
 from pat.networks.weights import load_weights
-from pat.training.train import TrainConfig, degraded, picture_loss, scenes, train
+from pat.training.train import TrainConfig, degraded, image_loss, scenes, train
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)
 
@@ -35,9 +35,9 @@ def test_truth_is_where_the_geometry_says(config):
     for given in learn(6):
         if len(given.betas) == 1:
             found = sample(given.betas[0], given.position[0]).values
-            off = (found - given.truth).abs().mean(1)
+            off = (found - given.ground_truth).abs().mean(1)
             errors.append(off[given.visible[0]].median())
-            assert (luminance(given.truth) - given.alpha).abs().max() < 1e-5
+            assert (luminance(given.ground_truth) - given.alpha).abs().max() < 1e-5
     assert torch.stack(errors).median() < 0.05
 
 
@@ -74,9 +74,9 @@ def test_the_same_seed_makes_the_same_samples(config):
 
 
 def test_every_sample_pulls_alike():
-    truth = torch.zeros(1, 3, 4, 4)
-    assert float(picture_loss(truth + 0.1, truth)) == pytest.approx(-2, abs=1e-3)
-    assert float(picture_loss(truth + 1.0, truth)) == pytest.approx(0, abs=1e-3)
+    ground_truth = torch.zeros(1, 3, 4, 4)
+    assert float(image_loss(ground_truth + 0.1, ground_truth)) == pytest.approx(-2, abs=1e-3)
+    assert float(image_loss(ground_truth + 1.0, ground_truth)) == pytest.approx(0, abs=1e-3)
 
 
 def test_a_short_run_learns_and_leaves_weights(config):
@@ -95,4 +95,4 @@ def test_degradation_keeps_the_truth_in_colour(config):
     scene = LayeredScenes(photographs(config)[0], RigDistribution(), hw=(32, 48)).sample(2, Generator().manual_seed(1))
     given = degraded(scene, Generator().manual_seed(2))
     ideal = scene.images[0]
-    assert (given.truth - luminance(given.truth) - (ideal - luminance(ideal))).abs().max() < 1e-5
+    assert (given.ground_truth - luminance(given.ground_truth) - (ideal - luminance(ideal))).abs().max() < 1e-5

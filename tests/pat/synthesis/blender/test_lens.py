@@ -29,8 +29,8 @@ def test_a_pinhole_is_rendered_as_it_is_turned_upright(name):
     K = lens.pinhole.K
     assert K[0, 1] == K[1, 0] == 0
     assert K[0, 0] > 0 < K[1, 1]
-    picture = torch.rand(3, *camera.hw)
-    assert lens.picture(picture) is picture
+    image = torch.rand(3, *camera.hw)
+    assert lens.resampled(image) is image
 
 
 @pytest.mark.parametrize("model", ["bent", "fisheye"])
@@ -47,7 +47,7 @@ def test_a_lens_is_resampled_from_a_pinhole_that_covers_it(model):
     index = torch.ones(h, w, dtype=torch.int32)
     torch.testing.assert_close(lens.depth(depth, index), plane_depth(camera), rtol=1e-6, atol=0)
     directions = pixel_grid(lens.pinhole.hw, dtype=torch.float64).movedim(-1, 0)
-    torch.testing.assert_close(lens.picture(directions), lens.x.movedim(-1, 0), rtol=0, atol=5e-3)
+    torch.testing.assert_close(lens.resampled(directions), lens.x.movedim(-1, 0), rtol=0, atol=5e-3)
 
 
 def test_depth_across_edges_is_of_one_side():
@@ -66,14 +66,14 @@ def test_what_the_lens_cannot_see_is_marked():
     assert not lens.valid.all()
     depth = lens.depth(torch.full(lens.pinhole.hw, 3.0), torch.ones(lens.pinhole.hw, dtype=torch.int32))
     assert (depth.isnan() == ~lens.valid).all()
-    assert (lens.picture(torch.ones(3, *lens.pinhole.hw))[:, ~lens.valid] == 0).all()
+    assert (lens.resampled(torch.ones(3, *lens.pinhole.hw))[:, ~lens.valid] == 0).all()
 
 
 @pytest.mark.parametrize(
     ("camera", "said"),
     [
         (RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])), "has skew"),
-        (RIG["oblong"].replace(K=RIG["oblong"].K * torch.tensor([[-1.0], [1], [1]])), "mirrors its picture"),
+        (RIG["oblong"].replace(K=RIG["oblong"].K * torch.tensor([[-1.0], [1], [1]])), "mirrors its image"),
         (View(hw=(48, 64)), "not calibrated"),
         (RIG["bent"].replace(K=RIG["bent"].K[None]), "is batched"),
         (

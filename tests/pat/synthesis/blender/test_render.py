@@ -1,4 +1,4 @@
-"""Blender's pictures against arraygeom and against theory. Each scene is rendered in the worker's process."""
+"""Blender's images against arraygeom and against theory. Each scene is rendered in the worker's process."""
 
 import os
 import sys
@@ -120,7 +120,7 @@ def on_sphere(scene: Scene, camera: Camera, frame) -> None:
 
 
 def fiducials(camera: Camera, count: int = 12) -> list[Object]:
-    """Squares about 9 pixels wide, parallel to the picture's plane, all over the picture at several depths."""
+    """Squares about 9 pixels wide, parallel to the image's plane, all over the image at several depths."""
     rng = np.random.default_rng(0)
     h, w = camera.hw
     found = []
@@ -173,7 +173,7 @@ def test_fiducials_are_where_arraygeom_projects_them(worker, tmp_path, name):
 @pytest.mark.slow
 @pytest.mark.parametrize(("depth", "f_number"), [(2.0, 2.0), (6.0, 4.0)])
 def test_the_circle_of_defocus_is_that_of_theory(worker, tmp_path, depth, f_number):
-    """A disc of diameter D has variance D^2 / 16; the sharp picture's own is taken off."""
+    """A disc of diameter D has variance D^2 / 16; the sharp image's own is taken off."""
     rig, pitch, focus = single(64, 400.0), 7.5e-4, 3.0
     dot = Scene(
         objects=(glowing("dot", Motion((Key(position=(0, 0, depth), extent=(depth / 400,) * 3),)), brightness=50.0),)
@@ -235,17 +235,17 @@ def follows_flow(camera: Camera, first, second) -> None:
     """Where the flow leads, the next frame has the same object (or one that has come in front of it)."""
     target = (pixel_grid(camera.hw) + first.flow.movedim(0, -1)).round().long()
     moving = first.flow.norm(dim=0) > 0.5
-    inside_picture = camera.contains(target.float()) & moving
-    x, y = target[inside_picture].unbind(-1)
-    same = second.index[y, x] == first.index[inside_picture]
-    nearer = second.depth[y, x] < first.depth[inside_picture]
+    inside_image = camera.contains(target.float()) & moving
+    x, y = target[inside_image].unbind(-1)
+    same = second.index[y, x] == first.index[inside_image]
+    nearer = second.depth[y, x] < first.depth[inside_image]
     assert moving.float().mean() > 0.05
     assert same.float().mean() > 0.75
     assert (same | nearer).float().mean() > 0.9
 
 
 @pytest.mark.slow
-def test_pictures_in_every_format(worker, tmp_path):
+def test_images_in_every_format(worker, tmp_path):
     rig = Rig({"oblong": unlike_cameras(48)["oblong"]})
     scene = Scene(**{**vars(room_scene()), "objects": room_scene().objects[:3]})
     done = worker.render(scene, rig, tmp_path / "x", settings=replaced(QUICK, passes=("alpha", "nir")))
@@ -271,7 +271,7 @@ def test_a_rendered_board_has_its_corners_where_it_should(worker, tmp_path):
     pose = Pose(posed((20, -15, 5)).R, torch.tensor([-1.0, -0.6, 3.5], dtype=torch.float64))
     rig = Rig({n: unlike_cameras(192)[n] for n in ("oblong", "bent")})
     done = worker.render(board([pose], spec), rig, tmp_path / "x", settings=replaced(CLEAN, samples=32))
-    for path, camera in zip(export(done, tmp_path / "pictures", channels="bw"), rig.cameras.values()):
+    for path, camera in zip(export(done, tmp_path / "images", channels="bw"), rig.cameras.values()):
         projected = camera.project(pose.apply(torch.from_numpy(inner_corners(spec))))
         assert camera.contains(projected.x).all()
         x = projected.x.numpy().astype(np.float32)[:, None]
