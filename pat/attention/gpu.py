@@ -18,7 +18,7 @@ import triton.language as tl
 from torch import Tensor
 
 from arraygeom.segments import sample_fractions
-from pat.attention.reference import EDGE_SLACK, LEAST_SPREAD, Look
+from pat.attention.reference import EDGE_SLACK, LEAST_SPREAD, SamplePositions
 
 PIXELS = 8
 """Alpha pixels of one program."""
@@ -29,7 +29,13 @@ FIXED_BITS = 61
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    positions: SamplePositions,
+    bias: Tensor | None,
+    nearest: bool,
+    measured: bool,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `cpu.forward`."""
     b, _, ha, wa = query.shape
@@ -37,7 +43,7 @@ def forward(
     out = query.new_empty(b, ha, wa, value.shape[1])
     statistics = query.new_empty(b, ha, wa, 4, dtype=counted)
     logsum = query.new_empty(b, ha, wa, dtype=counted)
-    inputs, options = _call(query, key, value, look, bias, nearest)
+    inputs, options = _call(query, key, value, positions, bias, nearest)
     _forward[_programs(query)](*inputs, out, statistics, logsum, **options)
     return out.permute(0, 3, 1, 2), statistics if measured else statistics.new_empty(0), logsum
 
@@ -46,7 +52,7 @@ def backward(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    look: Look,
+    positions: SamplePositions,
     bias: Tensor | None,
     nearest: bool,
     saved: tuple[Tensor, Tensor],
@@ -65,9 +71,9 @@ def backward(
     sums = torch.int64 if fixed else counted
     images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
-    points_out = query.new_zeros(b, *look.points.shape[1:], dtype=counted)
-    bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 1, dtype=counted)
-    inputs, options = _call(query, key, value, look, bias, nearest)
+    points_out = query.new_zeros(b, *positions.points.shape[1:], dtype=counted)
+    bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 1, dtype=counted)
+    inputs, options = _call(query, key, value, positions, bias, nearest)
     _backward[_programs(query)](
         *inputs,
         *(statistics, saved[1], upstream, statistics_upstream, scales),
@@ -83,7 +89,7 @@ def backward(
         query_out.permute(0, 3, 1, 2),
         key_out,
         value_out,
-        points_out.sum_to_size(look.points.shape),
+        points_out.sum_to_size(positions.points.shape),
         bias_out,
     )
     return tuple(t if want else t.new_empty(0) for t, want in zip(found, wanted))
@@ -116,18 +122,20 @@ def _programs(query: Tensor) -> tuple[int]:
     return (triton.cdiv(query.shape[0] * query.shape[2] * query.shape[3], PIXELS),)
 
 
-def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> tuple:
+def _call(
+    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> tuple:
     counted = _accumulated(query)
     inputs = (
         *(_channels_last(t) for t in (query, key, value)),
-        look.points.contiguous(),
-        look.mask.contiguous().view(torch.uint8),
-        sample_fractions(look.samples, like=look.points),
+        positions.points.contiguous(),
+        positions.mask.contiguous().view(torch.uint8),
+        sample_fractions(positions.samples, like=positions.points),
         query.new_zeros(1, dtype=counted) if bias is None else bias.to(counted).contiguous(),
         query.shape[0] * query.shape[2] * query.shape[3],
         query.shape[2] * query.shape[3],
         *key.shape[2:],
-        look.samples,
+        positions.samples,
     )
     options = {
         "D": query.shape[1],
@@ -135,8 +143,8 @@ def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | 
         "D_BLOCK": triton.next_power_of_2(query.shape[1]),
         "DV_BLOCK": triton.next_power_of_2(value.shape[1]),
         "PIXELS": PIXELS,
-        "SHARED": look.points.shape[0] == 1,
-        "STRAIGHT": look.straight,
+        "SHARED": positions.points.shape[0] == 1,
+        "STRAIGHT": positions.straight,
         "NEAREST": nearest,
         "BIASED": bias is not None,
         "NUMBER": tl.float64 if counted == torch.float64 else tl.float32,

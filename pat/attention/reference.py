@@ -28,8 +28,8 @@ LEAST_SPREAD = 1e-4
 """A spread (pixels) below this reads 0: it is rounding, and its derivative noise."""
 
 
-class Look(NamedTuple):
-    """Where to look, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
+class SamplePositions(NamedTuple):
+    """Where to positions, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
     batch.
 
     `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`
@@ -41,7 +41,7 @@ class Look(NamedTuple):
     samples: int
     straight: bool
 
-    def rows(self, top: int, bottom: int) -> Look:
+    def rows(self, top: int, bottom: int) -> SamplePositions:
         """A band of rows of alpha."""
         return self._replace(points=self.points[:, top:bottom], mask=self.mask[:, top:bottom])
 
@@ -69,7 +69,9 @@ class Attended(NamedTuple):
     peak: Tensor
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
+def attend(
+    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> Attended:
     """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
     accumulate = torch.float64 if query.dtype == torch.float64 else torch.float32
     with torch.autocast(query.device.type, enabled=False):
@@ -79,11 +81,11 @@ def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor |
                 query[:, :, top:bottom].to(accumulate).permute(0, 2, 3, 1),
                 key,
                 value,
-                look.rows(top, bottom),
+                positions.rows(top, bottom),
                 None if bias is None else bias[:, top:bottom].to(accumulate),
                 nearest,
             )
-            for top, bottom in _bands(query, key, value, look.samples)
+            for top, bottom in _bands(query, key, value, positions.samples)
         ]
         out = Attended(*(torch.cat(part, 1) for part in zip(*bands)))
     value = out.value.to(query.dtype).permute(0, 3, 1, 2)
@@ -102,11 +104,13 @@ def pixels(image: Tensor) -> Tensor:
     return image.permute(0, 2, 3, 1).contiguous()
 
 
-def _band(q: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
+def _band(
+    q: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> Attended:
     b, r, w, _ = q.shape
-    xy = look.positions().to(q.dtype)  # p r w l 2
-    counts = look.mask & on_image(xy, hw=key.shape[1:3])  # p r w l
-    xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, look.samples, 2)
+    xy = positions.positions().to(q.dtype)  # p r w l 2
+    counts = positions.mask & on_image(xy, hw=key.shape[1:3])  # p r w l
+    xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, positions.samples, 2)
     at = _nearest if nearest else _bilinear
 
     score = torch.einsum("brwd,brwld->brwl", q, at(key, xy))

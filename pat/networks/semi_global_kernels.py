@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pat.attention.cpu_kernels import compiled
+from pat.attention.kernels import compiled
 
 NOWHERE = np.uint8(80)
 """Cost of a label that is not on beta: more than any other can have."""
