@@ -20,6 +20,7 @@ from typing import Literal
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.segments import Positions, Segments
@@ -64,14 +65,16 @@ def attend(
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
-        backend: `reference` (plain torch, twice differentiable), `cpu`, `triton`, or `auto`: the compiled
-            one of the tensors' device, with second-order gradients by the reference, or the reference if
-            there is none. An explicit compiled backend that cannot serve raises.
+        backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
+            `triton`, or `auto`: the compiled one of the tensors' device, with forward-mode derivatives and
+            gradients of gradients by the reference, or the reference if there is none. An explicit compiled
+            backend that cannot serve raises.
 
     Raises:
         ValueError: shapes, devices or options that do not fit together.
-        TypeError: not Segments or Positions; dtypes that differ or are not supported.
+        TypeError: not Segments or Positions; a mask that is not bool; dtypes that differ or are not supported.
         RuntimeError: an explicit backend that cannot serve.
+        NotImplementedError: derivatives that an explicit backend does not have.
     """
     return _attend(query, key, value, locations, samples, interpolation, bias, backend, measured=False).value
 
@@ -152,7 +155,6 @@ def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePos
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
         points, mask, straight = torch.stack([locations.start, locations.end], -2), locations.valid[..., None], True
-        samples = samples_for(locations) if samples is None else samples
     elif isinstance(locations, Positions):
         points, mask, straight = locations.xy, locations.mask, False
         if samples not in (None, points.shape[-2]):
@@ -160,6 +162,10 @@ def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePos
         samples = points.shape[-2]
     else:
         raise TypeError(f"locations must be Segments, Positions or a function that returns them, got {type(locations)}")
+    if mask.dtype != torch.bool:
+        raise TypeError(f"the locations' mask (valid) must be bool, got {mask.dtype}: compare it, as in mask > 0")
+    if samples is None:
+        samples = samples_for(locations)
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
@@ -200,11 +206,21 @@ def _run(
     measured: bool,
 ) -> Attended:
     chosen = _choose(backend, q.device.type)
+    if chosen != "reference" and _has_tangent(q, k, v, positions.points, bias):
+        if backend != "auto":
+            raise NotImplementedError(f"backend '{backend}' has no forward mode: ask for backend=\"reference\"")
+        chosen = "reference"
     if chosen == "reference":
         return reference.attend(q, k, v, positions, bias, nearest)
-    return torch_op.attend(
-        q, k, v, positions, bias, nearest, measured=measured, backend=chosen, strict=backend != "auto"
-    )
+    strict = backend != "auto"
+    return torch_op.attend(q, k, v, positions, bias, nearest, measured=measured, backend=chosen, strict=strict)
+
+
+def _has_tangent(*tensors: Tensor | None) -> bool:
+    """Whether forward-mode differentiation is under way."""
+    if torch.compiler.is_compiling():
+        return False
+    return any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors)
 
 
 def _choose(backend: Backend, device: str) -> str:

@@ -164,23 +164,32 @@ def _differentiate_again(ctx, *cotangents):
     """The gradient of the gradient: of the reference's gradient, made anew with a graph."""
     samples, straight, nearest, measured, backend, strict, wanted = ctx.options
     if strict:
-        raise RuntimeError(f"backend '{backend}' has no second-order gradients: ask for 'auto' or 'reference'")
-    query, key, value, points, mask, bias, _, _, *upstream = (
-        t if t is None or not t.is_floating_point() else t.detach().requires_grad_() for t in ctx.saved_tensors
-    )
+        raise NotImplementedError(f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\"")
+    saved = [_input_again(t) for t in ctx.saved_tensors]
+    query, key, value, points, mask, bias, _, _, *upstream = saved
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
+    cotangents = [c for c, want in zip(cotangents, wanted) if want]
+    higher = torch.is_grad_enabled()
     with torch.enable_grad():
-        out = reference.attend(query, key, value, SamplePositions(points, mask, samples, straight), bias, nearest)
+        positions = SamplePositions(points, mask, samples, straight)
+        out = reference.attend(query, key, value, positions, bias, nearest)
         outputs = [out.value, _side_by_side(out)] if measured else [out.value]
         given = upstream[: len(outputs)]
         first = torch.autograd.grad(outputs, inputs, given, create_graph=True, materialize_grads=True)
-        cotangents = [c for c, want in zip(cotangents, wanted) if want]
         leaves = [t for t in (query, key, value, points, bias, *upstream) if t is not None]
-        outputs, cotangents = zip(*[(f, c) for f, c in zip(first, cotangents) if f.requires_grad])
-        second = iter(torch.autograd.grad(outputs, leaves, cotangents, allow_unused=True))
+        first, cotangents = zip(*[(f, c) for f, c in zip(first, cotangents) if f.requires_grad])
+        second = iter(torch.autograd.grad(first, leaves, cotangents, allow_unused=True, create_graph=higher))
     q, k, v, p = (next(second) for _ in range(4))
     b = None if bias is None else next(second)
     return q, k, v, p, None, b, None, None, *second, *[None] * len(ctx.options)
+
+
+def _input_again(t: Tensor | None) -> Tensor | None:
+    """An input of the reference: with a graph of its own, behind which is that of the tensor if a third order needs
+    it."""
+    if t is None or not t.is_floating_point():
+        return t
+    return t.view_as(t) if torch.is_grad_enabled() and t.requires_grad else t.detach().requires_grad_()
 
 
 def _side_by_side(out: Attended) -> Tensor:
