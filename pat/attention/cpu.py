@@ -35,9 +35,9 @@ def forward(
     bias: Tensor | None,
     nearest: bool,
     measured: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
-    the sum of exponentials (b, ha, wa)."""
+    the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest weights."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
     out = _new(b, ha, wa, value.shape[1], dtype=query.dtype)
@@ -46,7 +46,7 @@ def forward(
     call = _call(query, key, value, positions, bias, nearest)
     outputs = kernels.Outputs(_flat(out), _flat(statistics), _flat(logsum), measured)
     in_parallel([partial(kernels.forward, call, share, outputs) for share in _shares(0, b * ha * wa, call)])
-    return out.permute(0, 3, 1, 2), statistics, logsum
+    return out.permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
 
 
 def backward(
@@ -56,7 +56,7 @@ def backward(
     positions: SamplePositions,
     bias: Tensor | None,
     nearest: bool,
-    saved: tuple[Tensor, Tensor],
+    saved: tuple[Tensor, Tensor, Tensor, Tensor | None],
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:

@@ -16,7 +16,9 @@ from pat.attention import reference
 from pat.attention.reference import Attended, SamplePositions
 
 INPUTS = "Tensor query, Tensor key, Tensor value, Tensor points, Tensor mask, Tensor? bias"
-SAVED = "Tensor statistics, Tensor logsum, Tensor value_cotangent, Tensor statistics_cotangent"
+SAVED = (
+    "Tensor statistics, Tensor logsum, Tensor best, Tensor? out, Tensor value_cotangent, Tensor statistics_cotangent"
+)
 OPTIONS = "int samples, bool straight, bool nearest, bool measured, str backend, bool strict"
 
 
@@ -34,7 +36,7 @@ def attend(
 ) -> Attended:
     """As `reference.attend`, by the `cpu` or the `triton` backend; without statistics if not `measured`.
     `strict`: no second order by the reference."""
-    out, statistics, _ = _attend(
+    out, statistics, *_ = _attend(
         *(query, key, value, positions.points, positions.mask, bias),
         *(positions.samples, positions.straight, nearest, measured, backend, strict),
     )
@@ -54,7 +56,9 @@ def _kernels(backend: str) -> ModuleType:
     return gpu
 
 
-@torch.library.custom_op("pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor)")
+@torch.library.custom_op(
+    "pat::attend", mutates_args=(), schema=f"({INPUTS}, {OPTIONS}) -> (Tensor, Tensor, Tensor, Tensor)"
+)
 def _attend(
     query: Tensor,
     key: Tensor,
@@ -68,7 +72,7 @@ def _attend(
     measured: bool,
     backend: str,
     strict: bool,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     positions = SamplePositions(points, mask, samples, straight)
     return _kernels(backend).forward(query, key, value, positions, bias, nearest, measured)
 
@@ -77,7 +81,8 @@ def _attend(
 def _(query, key, value, points, mask, bias, samples, straight, nearest, measured, backend, strict):
     b, _, ha, wa = query.shape
     out = query.new_empty(b, ha, wa, value.shape[1]).permute(0, 3, 1, 2)
-    return out, points.new_empty((b, ha, wa, 4) if measured else 0), points.new_empty(b, ha, wa)
+    best = points.new_empty((b, ha, wa) if backend == "triton" else 0, dtype=torch.int32)
+    return out, points.new_empty((b, ha, wa, 4) if measured else 0), points.new_empty(b, ha, wa), best
 
 
 @torch.library.custom_op(
@@ -94,6 +99,8 @@ def _attend_backward(
     bias: Tensor | None,
     statistics: Tensor,
     logsum: Tensor,
+    best: Tensor,
+    out: Tensor | None,
     value_cotangent: Tensor,
     statistics_cotangent: Tensor,
     samples: int,
@@ -105,7 +112,7 @@ def _attend_backward(
     wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     positions = SamplePositions(points, mask, samples, straight)
-    saved, cotangents = (statistics, logsum), (value_cotangent, statistics_cotangent)
+    saved, cotangents = (statistics, logsum, best, out), (value_cotangent, statistics_cotangent)
     return _kernels(backend).backward(query, key, value, positions, bias, nearest, saved, cotangents, wanted)
 
 
@@ -128,18 +135,17 @@ def _channels_last_like(image: Tensor) -> Tensor:
 
 def _keep(ctx, inputs, output) -> None:
     query, key, value, points, mask, bias, *ctx.options = inputs
-    ctx.save_for_backward(query, key, value, points, mask, bias, *output[1:])
+    backend = ctx.options[-2]
+    ctx.save_for_backward(
+        query, key, value, points, mask, bias, *output[1:], output[0] if backend == "triton" else None
+    )
 
 
-def _differentiate(ctx, value_cotangent, statistics_cotangent, _):
-    query, key, value, points, mask, bias, statistics, logsum = ctx.saved_tensors
+def _differentiate(ctx, value_cotangent, statistics_cotangent, *_):
+    bias = ctx.saved_tensors[5]
     needed = ctx.needs_input_grad
     wanted = [*needed[:4], needed[5]]
-    gradients = _attend_backward(
-        *(query, key, value, points, mask, bias, statistics, logsum, value_cotangent, statistics_cotangent),
-        *ctx.options,
-        wanted,
-    )
+    gradients = _attend_backward(*ctx.saved_tensors, value_cotangent, statistics_cotangent, *ctx.options, wanted)
     q, k, v, p, b = (g if want else None for g, want in zip(gradients, wanted))
     return (
         q,
@@ -156,8 +162,8 @@ _attend.register_autograd(_differentiate, setup_context=_keep)
 
 
 def _keep_again(ctx, inputs, output) -> None:
-    ctx.save_for_backward(*inputs[:10])
-    ctx.options = inputs[10:]
+    ctx.save_for_backward(*inputs[:12])
+    ctx.options = inputs[12:]
 
 
 def _differentiate_again(ctx, *cotangents):
@@ -166,7 +172,7 @@ def _differentiate_again(ctx, *cotangents):
     if strict:
         raise NotImplementedError(f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\"")
     saved = [_input_again(t) for t in ctx.saved_tensors]
-    query, key, value, points, mask, bias, _, _, *upstream = saved
+    query, key, value, points, mask, bias, _, _, _, _, *upstream = saved
     inputs = [t for t, want in zip((query, key, value, points, bias), wanted) if want]
     cotangents = [c for c, want in zip(cotangents, wanted) if want]
     higher = torch.is_grad_enabled()
@@ -181,7 +187,7 @@ def _differentiate_again(ctx, *cotangents):
         second = iter(torch.autograd.grad(first, leaves, cotangents, allow_unused=True, create_graph=higher))
     q, k, v, p = (next(second) for _ in range(4))
     b = None if bias is None else next(second)
-    return q, k, v, p, None, b, None, None, *second, *[None] * len(ctx.options)
+    return q, k, v, p, None, b, None, None, None, None, *second, *[None] * len(ctx.options)
 
 
 def _input_again(t: Tensor | None) -> Tensor | None:
