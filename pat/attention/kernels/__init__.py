@@ -17,9 +17,9 @@ from pathlib import Path
 
 from .backward import backward
 from .channels import scatter
+from .emit import LANES, compiled
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
-from .vectors import LANES, compiled
 
 __all__ = [
     "LANES",

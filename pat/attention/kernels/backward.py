@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from .channels import block_products, block_sums, fill, pack, unpack
+from .emit import LANES, compiled
 from .layout import BLOCK, Taps, from_pixel, of, pixel_of, pointers, replaced
 from .sampling import HALF, course_of, distribute, find_samples, interpolate, interpolation_slopes
 from .softmax import exponentiate, find_scores
-from .vectors import LANES, compiled, fma, from_index, load, mul, splat, store, sub, take, total, zero
+from .vectors import fma, from_index, load, mul, splat, store, sub, take, total, zero
 
 
 @compiled(nogil=True, cache=True)

@@ -6,13 +6,30 @@ import math
 from inspect import unwrap
 
 import numpy as np
-from llvmlite import ir
 from numba import types
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 
+from .emit import LANES, compiled
 from .layout import BLOCK, from_pixel, of, pointers
-from .rows import dot_row, extend_row, fma_row, fma_taps, fold_row, gather_row, load_row, store_row
-from .vectors import LANES, TAP_BLOCK, add_totals, compiled, from_index, load, load_one, splat, store, zero
+from .vectors import (
+    TAP_BLOCK,
+    add_totals,
+    dot_row,
+    extend_row,
+    fma_row,
+    fma_taps,
+    fold_row,
+    from_index,
+    gather_row,
+    half_bits,
+    load,
+    load_one,
+    load_row,
+    splat,
+    store,
+    store_row,
+    zero,
+)
 
 ROW = 8
 """Vectors of channels that are processed at once."""
@@ -60,16 +77,6 @@ def _pack_narrower(numbers, n, array, at):
         array[at + c] = narrow(array, numbers[c])
 
 
-@intrinsic
-def _half_bits(typing, number):
-    """float32 to the bits of float16, to nearest even."""
-
-    def code(context, builder, signature, args):
-        return builder.bitcast(builder.fptrunc(args[0], ir.HalfType()), ir.IntType(16))
-
-    return types.int16(types.float32), code
-
-
 def narrow(array, number):
     """A number as the array stores it."""
 
@@ -79,7 +86,7 @@ def _narrow(array, number):
     if array.dtype == types.uint16:
         return _bfloat16_bits
     if array.dtype == types.int16:
-        return lambda array, number: _half_bits(number)
+        return lambda array, number: half_bits(number)
     return lambda array, number: number
 
 

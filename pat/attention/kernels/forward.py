@@ -7,10 +7,11 @@ import math
 import numpy as np
 
 from .channels import block_products, block_sums, fill, pack, unpack
+from .emit import LANES, compiled
 from .layout import BLOCK, of, pixel_of, pointers
 from .sampling import distribute, find_samples
 from .softmax import find_scores, softmax
-from .vectors import LANES, compiled, fma, from_index, largest, load, maximum, mul, splat, sub, take, total, zero
+from .vectors import fma, from_index, largest, load, maximum, mul, splat, sub, take, total, zero
 
 LEAST_SPREAD = np.float32(1e-4)
 

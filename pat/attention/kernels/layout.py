@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
-from numba.core import cgutils
-from numba.extending import intrinsic
 
-from .vectors import LANES, compiled, from_index
+from .emit import LANES, compiled, instruction
+from .vectors import from_index
 
 BLOCK = 16
 """Alpha pixels that are processed together, step by step."""
@@ -161,52 +160,44 @@ def _pointed(kind):
     return kind
 
 
-def _point(context, builder, kind, value):
+def _point(code, kind, value):
     if isinstance(kind, types.Array):
-        array = context.make_array(kind)(context, builder, value)
+        array = code.context.make_array(kind)(code.context, code.builder, value)
         if kind.ndim == 1:
             return array.data
-        return context.make_tuple(builder, _pointed(kind), [array.data, builder.extract_value(array.shape, 1)])
+        return _tuple(code, kind, [array.data, code.extract_value(array.shape, 1)])
     if isinstance(kind, types.BaseTuple):
-        parts = zip(kind.types, cgutils.unpack_tuple(builder, value))
-        return context.make_tuple(builder, _pointed(kind), [_point(context, builder, *part) for part in parts])
+        return _tuple(code, kind, [_point(code, *part) for part in zip(kind.types, code.parts(value))])
     return value
 
 
-@intrinsic
-def pointers(typing, arrays):
+def _tuple(code, kind, parts):
+    return code.context.make_tuple(code.builder, _pointed(kind), parts)
+
+
+@instruction(_pointed)
+def pointers(code, arrays):
     """A tuple with pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it, too."""
-
-    def code(context, builder, signature, args):
-        return _point(context, builder, arrays, args[0])
-
-    return _pointed(arrays)(arrays), code
+    return _point(code, code.kinds[0], arrays)
 
 
-@intrinsic
-def pixel_of(typing, block, slot):
+def _first_of_each(block, *_):
+    return types.BaseTuple.from_types([column.types[0] for column in block.types], block.instance_class)
+
+
+@instruction(_first_of_each)
+def pixel_of(code, block, slot: index):
     """The pointers of one pixel of a block: those of its columns."""
-    kind = types.BaseTuple.from_types([column.types[0] for column in block.types], block.instance_class)
-
-    def code(context, builder, signature, args):
-        columns = [cgutils.unpack_tuple(builder, column) for column in cgutils.unpack_tuple(builder, args[0])]
-        starts = [builder.gep(first, [builder.mul(args[1], step)]) for first, step in columns]
-        return context.make_tuple(builder, kind, starts)
-
-    return kind(block, types.intp), code
+    columns = [code.parts(column) for column in code.parts(block)]
+    return code.pack([code.gep(first, [code.mul(slot, step)]) for first, step in columns])
 
 
-@intrinsic
-def replaced(typing, block, other):
+@instruction(lambda block, other: block)
+def replaced(code, block, other):
     """A block with the columns that another tuple has by the same name."""
-    names = block.instance_class._fields
-
-    def code(context, builder, signature, args):
-        old, new = (cgutils.unpack_tuple(builder, value) for value in args)
-        changed = dict(zip(other.instance_class._fields, new))
-        return context.make_tuple(builder, block, [changed.get(name, value) for name, value in zip(names, old)])
-
-    return block(block, other), code
+    names, others = (kind.instance_class._fields for kind in code.kinds)
+    changed = dict(zip(others, code.parts(other)))
+    return code.pack([changed.get(name, column) for name, column in zip(names, code.parts(block))])
 
 
 @compiled

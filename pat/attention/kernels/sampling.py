@@ -7,13 +7,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .channels import fill
+from .emit import LANES, compiled
 from .vectors import (
-    LANES,
     TAP_BLOCK,
     add,
     add_fours,
     add_int,
-    compiled,
     converted,
     fma,
     from_index,

@@ -6,17 +6,15 @@ import math
 from inspect import unwrap
 
 import numpy as np
-from llvmlite import ir
 from numba import types
 from numba.extending import overload
 
 from .channels import fill
+from .emit import LANES, compiled
 from .sampling import ONE, interpolate
 from .vectors import (
-    LANES,
     add,
-    call_llvm,
-    compiled,
+    exponentials64,
     fma,
     keep_above,
     largest,
@@ -27,22 +25,9 @@ from .vectors import (
     store,
     sub,
     total,
-    unary,
+    two_to,
     zero,
 )
-
-
-@unary
-def _exponentials64(builder, x):
-    return call_llvm(builder, "llvm.exp.v8f64", x.type, [x])
-
-
-@unary
-def _two_to(builder, a):
-    """2 to the power of whole numbers in float32."""
-    whole = ir.VectorType(ir.IntType(32), LANES)
-    exponent = builder.add(builder.fptosi(a, whole), ir.Constant(whole, [127] * LANES))
-    return builder.bitcast(builder.shl(exponent, ir.Constant(whole, [23] * LANES)), a.type)
 
 
 def exponentials(x):
@@ -51,7 +36,7 @@ def exponentials(x):
 
 @overload(exponentials)
 def _exponentials(x):
-    return (lambda x: _exponentials64(x)) if x.scalar == types.float64 else _exponentials32
+    return (lambda x: exponentials64(x)) if x.scalar == types.float64 else _exponentials32
 
 
 @unwrap
@@ -69,7 +54,7 @@ def _exponentials32(x):
     p = fma(p, y, splat(np.float32(1.6666665459e-1)))
     p = fma(p, y, splat(np.float32(5.0000001201e-1)))
     p = add(fma(mul(p, y), y, y), splat(np.float32(1.0)))
-    return keep_above(x, low, mul(p, _two_to(n)))
+    return keep_above(x, low, mul(p, two_to(n)))
 
 
 @compiled

@@ -1,305 +1,212 @@
-"""Instructions on eight numbers at a time, as numba intrinsics.
+"""Instructions on eight numbers at a time, and on rows of them.
 
-The body of an intrinsic is Python that runs at compile time: a loop in it is unrolled code.
+A *row* is a tuple of n vectors that lie side by side, n being known at compile time; it stays in registers.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from inspect import unwrap
-from typing import Any
-
 from llvmlite import ir
-from numba import njit, types
-from numba.core import cgutils
-from numba.extending import intrinsic, models, register_model
+from numba import types
 
-LANES = 8
+from .emit import LANES, Vector, accumulated, instruction, row_of, vector_of
+
 TAP_BLOCK = 4
 
 
-def compiled(function=None, **options):
-    """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled."""
-    return njit(unwrap(function), **options) if function else lambda function: njit(unwrap(function), **options)
+def _nothing(*_):
+    return types.void
 
 
-class Vector(types.Type):
-    """`LANES` numbers of the accumulation type, or of int32, in one register (or two)."""
-
-    def __init__(self, scalar):
-        self.scalar = scalar
-        super().__init__(name=f"Vector({scalar})")
-
-
-@register_model(Vector)
-class _VectorModel(models.PrimitiveModel):
-    def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), LANES))
-
-
-def accumulated(dtype):
-    """The type in which stored numbers are accumulated."""
-    return types.float64 if dtype == types.float64 else types.float32
-
-
-def _constants(lanes) -> ir.Constant:
-    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
-
-
-def call_llvm(builder, name: str, result, args, **options):
-    """Calls an intrinsic of LLVM by its full name."""
-    function = ir.FunctionType(result, [value.type for value in args])
-    return builder.call(cgutils.get_or_insert_function(builder.module, function, name), args, **options)
-
-
-def _suffix(element) -> str:
-    return f"v{LANES}{'f64' if element == ir.DoubleType() else 'f32'}"
+def _first(kind, *_):
+    return kind
 
 
 # ---- memory --------------------------------------------------------------------------------------
 
 
-def widen(builder, stored, dtype, lanes):
-    """A stored number, or a vector of them, in the accumulation type."""
-
-    def shape(lane):
-        return ir.VectorType(lane, lanes) if lanes > 1 else lane
-
-    if dtype == types.uint16:
-        sixteen = shape(ir.IntType(32))(([16] * lanes) if lanes > 1 else 16)
-        return builder.bitcast(builder.shl(builder.zext(stored, shape(ir.IntType(32))), sixteen), shape(ir.FloatType()))
-    if dtype == types.int16:
-        return builder.fpext(builder.bitcast(stored, shape(ir.HalfType())), shape(ir.FloatType()))
-    return stored
-
-
-def offset(builder, index, k: int):
-    """index + k."""
-    return builder.add(index, ir.Constant(index.type, k))
-
-
-def load_vector(context, builder, dtype, address, index, lanes=LANES):
-    """`lanes` stored numbers, not widened."""
-    lane = ir.VectorType(context.get_data_type(dtype), lanes)
-    place = builder.bitcast(builder.gep(address, [index]), lane.as_pointer())
-    return builder.load(place, align=dtype.bitwidth // 8)
-
-
-def load_wide(context, builder, dtype, address, index):
-    """The stored vector at an index, in the accumulation type."""
-    return widen(builder, load_vector(context, builder, dtype, address, index), dtype, LANES)
-
-
-def store_vector(builder, dtype, address, index, vector):
-    """Stores a vector at an index."""
-    place = builder.bitcast(builder.gep(address, [index]), vector.type.as_pointer())
-    builder.store(vector, place, align=dtype.bitwidth // 8)
-
-
-@intrinsic
-def take(typing, counter):
+@instruction(lambda counter: counter.dtype)
+def take(code, counter):
     """Increments the number at a pointer atomically; gives what it was."""
-
-    def code(context, builder, signature, args):
-        return builder.atomic_rmw("add", args[0], ir.Constant(args[0].type.pointee, 1), "monotonic")
-
-    return counter.dtype(counter), code
+    return code.atomic_rmw("add", counter, ir.Constant(counter.type.pointee, 1), "monotonic")
 
 
-@intrinsic
-def from_index(typing, array, index):
+@instruction(_first)
+def from_index(code, array, i: index):
     """The pointer to an index."""
-
-    def code(context, builder, signature, args):
-        return builder.gep(args[0], [args[1]])
-
-    return array(array, types.intp), code
+    return code.gep(array, [i])
 
 
-@intrinsic
-def zero(typing, array):
+@instruction(accumulated)
+def zero(code, array):
     """0 in the accumulation type of the numbers at a pointer."""
-    kind = accumulated(array.dtype)
-
-    def code(context, builder, signature, args):
-        return context.get_constant(kind, 0)
-
-    return kind(array), code
+    return code.context.get_constant(code.result, 0)
 
 
-@intrinsic
-def load(typing, array, index):
+@instruction(vector_of)
+def load(code, array, i: index):
     """The vector at an index, in the accumulation type."""
-
-    def code(context, builder, signature, args):
-        return load_wide(context, builder, array.dtype, *args)
-
-    return Vector(accumulated(array.dtype))(array, types.intp), code
+    return code.get_wide(code.kinds[0], array, i)
 
 
-@intrinsic
-def store(typing, array, index, vector):
+@instruction(_nothing)
+def store(code, array, i: index, vector):
     """Stores a vector at an index."""
-
-    def code(context, builder, signature, args):
-        store_vector(builder, array.dtype, *args)
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, vector), code
+    code.put(code.kinds[0], array, i, vector)
 
 
-@intrinsic
-def load_one(typing, array, index):
+@instruction(lambda array, i: accumulated(array))
+def load_one(code, array, i: index):
     """The number at an index, in the accumulation type."""
+    return code.widen(code.at(array, i), code.kinds[0].dtype, 1)
 
-    def code(context, builder, signature, args):
-        return widen(builder, builder.load(builder.gep(args[0], [args[1]])), array.dtype, 1)
 
-    return accumulated(array.dtype)(array, types.intp), code
+# ---- rows ----------------------------------------------------------------------------------------
+
+
+@instruction(lambda array, i, n: row_of(vector_of(array), n))
+def load_row(code, array, i: index, n: literal):
+    """n vectors from an index on."""
+    return code.pack([code.get_wide(code.kinds[0], array, code.offset(i, k * LANES)) for k in range(n)])
+
+
+@instruction(lambda array, starts, i: row_of(vector_of(array), starts.count))
+def gather_row(code, array, starts, i: index):
+    """The vector at an index from each of some starts on."""
+    return code.pack([code.get_wide(code.kinds[0], array, code.add(start, i)) for start in code.parts(starts)])
+
+
+@instruction(_nothing)
+def store_row(code, array, i: index, row):
+    """Stores a row from an index on."""
+    for k, vector in enumerate(code.parts(row)):
+        code.put(code.kinds[0], array, code.offset(i, k * LANES), vector)
+
+
+@instruction(lambda row, n: row_of(row.dtype, n))
+def extend_row(code, row, n: literal):
+    """A row with zeros added: n vectors."""
+    vectors = code.parts(row)
+    return code.pack(vectors + [ir.Constant(vectors[0].type, None)] * (n - len(vectors)))
+
+
+@instruction(lambda vector, row, totals: totals)
+def fma_row(code, vector, row, totals):
+    """totals + vector row, each rounded once."""
+    return code.pack([code.fused(vector, a, b) for a, b in zip(code.parts(row), code.parts(totals))])
+
+
+@instruction(lambda row, array, i: row.dtype)
+def dot_row(code, row, array, i: index):
+    """The products of a row with the one at an index, summed lane by lane."""
+    total = None
+    for k, a in enumerate(code.parts(row)):
+        b = code.get_wide(code.kinds[1], array, code.offset(i, k * LANES))
+        total = code.fmul(a, b) if total is None else code.fused(a, b, total)
+    return total
+
+
+@instruction(lambda weights, rows, t, image, channels, c, totals, n: totals)
+def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
+    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row at image[rows[t + k], c]."""
+    vectors = code.parts(totals)
+    for k in range(0, len(vectors), n):
+        tap = code.offset(t, k // n)
+        weight = code.repeat(code.at(weights, tap))
+        start = code.add(code.mul(code.sext(code.at(rows, tap), channels.type), channels), c)
+        for i in range(n):
+            vector = code.get_wide(code.kinds[3], image, code.offset(start, i * LANES))
+            vectors[k + i] = code.fused(weight, vector, vectors[k + i])
+    return code.pack(vectors)
+
+
+@instruction(lambda row, n: row_of(row.dtype, n))
+def fold_row(code, row, n: literal):
+    """The sum, pair by pair, of the groups of n vectors of a row."""
+    vectors = code.parts(row)
+    groups = [vectors[k : k + n] for k in range(0, len(vectors), n)]
+    while len(groups) > 1:
+        groups = [[code.fadd(a, b) for a, b in zip(*pair)] for pair in zip(groups[::2], groups[1::2])]
+    return code.pack(groups[0])
 
 
 # ---- arithmetic ----------------------------------------------------------------------------------
 
 
-def repeat(builder, number):
-    """A vector of one number repeated."""
-    first = builder.insert_element(
-        ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined), number, ir.IntType(32)(0)
-    )
-    return builder.shuffle_vector(first, first, _constants([0] * LANES))
+def _elementwise(emit):
+    """The intrinsic of vectors of one kind that gives another one of it."""
+    return instruction(_first)(emit)
 
 
-def fma_values(builder, a, b, c):
-    """a b + c, rounded once."""
-    return call_llvm(builder, f"llvm.fma.{_suffix(a.type.element)}", a.type, [a, b, c])
-
-
-def unary(build: Callable[..., Any]):
-    """The intrinsic of a vector that `build(builder, a)` computes, of the same kind."""
-
-    @intrinsic
-    def operation(typing, a):
-        def code(context, builder, signature, args):
-            return build(builder, *args)
-
-        return a(a), code
-
-    return operation
-
-
-def binary(build: Callable[..., Any]):
-    """Likewise of two vectors."""
-
-    @intrinsic
-    def operation(typing, a, b):
-        def code(context, builder, signature, args):
-            return build(builder, *args)
-
-        return a(a, b), code
-
-    return operation
-
-
-def ternary(build: Callable[..., Any]):
-    """Likewise of three vectors."""
-
-    @intrinsic
-    def operation(typing, a, b, c):
-        def code(context, builder, signature, args):
-            return build(builder, *args)
-
-        return a(a, b, c), code
-
-    return operation
-
-
-add = binary(lambda builder, a, b: builder.fadd(a, b))
-sub = binary(lambda builder, a, b: builder.fsub(a, b))
-mul = binary(lambda builder, a, b: builder.fmul(a, b))
-add_int = binary(lambda builder, a, b: builder.add(a, b))
-mul_int = binary(lambda builder, a, b: builder.mul(a, b))
-minimum_int = binary(lambda builder, a, b: builder.select(builder.icmp_signed("<", a, b), a, b))
-minimum = binary(lambda builder, a, b: builder.select(builder.fcmp_ordered("<", a, b), a, b))
-maximum = binary(lambda builder, a, b: builder.select(builder.fcmp_ordered(">", a, b), a, b))
+add = _elementwise(lambda code, a, b: code.fadd(a, b))
+sub = _elementwise(lambda code, a, b: code.fsub(a, b))
+mul = _elementwise(lambda code, a, b: code.fmul(a, b))
+add_int = _elementwise(lambda code, a, b: code.add(a, b))
+mul_int = _elementwise(lambda code, a, b: code.mul(a, b))
+minimum_int = _elementwise(lambda code, a, b: code.select(code.icmp_signed("<", a, b), a, b))
+minimum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered("<", a, b), a, b))
+maximum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered(">", a, b), a, b))
 """Where either number is NaN, minimum and maximum are that of b."""
-fma = ternary(fma_values)
+fma = _elementwise(lambda code, a, b, c: code.fused(a, b, c))
 """a b + c, rounded once."""
+exponentials64 = _elementwise(lambda code, a: code.intrinsic("llvm.exp.%", a.type, [a]))
 
 
-@ternary
-def keep_above(builder, a, limit, b):
+@_elementwise
+def keep_above(code, a, limit, b):
     """The numbers of b; 0 where those of a are below the limit."""
-    return builder.select(builder.fcmp_ordered("<", a, limit), ir.Constant(b.type, None), b)
+    return code.select(code.fcmp_ordered("<", a, limit), ir.Constant(b.type, None), b)
 
 
-@intrinsic
-def splat(typing, number):
+@_elementwise
+def two_to(code, a):
+    """2 to the power of whole numbers in float32."""
+    whole = ir.VectorType(ir.IntType(32), LANES)
+    exponent = code.add(code.fptosi(a, whole), ir.Constant(whole, [127] * LANES))
+    return code.bitcast(code.shl(exponent, ir.Constant(whole, [23] * LANES)), a.type)
+
+
+@instruction(Vector)
+def splat(code, number):
     """A vector of one number repeated."""
-
-    def code(context, builder, signature, args):
-        return repeat(builder, args[0])
-
-    return Vector(number)(number), code
+    return code.repeat(number)
 
 
-@intrinsic
-def truncated(typing, a):
+@instruction(lambda a: Vector(types.int32))
+def truncated(code, a):
     """A vector's numbers towards 0, as int32."""
-    whole = Vector(types.int32)
-
-    def code(context, builder, signature, args):
-        return builder.fptosi(args[0], context.get_value_type(whole))
-
-    return whole(a), code
+    return code.fptosi(a, ir.VectorType(ir.IntType(32), LANES))
 
 
-@intrinsic
-def converted(typing, whole, like):
+@instruction(lambda whole, like: like)
+def converted(code, whole, like):
     """A vector of int32 in the type of another."""
-
-    def code(context, builder, signature, args):
-        return builder.sitofp(args[0], args[1].type)
-
-    return like(whole, like), code
+    return code.sitofp(whole, like.type)
 
 
-def _reduction(name: str, start: float | None):
-    """The intrinsic that reduces a vector to one number."""
-
-    @intrinsic
-    def operation(typing, a):
-        def code(context, builder, signature, args):
-            element = args[0].type.element
-            first = [] if start is None else [ir.Constant(element, start)]
-            full = f"llvm.vector.reduce.{name}.{_suffix(element)}"
-            return call_llvm(builder, full, element, [*first, args[0]], fastmath=["reassoc"])
-
-        return a.scalar(a), code
-
-    return operation
+@instruction(lambda a: a.scalar)
+def total(code, a):
+    """The sum of a vector's numbers."""
+    nothing = ir.Constant(a.type.element, 0.0)
+    return code.intrinsic("llvm.vector.reduce.fadd.%", a.type.element, [nothing, a], fastmath=["reassoc"])
 
 
-total = _reduction("fadd", 0.0)
-largest = _reduction("fmax", None)
+@instruction(lambda a: a.scalar)
+def largest(code, a):
+    """The largest of a vector's numbers."""
+    return code.intrinsic("llvm.vector.reduce.fmax.%", a.type.element, [a], fastmath=["reassoc"])
 
 
-@intrinsic
-def add_totals(typing, array, index, a, b, c, d):
+@instruction(_nothing)
+def add_totals(code, array, i: index, a, b, c, d):
     """Adds the sums of four vectors to four numbers side by side."""
 
-    def code(context, builder, signature, args):
-        def pairs(p, q):
-            halves = [[0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]]
-            even, odd = (builder.shuffle_vector(p, q, _constants(half)) for half in halves)
-            return builder.fadd(even, odd)
+    def pairs(p, q):
+        even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
+        return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, odd))
 
-        v = pairs(pairs(args[2], args[3]), pairs(args[4], args[5]))
-        low, high = (builder.shuffle_vector(v, v, _constants(half)) for half in ([0, 1, 2, 3], [4, 5, 6, 7]))
-        stored = load_vector(context, builder, array.dtype, args[0], args[1], TAP_BLOCK)
-        store_vector(builder, array.dtype, args[0], args[1], builder.fadd(stored, builder.fadd(low, high)))
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp, a, b, c, d), code
+    v = pairs(pairs(a, b), pairs(c, d))
+    sums = code.fadd(code.shuffle(v, None, [0, 1, 2, 3]), code.shuffle(v, None, [4, 5, 6, 7]))
+    code.put(code.kinds[0], array, i, code.fadd(code.get(code.kinds[0], array, i, TAP_BLOCK), sums))
 
 
 # ---- four numbers of each of eight places --------------------------------------------------------
@@ -309,62 +216,48 @@ PAIRS = [[0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]]
 """Shuffles that transpose a 4 by 4 block in each half of four vectors."""
 
 
-def _transpose(builder, a, b, c, d):
-    def shuffle(p, q, how):
-        return [builder.shuffle_vector(p, q, _constants(lanes)) for lanes in how]
-
-    (ab_low, ab_high), (cd_low, cd_high) = shuffle(a, b, FOURS), shuffle(c, d, FOURS)
-    return *shuffle(ab_low, cd_low, PAIRS), *shuffle(ab_high, cd_high, PAIRS)
+def _transpose(code, a, b, c, d):
+    (ab_low, ab_high), (cd_low, cd_high) = ([code.shuffle(p, q, how) for how in FOURS] for p, q in ((a, b), (c, d)))
+    return [code.shuffle(p, q, how) for p, q in ((ab_low, cd_low), (ab_high, cd_high)) for how in PAIRS]
 
 
-@intrinsic
-def load_fours(typing, array, starts, index):
+@instruction(lambda array, starts, i: row_of(Vector(array.dtype), 4))
+def load_fours(code, array, starts, i: index):
     """Four vectors, the k-th of array[start + k] for the `LANES` starts at an index."""
-    kind = types.UniTuple(Vector(array.dtype), 4)
 
-    def code(context, builder, signature, args):
-        def four(k):
-            start = builder.load(builder.gep(args[1], [offset(builder, args[2], k)]))
-            return load_vector(context, builder, array.dtype, args[0], start, 4)
+    def four(k):
+        return code.get(code.kinds[0], array, code.at(starts, code.offset(i, k)), 4)
 
-        halves = [builder.shuffle_vector(four(k), four(k + 4), _constants([*range(LANES)])) for k in range(4)]
-        return context.make_tuple(builder, kind, _transpose(builder, *halves))
-
-    return kind(array, starts, types.intp), code
+    halves = [code.shuffle(four(k), four(k + 4), [*range(LANES)]) for k in range(4)]
+    return code.pack(_transpose(code, *halves))
 
 
-@intrinsic
-def add_fours(typing, array, starts, index, a, b, c, d):
+@instruction(_nothing)
+def add_fours(code, array, starts, i: index, a, b, c, d):
     """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
     in their order. By twos: what the next start touches is the second two of this one."""
-
-    def code(context, builder, signature, args):
-        fours = _transpose(builder, *args[3:])
-        for k in range(LANES):
-            start = builder.load(builder.gep(args[1], [offset(builder, args[2], k)]))
-            for half in range(2):
-                lanes = [2 * half + k // 4 * 4, 2 * half + k // 4 * 4 + 1]
-                number = builder.shuffle_vector(fours[k % 4], fours[k % 4], _constants(lanes))
-                at = offset(builder, start, 2 * half)
-                stored = load_vector(context, builder, array.dtype, args[0], at, 2)
-                store_vector(builder, array.dtype, args[0], at, builder.fadd(stored, number))
-        return context.get_dummy_value()
-
-    return types.void(array, starts, types.intp, a, b, c, d), code
+    fours = _transpose(code, a, b, c, d)
+    for k in range(LANES):
+        start = code.at(starts, code.offset(i, k))
+        for half in range(2):
+            lane = 2 * half + k // 4 * 4
+            number = code.shuffle(fours[k % 4], None, [lane, lane + 1])
+            place = code.offset(start, 2 * half)
+            code.put(code.kinds[0], array, place, code.fadd(code.get(code.kinds[0], array, place, 2), number))
 
 
-@intrinsic
-def store_four(typing, array, index, number, offsets):
-    """array[index + k] = number + offsets[k], k from 0 to 3."""
+@instruction(_nothing)
+def store_four(code, array, i: index, number, offsets):
+    """array[i + k] = number + offsets[k], k from 0 to 3."""
+    numbers = shifts = ir.Constant(ir.VectorType(number.type, 4), ir.Undefined)
+    for k, shift in enumerate(code.parts(offsets)):
+        shift = code.context.cast(code.builder, shift, code.kinds[3].dtype, code.kinds[0].dtype)
+        numbers = code.insert_element(numbers, number, ir.IntType(32)(k))
+        shifts = code.insert_element(shifts, shift, ir.IntType(32)(k))
+    code.put(code.kinds[0], array, i, code.builder.add(numbers, shifts))
 
-    def code(context, builder, signature, args):
-        lane = context.get_data_type(array.dtype)
-        numbers = shifts = ir.Constant(ir.VectorType(lane, 4), ir.Undefined)
-        for k in range(4):
-            shift = context.cast(builder, builder.extract_value(args[3], k), offsets.dtype, array.dtype)
-            numbers = builder.insert_element(numbers, args[2], ir.IntType(32)(k))
-            shifts = builder.insert_element(shifts, shift, ir.IntType(32)(k))
-        store_vector(builder, array.dtype, args[0], args[1], builder.add(numbers, shifts))
-        return context.get_dummy_value()
 
-    return types.void(array, types.intp, array.dtype, offsets), code
+@instruction(lambda number: types.int16)
+def half_bits(code, number):
+    """float32 to the bits of float16, to nearest even."""
+    return code.bitcast(code.fptrunc(number, ir.HalfType()), ir.IntType(16))
