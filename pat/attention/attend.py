@@ -5,8 +5,8 @@ On that area the bilinear look-up takes coordinates clamped to the border's cent
 takes the pixel on whose area the position lies. An alpha pixel without a sample that counts gets 0
 everywhere, and passes no gradient.
 
-Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak say nothing
-about the geometry (they are constant almost everywhere); position and spread do, as weighted means of the
+Gradients reach query, key, value, bias and the geometry. With `nearest` the value and the peak have no
+gradient by the geometry (they are constant almost everywhere); position and spread do, as weighted means of the
 positions.
 """
 
@@ -90,7 +90,7 @@ def attend_with_statistics(
     bias: Tensor | None = None,
     backend: Backend = "auto",
 ) -> Attended:
-    """As `attend`, with where the match is expected, how far the weights spread and how high they peak.
+    """As `attend`, with the expected position of the match, the spread of the weights and the largest of them.
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
@@ -170,9 +170,9 @@ def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePos
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
     if tuple(mask.shape[:-1]) not in ((ha, wa), (b, ha, wa), (1, ha, wa)):
-        raise ValueError(f"locations has the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}")
+        raise ValueError(f"locations have the leading axes {tuple(mask.shape[:-1])}, want {(ha, wa)} or {(b, ha, wa)}")
     if points.device != query.device:
-        raise ValueError(f"locations is on {points.device}, the features are on {query.device}: move one of them")
+        raise ValueError(f"locations are on {points.device}, the features are on {query.device}: move one of them")
     if mask.dim() == 3:
         points, mask = points[None], mask[None]
     count_in = torch.float64 if query.dtype == torch.float64 else torch.float32

@@ -1,5 +1,5 @@
-"""C3 attention as a formula: plain torch, any device, differentiable twice. Slow, and what the fast ones
-obey.
+"""C3 attention as a formula: plain torch, any device, differentiable any number of times. Slow; the fast backends
+are tested against it.
 
 For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that count,
 
@@ -8,7 +8,7 @@ For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that 
     output   = sum_l weight_l V(x_l)
 
 (the physics-aware transformer, eq. 3 to 5: no scale, no position code). Shapes are written on the lines with
-b images, d channels, r rows of w alpha pixels, l samples. Alpha is worked off in bands of rows, so that
+b images, d channels, r rows of w alpha pixels, l samples. Alpha is processed in bands of rows, so that
 without gradients no more than `BAND_BYTES` of gathered keys and values exist at a time.
 """
 
@@ -55,9 +55,9 @@ class SamplePositions(NamedTuple):
 
 
 class Attended(NamedTuple):
-    """What C3 attention says about each alpha pixel. Where no sample counts, everything is 0.
+    """The outputs of C3 attention for each alpha pixel. Where no sample counts, everything is 0.
 
-    value: (B, Dv, Ha, Wa), the values seen, weighted.
+    value: (B, Dv, Ha, Wa), the weighted mean of the values.
     position: (B, 2, Ha, Wa), the expected (x, y) of the match, in beta's pixels.
     spread: (B, Ha, Wa), root of the expected squared distance of the samples from `position`, in pixels.
     peak: (B, Ha, Wa), the largest weight.

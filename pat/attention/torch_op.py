@@ -167,7 +167,7 @@ def _keep_again(ctx, inputs, output) -> None:
 
 
 def _differentiate_again(ctx, *cotangents):
-    """The gradient of the gradient: of the reference's gradient, made anew with a graph."""
+    """The gradient of the gradient: the reference is run again, and its gradient differentiated."""
     samples, straight, nearest, measured, backend, strict, wanted = ctx.options
     if strict:
         raise NotImplementedError(f"backend '{backend}' has no second-order gradients: ask for backend=\"reference\"")
