@@ -29,7 +29,7 @@ LEAST_SPREAD = 1e-4
 
 
 class SamplePositions(NamedTuple):
-    """Where to positions, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
+    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
     batch.
 
     `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`

@@ -1,4 +1,4 @@
-"""What the public face accepts and refuses."""
+"""What the public functions accept and refuse."""
 
 import importlib
 
