@@ -142,10 +142,11 @@ def _keep(ctx, inputs, output) -> None:
 
 
 def _differentiate(ctx, value_cotangent, statistics_cotangent, *_):
-    bias = ctx.saved_tensors[5]
+    saved = ctx.saved_tensors
+    bias = saved[5]
     needed = ctx.needs_input_grad
     wanted = [*needed[:4], needed[5]]
-    gradients = _attend_backward(*ctx.saved_tensors, value_cotangent, statistics_cotangent, *ctx.options, wanted)
+    gradients = _attend_backward(*saved, value_cotangent, statistics_cotangent, *ctx.options, wanted)
     q, k, v, p, b = (g if want else None for g, want in zip(gradients, wanted))
     return (
         q,

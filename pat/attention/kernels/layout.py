@@ -43,10 +43,15 @@ Block = namedtuple("Block", [name for name, _, _ in LAYOUT])  # type: ignore[mis
 
 
 def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
-    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`."""
+    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, what belongs to a pixel side by side."""
     lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
-    kinds = {"integer": np.int32, "number": number}
-    return Block(*(np.empty((BLOCK, lengths[each]), kinds[kind]) for _, kind, each in LAYOUT))
+    ends = {"integer": 0, "number": 0}
+    slices = []
+    for _, kind, each in LAYOUT:
+        slices.append(slice(ends[kind], ends[kind] + lengths[each]))
+        ends[kind] = slices[-1].stop
+    rooms = {kind: np.empty((BLOCK, ends[kind]), dtype) for kind, dtype in (("integer", np.int32), ("number", number))}
+    return Block(*(rooms[kind][:, part] for (_, kind, _), part in zip(LAYOUT, slices)))
 
 
 class Geometry(NamedTuple):
@@ -165,7 +170,8 @@ def _point(code, kind, value):
         array = code.context.make_array(kind)(code.context, code.builder, value)
         if kind.ndim == 1:
             return array.data
-        return _tuple(code, kind, [array.data, code.extract_value(array.shape, 1)])
+        size = code.context.get_constant(types.intp, kind.dtype.bitwidth // 8)
+        return _tuple(code, kind, [array.data, code.sdiv(code.parts(array.strides)[0], size)])
     if isinstance(kind, types.BaseTuple):
         return _tuple(code, kind, [_point(code, *part) for part in zip(kind.types, code.parts(value))])
     return value
