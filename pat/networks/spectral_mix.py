@@ -107,8 +107,8 @@ def coarse_mix(
     own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
     guide = SpectralMix.equal(bands).of(bands)
     normalisations = Normalisations.of(own, guide)
-    disparity, facts = matched_at_half_size(own, guide, _reduced(blocks, factor), normalisations.half)
-    values, valid = at_matches(bands, _reduced(segments, factor), disparity)
+    disparity, facts = matched_at_half_size(own, guide, reduced(blocks, factor), normalisations.half)
+    values, valid = at_matches(bands, reduced(segments, factor), disparity)
     return SpectralMix.fitted(values, normalisations.whole.softened(own), valid * is_consistent(facts))
 
 
@@ -140,7 +140,7 @@ def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Nor
     return values + slope * beyond.clamp(-MOST_DETAIL, MOST_DETAIL) - alpha, brightness - soft
 
 
-def _reduced(segments: Segments, factor: int) -> Segments:
+def reduced(segments: Segments, factor: int) -> Segments:
     """The same segments in pixels of a beta that is `factor` times smaller."""
     start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
     return Segments(start, end, segments.valid)
