@@ -23,9 +23,19 @@ from torch import Tensor
 from arraygeom import Link, Rig, View
 from arraygeom.atomic import write_text
 from arraygeom.pixels import coarse_grid
-from calib.images.from_images import start
+from calib.images.from_images import rig_from_images
 from calib.images.matches import Matches, fit_fundamental, line_distance, match_cameras
-from calib.images.refine import FREE, Agreement, Fit, agreement, line_distances, polish, refine, refine_matches, split
+from calib.images.refinement import (
+    FREE,
+    LineStatistics,
+    RefinementProblem,
+    line_distances,
+    line_statistics,
+    polish,
+    refine,
+    refine_matches,
+    split,
+)
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
 from pat.evaluation.ablation import Case, rendered_cases
@@ -35,6 +45,7 @@ from pat.media.images import read_image
 from pat.networks.weights import load_weights
 from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from tests.calib.real import bumblebee, syntim
+from tests.calib.scenes import uninformed
 
 TURN, MOVE = math.radians(0.3), 5.0
 
@@ -69,14 +80,14 @@ def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
         yield "| " + " | ".join(map(str, (*cells, published, *map(_span, (before, after, rest))))) + " |"
 
 
-def own_agreement(pairs: dict) -> Agreement:
+def own_agreement(pairs: dict) -> LineStatistics:
     """How held-out points agree with an F fitted to all points."""
     _, held_out = split([pairs])
     (names, points), *_ = pairs.items()
-    return agreement(line_distance(held_out[names], fit_fundamental(points)))
+    return line_statistics(line_distance(held_out[names], fit_fundamental(points)))
 
 
-def beyond(found: Agreement, own: Agreement) -> float:
+def beyond(found: LineStatistics, own: LineStatistics) -> float:
     """What is left of a distance without that of the points themselves."""
     return math.sqrt(max(found.rms**2 - own.rms**2, 0.0))
 
@@ -101,7 +112,7 @@ def fast_and_slow(data: Path) -> Iterator[str]:
     rig = Rig(views, links={(FAST, name): Link(F) for name, F in published.items()})
     matches = match_cameras(images)
     _, held_out = split([matches])
-    rigs = refine_matches(rig, [matches]).rig, start(images).rig
+    rigs = refine_matches(rig, [matches]).rig, rig_from_images(images).rig
     for names in rig.links:
         points = {names: held_out[names]}
         own = own_agreement({names: matches[names]}).median
@@ -124,7 +135,7 @@ def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterat
                 0
             ]
 
-        true, alone = psnr(case.rig), psnr(start(case.images).rig)
+        true, alone = psnr(case.rig), psnr(rig_from_images(case.images).rig)
         for draw in range(1, draws + 1):
             bad = worse(case.rig, g)
             rigs = [bad, *(refine(bad, [case.images], attend=a).rig for a in (None, attend_with_statistics))]
@@ -140,8 +151,8 @@ def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
     (names,) = points
     true = exact_points(sample.rig, names)
     for draw in range(1, draws + 1):
-        fit = Fit.of(worse(sample.rig, g), [points], free=FREE, sigma=None)
-        near = fit.prior()._replace(z=0.8 * fit.solve().z)
+        fit = RefinementProblem.of(worse(sample.rig, g), [points], free=FREE, sigma=None)
+        near = uninformed(fit)._replace(z=0.8 * fit.solve().z)
         found, _ = polish(
             fit, near._replace(covariance=0.01 * near.covariance), [sample.images], attend_with_statistics
         )

@@ -7,9 +7,9 @@ import torch
 
 from arraygeom import Pose, rotation_from_vector
 from calib.boards.corners import refine_corners, smooth_map
-from calib.boards.rehearsal import photograph
+from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import camera, tensor
+from tests.calib.board_scenes import camera, tensor
 
 CAMERA = camera(600.0, (480, 640), lens=(-0.25, 0.08, 0.001, -0.001, 0.0))
 CLEAR = {"chessboard:9x6:25mm": 0.5, "charuco:9x7:25mm": 0.125}

@@ -19,10 +19,10 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.images.doctor import diagnose_matches
-from calib.images.lenses import bending, uncalibrated_lenses, with_lenses
-from calib.images.matches import Matches, fit_fundamental, match_cameras, straightened
-from calib.images.photometric import Views, photometric_errors
-from calib.images.refine import Refined, line_distances, refine_matches
+from calib.images.lenses import largest_distortion, uncalibrated_lenses, with_lenses
+from calib.images.matches import Matches, fit_fundamental, match_cameras, undistort_matches
+from calib.images.photometric import PhotometricFrame, photometric_errors
+from calib.images.refinement import Refinement, line_distances, refine_matches
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import read_image
@@ -50,7 +50,7 @@ def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], 
 
 
 @functools.cache
-def found_by_points() -> tuple[dict[tuple[str, str], Matches], Rig, Refined]:
+def found_by_points() -> tuple[dict[tuple[str, str], Matches], Rig, Refinement]:
     """Points, the rig of them with no regard to lenses, and what refining finds."""
     points = matches(pair(-0.25))
     rig = known_by_f(points)
@@ -73,7 +73,7 @@ def test_lines_that_bend_are_followed(tmp_path):
     assert found.held_out[1].median < 0.06 < 0.12 < found.held_out[0].median
     assert median(found.rig, exact) < 0.03 < 0.12 < median(rig, exact)
     assert set(uncalibrated_lenses(found.rig)) == set(NAMES)
-    assert "lenses bend lines; without them F does not fit: a by up to" in found.as_text()
+    assert "F does not fit without lens distortion: a by up to" in found.as_text()
     found.rig.save(tmp_path / "rig.yaml")
     again = Rig.load(tmp_path / "rig.yaml")
     assert torch.allclose(line_distances(again, exact), line_distances(found.rig, exact), atol=1e-9)
@@ -81,7 +81,7 @@ def test_lines_that_bend_are_followed(tmp_path):
 
 def test_a_map_for_fusion_comes_with_the_lens():
     pair_found = found_by_points()[2].rig.pair(*NAMES)
-    x, y = straightened(pair_found, matches(pair(-0.25), noise=0.0, wrong=False)[NAMES])
+    x, y = undistort_matches(pair_found, matches(pair(-0.25), noise=0.0, wrong=False)[NAMES])
     assert (apply_homography(pair_found.homography, x).x - y).norm(dim=-1).median() < 40
     assert (apply_homography(resize_matrix(HW, HW), x).x - y).norm(dim=-1).median() > 60
 
@@ -105,11 +105,11 @@ def test_a_lens_that_is_known_is_kept_and_improved():
 
 def test_bending_is_what_no_straight_camera_does():
     rig = with_lenses(Rig({n: View(hw=HW) for n in NAMES}, links={NAMES: Link(torch.eye(3).double())}), NAMES)
-    assert float(bending(rig["a"])) < 1e-6
+    assert float(largest_distortion(rig["a"])) < 1e-6
     view = rig["a"].replace(distortion=Distortion("brown-conrady", vector(0.05, 0, 0, 0)))
     corner = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
     moved = float((view.undistort(corner)[0] - corner).norm())
-    assert 0.1 * moved < float(bending(view)) < 0.7 * moved
+    assert 0.1 * moved < float(largest_distortion(view)) < 0.7 * moved
 
 
 def test_the_doctor_takes_lenses_of_uncalibrated_cameras_as_they_are():
@@ -128,7 +128,7 @@ def test_the_fusions_error_sees_through_lenses():
     views = with_lenses(
         Rig({n: View(hw=rig[n].hw) for n in rig.names}, links={("left", "right"): Link(F, H)}), rig.names
     )
-    ready = Views.of(images)
+    ready = PhotometricFrame.of(images)
 
     def error(change):
         changed = views.perturbed({"right.distortion": change})

@@ -1,4 +1,4 @@
-"""Matched points and what they tell, against rigs that are known."""
+"""Matched points and quantities derived from them, against known rigs."""
 
 import cv2
 import numpy as np
@@ -7,15 +7,9 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
 from calib.images.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
+from tests.calib.scenes import texture
 
 HW = (240, 320)
-
-
-def texture(hw=HW, seed=0):
-    """Blobs of many sizes, (1, H, W)."""
-    noise = np.random.default_rng(seed).standard_normal(hw).astype(np.float32)
-    image = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
-    return torch.from_numpy((image - image.min()) / np.ptp(image))[None]
 
 
 def rig_of(depth=(1.0, 9.0)) -> Rig:

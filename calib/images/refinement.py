@@ -1,13 +1,13 @@
-"""A better rig from ordinary images: points matched between its cameras, what is known of it, and nothing else.
+"""Refinement of a rig by points matched between ordinary images, and a prior of its parameters.
 
-Chosen numbers z, in standard deviations of what they were known to (a calibration's, say), minimise
+The free parameters z, in units of their prior standard deviations (of a calibration, say), minimise
 
     sum_i log(1 + (r_i(z) / s)^2) + sum_k z_k^2
 
-with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points' own noise:
-Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). Numbers of which the
-images say nothing new keep their values. Points held out decide whether the result is accepted. What the points
-told is then the prior of a second fit, to the photometric error of the fusion itself: see `photometric`.
+with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points' noise:
+Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). Parameters that the images
+do not determine keep their values. Held-out points decide whether the result is accepted. Its posterior is then the
+prior of a second fit, to the photometric error of the fusion: see `photometric`.
 """
 
 from __future__ import annotations
@@ -22,38 +22,38 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 
-from .lenses import spoken_lenses, with_lenses
+from .lenses import describe_lenses, with_lenses
 from .matches import ENOUGH, Matches, match_cameras, with_map
-from .parameters import Unknown, changed, unknowns
-from .photometric import Attend, Views, photometric_errors, with_depths
+from .parameters import FreeParameter, apply_change, free_parameters
+from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .residuals import epipolar_residuals, related
 
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
 FREE = ("rotation", "centre")
-MORE = ("translation",)
-"""Freed too where points demand it: along their lines images tell little of it, and depths would drift."""
-NO_NARROWER = 0.9
-"""A number is left alone if the images leave more than this part of its standard deviation."""
+EXTRA_FREE = ("translation",)
+"""Freed too if held-out points improve: otherwise it is poorly constrained, and depths would drift."""
+LARGEST_POSTERIOR = 0.9
+"""A parameter is fixed if its posterior standard deviation stays above this share of the prior's."""
 HELD_OUT = 4
-"""One part in so many of the points, or of the frames, is held out."""
+"""One in this many points or frames is held out."""
 CELL = 24
-"""Points are held out by squares of so many pixels of alpha, so that none has a twin on the other side."""
+"""Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
 SIGNIFICANT = 2.0
-"""Held-out points must come nearer to their lines by so many standard errors."""
+"""Standard errors by which the distances of held-out points must decrease."""
 STEPS = 40
-TOGETHER = 10.0
-"""So many neighbouring errors of the fusion count as one."""
+CORRELATED_PIXELS = 10.0
+"""Photometric errors of this many neighbouring pixels count as one measurement."""
 ROUNDS = 8
-"""Steps of the search for the least photometric error."""
+"""Iterations of the photometric minimisation."""
 LEAST_NOISE = 0.03
-"""Matched points are never taken to be better than this, pixels."""
+"""Lower bound of the noise of matched points, pixels."""
 
 
 @dataclass(frozen=True)
-class Change:
-    """Numbers that changed: by how much, and how well they are known now, in the unit people use."""
+class ParameterChange:
+    """The change of a parameter vector and its posterior standard deviation, in the unit for display."""
 
     name: str
     amount: tuple[float, ...]
@@ -67,8 +67,8 @@ class Change:
         return f"{self.name} {amounts} {self.unit}".rstrip()
 
 
-class Agreement(NamedTuple):
-    """How far points are from their lines: their number, the median and the root mean square of the nearest 85%."""
+class LineStatistics(NamedTuple):
+    """Distances of points from their lines, pixels: number, median, and root mean square of the nearest 85%."""
 
     points: int
     median: float
@@ -78,8 +78,8 @@ class Agreement(NamedTuple):
         return f"{self.median:.2f} px"
 
 
-class Photometric(NamedTuple):
-    """The fusion's photometric error on held-out pixels, before and after its own stage, and whether that was kept."""
+class PhotometricResult(NamedTuple):
+    """The photometric error on held-out pixels before and after its minimisation, and whether that was accepted."""
 
     before: float
     after: float
@@ -87,37 +87,37 @@ class Photometric(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Refined:
-    """A rig made better, or not.
+class Refinement:
+    """The result of a refinement.
 
-    rig: the better one if `accepted`, else the one given. changes: what is different in it. left_alone: numbers that
-    the images do not determine. fitted, held_out: agreement before and after of the points that were used, and of
-    those that were not. photometric: what the fusion's own error did, if it was asked.
+    rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters that the
+    images do not determine. fitted, held_out: statistics before and after of the points used, and of those held out.
+    photometric: the photometric error, if it was minimised.
     """
 
     rig: Rig
     accepted: bool
-    changes: tuple[Change, ...]
-    left_alone: tuple[str, ...]
-    fitted: tuple[Agreement, Agreement]
-    held_out: tuple[Agreement, Agreement]
-    photometric: Photometric | None = None
+    changes: tuple[ParameterChange, ...]
+    unobservable: tuple[str, ...]
+    fitted: tuple[LineStatistics, LineStatistics]
+    held_out: tuple[LineStatistics, LineStatistics]
+    photometric: PhotometricResult | None = None
 
     def as_text(self) -> str:
-        """What changed and whether points that were held out agree, as people read it."""
-        before, after = self.held_out
-        lines = [f"held-out points ({before.points}) lie {before} off their lines before, {after} after"]
+        """The changes and the distances of held-out points, as text."""
+        given, refined = self.held_out
+        lines = [f"held-out points ({given.points}) lie {given} from their lines before, {refined} after"]
         if self.accepted:
             lines += [f"changed: {change}" for change in self.changes]
-            lines += [sentence] if (sentence := spoken_lenses(self.rig)) else []
+            lines += [sentence] if (sentence := describe_lenses(self.rig)) else []
         else:
-            lines.append("not accepted: held-out points come no nearer to their lines; the rig stays as it is")
-        if self.left_alone:
-            lines.append(f"left alone, not determined by these images: {', '.join(self.left_alone)}")
+            lines.append("not accepted: held-out points are no nearer to their lines; the rig is unchanged")
+        if self.unobservable:
+            lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")
         if self.photometric is not None:
-            b, a, kept = self.photometric
-            verdict = "kept" if kept else "not kept"
-            lines.append(f"the fusion's own error on held-out pixels: {b:.4f} before, {a:.4f} after: {verdict}")
+            before, after, accepted = self.photometric
+            verdict = "accepted" if accepted else "not accepted"
+            lines.append(f"photometric error on held-out pixels: {before:.4f} before, {after:.4f} after: {verdict}")
         return "\n".join(lines)
 
 
@@ -128,24 +128,23 @@ def refine(
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
     attend: Attend | None = None,
-) -> Refined:
-    """The rig after its free numbers are fitted to points matched in frames, each with an image of every camera.
+) -> Refinement:
+    """Refine a rig by points matched in frames, each with an image of every camera.
 
-    The first camera that has images keeps its pose. `free` and `sigma` are as of `unknowns.unknowns`; F of links is
-    always free, and views that are known by F alone are given lenses where points that were held out come nearer to
-    their lines so. With two frames or more, whole frames are held out, else parts of the image. With `attend`,
-    the fusion's own error then has its say, with what the points told as its prior.
-    Raises ValueError, one line: a camera that the rig lacks, an image of another size than the rig says, equal
-    images, too few points.
+    The first camera that has images keeps its pose. `free` and `sigma` are those of `parameters.free_parameters`; F of
+    links is always free, and views known by F alone are given lenses if held-out points improve. With two frames or
+    more, whole frames are held out, else parts of the image. With `attend` the photometric error of the fusion is then
+    minimised, with the posterior of the points as its prior. Raises ValueError, one line: a camera that the rig lacks,
+    an image of another size than the rig states, equal images, too few points.
     """
     for frame in frames:
         _check(rig, frame)
     fit, solution = fitted(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
-    told = fit.report(solution)
-    if attend is None or not told.accepted:
-        return told
+    refined = fit.report(solution)
+    if attend is None or not refined.accepted:
+        return refined
     polished, errors = polish(fit, solution, frames, attend)
-    return replace(fit.report(polished) if errors.accepted else told, photometric=errors)
+    return replace(fit.report(polished) if errors.accepted else refined, photometric=errors)
 
 
 def refine_matches(
@@ -154,99 +153,101 @@ def refine_matches(
     *,
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
-) -> Refined:
-    """The same from points matched already, without the fusion's error."""
+) -> Refinement:
+    """`refine` from matched points, without the photometric error."""
     fit, solution = fitted(rig, frames, free=free, sigma=sigma)
     return fit.report(solution)
 
 
 def fitted(
     rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
-) -> tuple[Fit, Solution]:
-    """The fit and what it tells; of more numbers where points that were held out come nearer to their lines so.
+) -> tuple[RefinementProblem, Solution]:
+    """The fit and its solution, with additional free parameters if held-out points improve.
 
-    More are translations, if `free` is the default, and lenses of views that are known by F.
+    Those are translations, if `free` is the default, and lenses of views known by F.
     """
     free = tuple(free)
     found = _fitted(rig, frames, free, sigma)
     if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
-        found = _nearer(found, _fitted(rig, frames, (*FREE, *MORE), sigma))
-    has_lens = with_lenses(rig, rig.names)
-    return found if has_lens is rig else _nearer(found, _fitted(has_lens, frames, free, sigma))
+        found = _nearer(found, _fitted(rig, frames, (*FREE, *EXTRA_FREE), sigma))
+    with_lens = with_lenses(rig, rig.names)
+    return found if with_lens is rig else _nearer(found, _fitted(with_lens, frames, free, sigma))
 
 
 def _fitted(
     rig: Rig, frames: Sequence[Pairs], free: tuple[str, ...], sigma: Mapping[str, float] | None
-) -> tuple[Fit, Solution]:
-    fit = Fit.of(rig, frames, free=free, sigma=sigma)
+) -> tuple[RefinementProblem, Solution]:
+    fit = RefinementProblem.of(rig, frames, free=free, sigma=sigma)
     return fit, fit.solve()
 
 
-def _nearer(found: tuple[Fit, Solution], other: tuple[Fit, Solution]) -> tuple[Fit, Solution]:
-    """The other fit if held-out points come nearer to their lines by it."""
+def _nearer(
+    found: tuple[RefinementProblem, Solution], other: tuple[RefinementProblem, Solution]
+) -> tuple[RefinementProblem, Solution]:
+    """The other fit if held-out points are nearer to their lines in it."""
     off = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (found, other)]
     return other if nearer(*off) else found
 
 
 @dataclass(frozen=True)
-class Fit:
-    """A rig, what may change in it, and the points: those used and those held out."""
+class RefinementProblem:
+    """A rig, its free parameters, and the points used and held out."""
 
     rig: Rig
-    given: tuple[Unknown, ...]
+    parameters: tuple[FreeParameter, ...]
     used: Pairs
     held_out: Pairs
 
     @classmethod
-    def of(cls, rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None) -> Fit:
+    def of(
+        cls, rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
+    ) -> RefinementProblem:
         """Raises ValueError if nothing is free."""
         used, held_out = split([related(rig, pairs) for pairs in frames])
         names = [name for name in rig.names if any(name in pair for pairs in (used, held_out) for pair in pairs)]
-        given = unknowns(rig, names, free=free, sigma=sigma)
-        if not given:
+        parameters = free_parameters(rig, names, free=free, sigma=sigma)
+        if not parameters:
             raise ValueError("nothing is free: the first camera keeps its pose; free more with --free, such as centre")
-        return cls(rig, tuple(given), used, held_out)
+        return cls(rig, tuple(parameters), used, held_out)
 
     def after(self, z: Float[Tensor, " n"]) -> Rig:
         """The rig after a change of z, in standard deviations."""
-        return changed(self.rig, self.given, z)
-
-    def prior(self) -> Solution:
-        """What is known before any point: no change, give or take a standard deviation."""
-        count = sum(len(u.sigma) for u in self.given)
-        eye = torch.eye(count, dtype=torch.float64)
-        return Solution(torch.zeros(count, dtype=torch.float64), torch.ones(count, dtype=torch.bool), eye)
+        return apply_change(self.rig, self.parameters, z)
 
     def solve(self) -> Solution:
-        """What the used points tell."""
-        return solve(lambda z: sampson(self.after(z), self.used), sum(len(u.sigma) for u in self.given))
+        """The posterior given the used points."""
+        return solve(lambda z: sampson(self.after(z), self.used), sum(len(u.sigma) for u in self.parameters))
 
-    def report(self, solution: Solution) -> Refined:
-        """What a solution changes, and whether the held-out points accept it."""
-        better = self.after(solution.z)
-        off = [(line_distances(self.rig, pairs), line_distances(better, pairs)) for pairs in (self.used, self.held_out)]
-        fitted, held_out = ((agreement(before), agreement(after)) for before, after in off)
-        accepted = bool(solution.active.any()) and nearer(*off[1])
-        changes = tuple(_changes(self.given, solution)) if accepted else ()
-        alone = tuple(_left_alone(self.given, solution.active))
-        rig = _with_maps(better, self.used) if accepted else self.rig
-        return Refined(rig, accepted, changes, alone, fitted, held_out)
+    def report(self, solution: Solution) -> Refinement:
+        """The changes by a solution, and whether the held-out points support it."""
+        refined = self.after(solution.z)
+        distances = [
+            (line_distances(self.rig, pairs), line_distances(refined, pairs)) for pairs in (self.used, self.held_out)
+        ]
+        fitted, held_out = ((line_statistics(before), line_statistics(after)) for before, after in distances)
+        accepted = bool(solution.active.any()) and nearer(*distances[1])
+        changes = tuple(_changes(self.parameters, solution)) if accepted else ()
+        unobservable = tuple(_unobservable(self.parameters, solution.active))
+        rig = _with_maps(refined, self.used) if accepted else self.rig
+        return Refinement(rig, accepted, changes, unobservable, fitted, held_out)
 
 
-def polish(fit: Fit, solution: Solution, frames: Sequence[Frame], attend: Attend) -> tuple[Solution, Photometric]:
-    """The solution moved to where the fusion's photometric error is least, with what the points told as its prior.
+def polish(
+    fit: RefinementProblem, solution: Solution, frames: Sequence[Frame], attend: Attend
+) -> tuple[Solution, PhotometricResult]:
+    """Minimise the photometric error of the fusion, with the solution of the points as its prior.
 
-    Errors are compared with their own deviation and count as one measurement for every `TOGETHER` pixels, because
-    neighbours err alike. Kept if the error falls on held-out pixels too and held-out points do not mind.
+    Errors are scaled by their own deviation and count as one measurement per `CORRELATED_PIXELS` pixels, as neighbours
+    are correlated. Accepted if the error on held-out pixels falls and held-out points are not significantly worse.
     """
     rig = with_depths(fit.after(solution.z), fit.used)
     base = replace(fit, rig=fit.rig.replace(depth=rig.depth))
-    views = [Views.of(frame) for frame in frames]
+    views = [PhotometricFrame.of(frame) for frame in frames]
     root = torch.linalg.cholesky(solution.covariance)[:, solution.active]
 
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
         parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
-        return torch.cat([error[seen & (_marked(error) == held_out)] for error, seen in parts])
+        return torch.cat([error[valid & (_held_out_pixels(error) == held_out)] for error, valid in parts])
 
     noise = _noise(errors(solution.z, held_out=False).detach())
     y = torch.zeros(root.shape[1], dtype=torch.float64, requires_grad=True)
@@ -255,7 +256,7 @@ def polish(fit: Fit, solution: Solution, frames: Sequence[Frame], attend: Attend
     def cost() -> Tensor:
         optimiser.zero_grad()
         left = errors(solution.z + root @ y, held_out=False) / noise
-        total = left.square().log1p().sum() / TOGETHER + y.square().sum()
+        total = left.square().log1p().sum() / CORRELATED_PIXELS + y.square().sum()
         total.backward()
         return total
 
@@ -263,17 +264,17 @@ def polish(fit: Fit, solution: Solution, frames: Sequence[Frame], attend: Attend
     z = (solution.z + root @ y).detach()
     before, after = (float(errors(v, held_out=True).detach().abs().mean()) for v in (solution.z, z))
     off = [line_distances(fit.after(v), fit.held_out) for v in (z, solution.z)]
-    return solution._replace(z=z), Photometric(before, after, after < before and not nearer(*off))
+    return solution._replace(z=z), PhotometricResult(before, after, after < before and not nearer(*off))
 
 
-def _marked(error: Tensor) -> Tensor:
+def _held_out_pixels(error: Tensor) -> Tensor:
     """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
     rows, columns = (torch.arange(n) // 4 for n in error.shape)
     return (columns + 2 * rows[:, None]) % HELD_OUT == 0
 
 
 class Solution(NamedTuple):
-    """The numbers z, which of them were free in the end, and the covariance of all, in units of the prior's."""
+    """The parameters z, which of them were observable, and their covariance, in units of the prior's deviations."""
 
     z: Float[Tensor, " n"]
     active: Bool[Tensor, " n"]
@@ -281,19 +282,19 @@ class Solution(NamedTuple):
 
 
 def solve(residuals: Callable[[Tensor], Tensor], count: int) -> Solution:
-    """The most probable z under a normal prior of variance 1, leaving alone what the residuals do not tell.
+    """The most probable z under a normal prior of variance 1, with unobservable parameters fixed.
 
-    Numbers whose standard deviation stays above `NO_NARROWER` are set back to 0 and the rest is solved for anew.
+    Parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others solved for again.
     """
     active = torch.ones(count, dtype=torch.bool)
     while True:
         z = _most_probable(residuals, active)
         information, _ = _normal_equations(residuals, z, active)
         covariance = torch.linalg.inv(information)
-        told = covariance.diagonal().sqrt() <= NO_NARROWER
-        if bool((told == active).all()):
+        observable = covariance.diagonal().sqrt() <= LARGEST_POSTERIOR
+        if bool((observable == active).all()):
             return Solution(z, active, covariance)
-        active = active & told
+        active = active & observable
 
 
 def _most_probable(residuals: Callable[[Tensor], Tensor], active: Tensor) -> Tensor:
@@ -328,7 +329,7 @@ def _noise(r: Tensor) -> float:
 
 
 def _normal_equations(residuals: Callable[[Tensor], Tensor], z: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss; inactive numbers have a prior alone and stay."""
+    """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss; inactive parameters have only their prior."""
     r, J = jacobian(residuals, z)
     J = torch.where(active, J, 0.0)
     scale = _noise(r)
@@ -338,9 +339,9 @@ def _normal_equations(residuals: Callable[[Tensor], Tensor], z: Tensor, active: 
 
 
 def jacobian(f: Callable[[Tensor], Tensor], z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
-    """f(z) and its derivatives, of many values in few numbers.
+    """f(z) and its derivatives, for many values of few parameters.
 
-    The gradient of u . f in z is linear in u; its derivatives in u are the columns wanted, all at once.
+    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian.
     """
     z = z.detach().requires_grad_()
     values = f(z)
@@ -356,14 +357,14 @@ def sampson(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     return torch.cat([torch.where(part.valid, part.sampson, 0.0) for part in parts])
 
 
-def agreement(off: Float[Tensor, " n"]) -> Agreement:
-    """How far points are from their lines, in short."""
-    nearest = off.abs().sort().values[: max(1, int(0.85 * len(off)))]
-    return Agreement(len(off), float(off.abs().median()), float(nearest.square().mean().sqrt()))
+def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:
+    """Statistics of the distances of points from their lines."""
+    nearest = distance.abs().sort().values[: max(1, int(0.85 * len(distance)))]
+    return LineStatistics(len(distance), float(distance.abs().median()), float(nearest.square().mean().sqrt()))
 
 
 def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
-    """Whether points came nearer to their lines by more than chance: a paired test, each distance cut at 5 px."""
+    """Whether distances from the lines decreased significantly: a paired test, distances clipped at 5 px."""
     gain = before.abs().clamp(max=5) - after.abs().clamp(max=5)
     return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
 
@@ -379,14 +380,14 @@ def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict
         held_out = max(1, len(frames) // HELD_OUT)
         return _joined(frames[:-held_out]), _joined(frames[-held_out:])
     (pairs,) = frames
-    marks = {names: _marks(matches) for names, matches in pairs.items()}
+    marks = {names: _held_out_points(matches) for names, matches in pairs.items()}
     return (
         {names: matches.only(~marks[names]) for names, matches in pairs.items()},
         {names: matches.only(marks[names]) for names, matches in pairs.items() if bool(marks[names].any())},
     )
 
 
-def _marks(matches: Matches) -> Tensor:
+def _held_out_points(matches: Matches) -> Tensor:
     """Points in one square out of `HELD_OUT`."""
     column, row = (matches.alpha / CELL).floor().long().unbind(-1)
     return (column + 2 * row) % HELD_OUT == 0
@@ -399,7 +400,7 @@ def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], Matches]:
 
 
 def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
-    """The rig whose links have a rough map where they had none and points tell one."""
+    """The rig with a rough map for links that have none, by their points."""
     links = dict(rig.links)
     for names, matches in pairs.items():
         if names in links and links[names].H is None and len(matches.alpha) >= ENOUGH:
@@ -413,22 +414,22 @@ def _check(rig: Rig, frame: Frame) -> None:
         if tuple(image.shape[1:]) != (h, w):
             got = f"{image.shape[2]}x{image.shape[1]}"
             raise ValueError(
-                f"the image of '{name}' is {got}, the rig says {w}x{h}: `pat rig doctor` tells what was done to it"
+                f"the image of '{name}' is {got}, the rig states {w}x{h}: `pat rig doctor` finds the reason"
             )
 
 
-def _changes(given: Sequence[Unknown], solution: Solution) -> Iterable[Change]:
-    sizes = [len(u.sigma) for u in given]
+def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[ParameterChange]:
+    sizes = [len(u.sigma) for u in parameters]
     deviations = solution.covariance.diagonal().sqrt().split(sizes)
-    for u, z, deviation, active in zip(given, solution.z.split(sizes), deviations, solution.active.split(sizes)):
+    for u, z, deviation, active in zip(parameters, solution.z.split(sizes), deviations, solution.active.split(sizes)):
         if bool(active.any()):
             scale = u.sigma * u.factor
-            yield Change(u.name, tuple((z * scale).tolist()), tuple((deviation * scale).tolist()), u.unit)
+            yield ParameterChange(u.name, tuple((z * scale).tolist()), tuple((deviation * scale).tolist()), u.unit)
 
 
-def _left_alone(given: Sequence[Unknown], active: Tensor) -> Iterable[str]:
-    for u, mine in zip(given, active.split([len(u.sigma) for u in given])):
+def _unobservable(parameters: Sequence[FreeParameter], active: Tensor) -> Iterable[str]:
+    for u, mine in zip(parameters, active.split([len(u.sigma) for u in parameters])):
         if not bool(mine.any()):
             yield u.name
         else:
-            yield from (u.spoken(i) for i, free in enumerate(mine.tolist()) if not free)
+            yield from (u.label(i) for i, free in enumerate(mine.tolist()) if not free)
