@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 import torch
@@ -45,9 +45,8 @@ class Observations(NamedTuple):
 class Structure(Protocol):
     """Blocks of parameters of the observed points."""
 
-    @property
-    def width(self) -> int:
-        """Parameters per block."""
+    width: ClassVar[int]
+    """Parameters per block."""
 
     def __len__(self) -> int: ...
 
@@ -66,11 +65,8 @@ class BoardPoses:
     """A rigid board in many poses, `world_from_board` batched over them."""
 
     world_from_board: Pose
-
-    @property
-    def width(self) -> int:
-        """Six: a rotation vector and a translation."""
-        return 6
+    width: ClassVar[int] = 6
+    """A rotation vector and a translation."""
 
     def __len__(self) -> int:
         return len(self.world_from_board.t)

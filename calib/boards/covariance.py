@@ -87,18 +87,12 @@ def beta_covariance(
     return found
 
 
-def centre_covariance(camera: Camera, name: str, covariance: RigCovariance) -> Float[np.ndarray, "3 3"]:
-    """Covariance of a camera's optical centre in the world, m^2."""
-    t = camera.t.numpy()
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    by_pose = -camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1)
-    change = by_pose @ covariance.of(name, camera)[:6]
-    return change @ covariance.matrix @ change.T
-
-
 def baseline_deviation(rig: Mapping[str, Camera], name: str, covariance: RigCovariance) -> float:
     """The standard deviation of the distance between a camera and the world's origin, metres."""
     camera = rig[name]
-    centre = camera.centre.numpy()
+    centre, (x, y, z) = camera.centre.numpy(), camera.t.numpy()
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    centre_by_pose = -camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1)
     direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
-    return float(np.sqrt(direction @ centre_covariance(camera, name, covariance) @ direction))
+    change = direction @ centre_by_pose @ covariance.of(name, camera)[:6]
+    return float(np.sqrt(change @ covariance.matrix @ change))

@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -115,18 +116,15 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
         raise ValueError(f"{name}: two images have the same number, such as {files[0].name}: give each its own")
-    return {key: Photo(file.name, _reader(file)) for key, file in zip(keys, files)}
+    return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
 
 
-def _reader(path: Path) -> Callable[[], np.ndarray]:
-    def decode() -> np.ndarray:
-        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
-        if image is None:
-            raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
-        return image
-
-    return decode
+def _decode_file(path: Path) -> np.ndarray:
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    if image is None:
+        raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
+    return image
 
 
 def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
@@ -137,17 +135,14 @@ def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
         raise ValueError(f"{path}: not a video that can be read: save images from it, or convert it to .mp4")
     step = 1 << max(0, math.ceil(math.log2(count / MOST_FRAMES)))
     for index in range(0, count, step):
-        yield index, Photo(f"{path.name} frame {index}", _frame_reader(path, index))
+        yield index, Photo(f"{path.name} frame {index}", partial(_decode_frame, path, index))
 
 
-def _frame_reader(path: Path, index: int) -> Callable[[], np.ndarray]:
-    def decode() -> np.ndarray:
-        video = cv2.VideoCapture(str(path))
-        video.set(cv2.CAP_PROP_POS_FRAMES, index)
-        done, image = video.read()
-        video.release()
-        if not done:
-            raise ValueError(f"{path}: frame {index} cannot be read: is the video complete?")
-        return image
-
-    return decode
+def _decode_frame(path: Path, index: int) -> np.ndarray:
+    video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_POS_FRAMES, index)
+    done, image = video.read()
+    video.release()
+    if not done:
+        raise ValueError(f"{path}: frame {index} cannot be read: is the video complete?")
+    return image

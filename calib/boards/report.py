@@ -6,6 +6,7 @@ import base64
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from io import BytesIO
+from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,9 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<p>{escape(summary(calibration))}</p>",
-        _list(advice) if advice else "<p>No advice.</p>",
+        "<ul>" + "".join(f'<li class="note">{escape(a)}</li>' for a in advice) + "</ul>"
+        if advice
+        else "<p>No advice.</p>",
         "<h2>Cameras</h2>",
         camera_table(calibration, covers),
         "<h2>Pairs</h2>" + pair_table(calibration) if len(calibration.views) > 1 else "",
@@ -190,10 +193,6 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
 
 
-def _list(items: Sequence[str]) -> str:
-    return "<ul>" + "".join(f'<li class="note">{escape(item)}</li>' for item in items) + "</ul>"
-
-
 # Figures ------------------------------------------------------------------------------------------------------
 
 
@@ -209,7 +208,7 @@ def draw_scene(calibration: Calibration) -> Figure:
     for pose in calibration.fit.problem.board_poses(calibration.frames).values():
         X = pose.apply(corners).numpy()
         above.plot(X[:, 0], X[:, 2], color="0.75", lw=0.8)
-    for colour, (name, camera) in zip(_colours(), calibration.fit.problem.cameras.items()):
+    for colour, (name, camera) in zip(cycle(COLOURS), calibration.fit.problem.cameras.items()):
         x, _, z = camera.centre.tolist()
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
@@ -228,7 +227,7 @@ def draw_by_image(calibration: Calibration) -> Figure:
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
-    for colour, (name, r) in zip(_colours(), calibration.fit.problem.residuals().items()):
+    for colour, (name, r) in zip(cycle(COLOURS), calibration.fit.problem.residuals().items()):
         block = calibration.fit.problem.seen[name].block
         counts = np.bincount(block, minlength=len(frames))
         present = np.flatnonzero(counts)
@@ -321,10 +320,6 @@ def _outline(calibration: Calibration) -> Tensor:
 
 def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
     return (-0.5, hw[1] - 0.5, hw[0] - 0.5, -0.5)
-
-
-def _colours() -> Iterable[str]:
-    return COLOURS * 32
 
 
 def _escaped(text: str) -> str:

@@ -14,7 +14,7 @@ from arraygeom.rig import depth_range
 from .collect import Progress, collect_folder
 from .intrinsics import Lens
 from .report import coverages, report_html, rig_covariance, summary
-from .rig import Calibration, calibrate
+from .rig import calibrate
 from .target import draw_board, parse_board
 
 
@@ -53,7 +53,9 @@ def calibrate_photos(
     if covariance is not None:
         covariance.save(written[1])
     rig.save(out)
-    return CalibrationOutput(_messages(calibration, found.notes), [path for path in written if path.exists()])
+    advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
+    messages = [summary(calibration), *found.notes, *calibration.notes, *advice]
+    return CalibrationOutput(messages, [path for path in written if path.exists()])
 
 
 def write_board(board: str, out: Path) -> Path:
@@ -64,8 +66,3 @@ def write_board(board: str, out: Path) -> Path:
     with write_atomically(out) as temporary, rc_context({"svg.fonttype": "path"}):
         figure.savefig(temporary)
     return out
-
-
-def _messages(calibration: Calibration, notes: tuple[str, ...]) -> list[str]:
-    advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
-    return [summary(calibration), *notes, *calibration.notes, *advice]

@@ -25,6 +25,8 @@ from .target import Board, Circles, draw_board
 
 FILLS = (0.35, 0.9)
 """Least and largest width of the board, as a share of the narrowest view."""
+TILT = 35.0
+"""Largest rotation of the board about x and about y, degrees."""
 TRIES = 2000
 WALL = 90
 """Grey value of the background."""
@@ -52,10 +54,10 @@ def simulate_photos(
     return boards
 
 
-def board_poses(rig: Rig, board: Board, count: int, *, tilt: float = 35.0, seed: int = 0) -> Pose:
+def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
     """Random `world_from_board` (a batch) with the board's centre visible in every camera, at several depths and tilts.
 
-    `tilt` is the largest rotation about x and about y, degrees. Raises ValueError if there are too few such poses.
+    Raises ValueError if there are too few such poses.
     """
     cameras, random = list(calibrated(rig).values()), np.random.default_rng(seed)
     narrow = max(float(c.K[0, 0]) / c.hw[1] for c in cameras)
@@ -67,7 +69,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, tilt: float = 35.0, seed:
         x = torch.from_numpy(random.uniform(0.15, 0.85, 2) * (np.array(camera.hw[::-1]) - 1))
         centre = camera.unproject(x, torch.tensor(depth))
         if all(bool(p.valid) and bool(c.contains(p.x)) for c in cameras for p in [c.project(centre)]):
-            rotation = np.radians([*random.uniform(-tilt, tilt, 2), random.uniform(-20, 20)])
+            rotation = np.radians([*random.uniform(-TILT, TILT, 2), random.uniform(-20, 20)])
             R = camera.R.T.double() @ rotation_from_vector(torch.from_numpy(rotation))
             found.append(Pose(R, centre - R @ middle))
         if len(found) == count:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import NamedTuple
 
 import torch
@@ -187,7 +188,7 @@ def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[FitStatis
             inliers=inliers,
             floor=floor,
             bounds=rig.depth,
-            handed=_mean(abs(share - _mirrors(repaired, names)) for share, names in zip(preserved, pairs)),
+            handed=fmean(abs(share - _mirrors(repaired, names)) for share, names in zip(preserved, pairs)),
         )
         for i, repaired in enumerate(rigs)
     ]
@@ -212,11 +213,6 @@ def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
     """Whether exactly one of two cameras is that of a mirrored image."""
     views = [rig[name] for name in names]
     return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
-
-
-def _mean(shares: Iterable[float]) -> float:
-    found = list(shares)
-    return sum(found) / len(found)
 
 
 class PointObservations(NamedTuple):

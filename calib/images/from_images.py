@@ -13,7 +13,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
-from arraygeom.pixels import HW
 
 from .lenses import describe_lenses
 from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, with_map
@@ -60,10 +59,11 @@ def rig_from_images(
         if name not in images or length <= 0:
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
+    K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
     found = UncalibratedRig(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {})
     links, matched = {}, match_cameras(images)
     for names, matches in matched.items():
-        F, distance, by_focal = _fundamental(matches, *(_K(name, focal, sizes) for name in names))
+        F, distance, by_focal = _fundamental(matches, *(K.get(name) for name in names))
         links[names] = fit_link(matches, F, within=AGREE).link
         found.distance[names], found.by_focal[names] = distance, by_focal
     rig = found.rig.replace(links=links)
@@ -81,10 +81,6 @@ def rig_from_images(
 def _distances(rig: Rig, matched: Mapping[tuple[str, str], Matches]) -> dict[tuple[str, str], float]:
     _, held_out = split([matched])
     return {names: float(line_distances(rig, {names: m}).abs().median()) for names, m in held_out.items()}
-
-
-def _K(name: str, focal: Mapping[str, float], sizes: Mapping[str, HW]) -> Tensor | None:
-    return intrinsics(focal[name], sizes[name]) if name in focal else None
 
 
 def _fundamental(matches: Matches, K: Tensor | None, K_beta: Tensor | None) -> tuple[Tensor, float, bool]:

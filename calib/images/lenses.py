@@ -35,17 +35,14 @@ def _flat(view: View) -> LensView:
     return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
 
 
-def uncalibrated_lenses(rig: Rig) -> dict[str, LensView]:
-    """The views that are not calibrated but have a lens."""
-    views = {name: view for name, view in rig.cameras.items() if isinstance(view, LensView)}
-    return {name: v for name, v in views.items() if v.distortion is not None and not isinstance(v, Camera)}
-
-
 def describe_lenses(rig: Rig) -> str:
     """A sentence on the lenses of uncalibrated views; empty if there are none."""
-    lenses = uncalibrated_lenses(rig)
-    distorted = ", ".join(f"{name} by up to {float(largest_distortion(view)):.1f} px" for name, view in lenses.items())
-    return f"F does not fit without lens distortion: {distorted}" if lenses else ""
+    distorted = [
+        f"{name} by up to {float(largest_distortion(view)):.1f} px"
+        for name, view in rig.cameras.items()
+        if isinstance(view, LensView) and view.distortion is not None and not isinstance(view, Camera)
+    ]
+    return f"F does not fit without lens distortion: {', '.join(distorted)}" if distorted else ""
 
 
 def largest_distortion(view: LensView) -> Float[Tensor, ""]:

@@ -33,7 +33,7 @@ MANY = 60
 AGREE = 5.0
 """Largest distance, in pixels, of a consistent match from its line: lenses distort lines."""
 STILL = 0.05
-"""Images whose points move less than this, in pixels, are the same image."""
+"""Images in which nine points in ten move less than this, in pixels, are the same image."""
 
 
 class Matches(NamedTuple):
@@ -121,7 +121,8 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
-        if images[a].shape[1:] == images[b].shape[1:] and float(_movement(matches)) < STILL:
+        displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
+        if images[a].shape[1:] == images[b].shape[1:] and displacement < STILL:
             raise ValueError(f"the images of '{a}' and '{b}' are the same image: give each camera its own")
     if not kept:
         (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
@@ -152,11 +153,6 @@ def agreeing(matches: Matches) -> Matches:
     except ValueError:
         return none
     return near_lines(matches, F, within=AGREE)
-
-
-def _movement(matches: Matches) -> Tensor:
-    """The 90th percentile of the displacement between the images, pixels."""
-    return (matches.alpha - matches.beta).norm(dim=-1).quantile(0.9)
 
 
 def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> Matches:

@@ -8,6 +8,7 @@ alone. Bilinear sampling propagates the gradient to the segments' ends and so to
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -30,7 +31,7 @@ from arraygeom import (
     pixel_grid,
 )
 
-from .matches import ENOUGH, Matches, seen_depths
+from .matches import Matches, seen_depths
 
 
 @runtime_checkable
@@ -40,12 +41,10 @@ class PhotometricMatch(Protocol):
     @property
     def value(self) -> Tensor:
         """The weighted value."""
-        ...
 
     @property
     def peak(self) -> Tensor:
         """The largest weight."""
-        ...
 
 
 Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], PhotometricMatch]
@@ -117,18 +116,12 @@ def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:
     """The rig with the depth range of the matched points, if it has none."""
     if rig.depth is not None:
         return rig
-    bounds = [_bounds(rig.pair(*names), matches) for names, matches in pairs.items()]
-    found = [b for b in bounds if b is not None]
-    return rig.replace(depth=(min(n for n, _ in found), max(f for _, f in found))) if found else rig
-
-
-def _bounds(pair: Pair, matches: Matches) -> tuple[float, float] | None:
-    if not pair.calibrated or len(matches.alpha) < ENOUGH:
-        return None
-    try:
-        return seen_depths(pair, matches)
-    except ValueError:
-        return None
+    bounds = []
+    for names, matches in pairs.items():
+        if (pair := rig.pair(*names)).calibrated:
+            with suppress(ValueError):
+                bounds.append(seen_depths(pair, matches))
+    return rig.replace(depth=(min(near for near, _ in bounds), max(far for _, far in bounds))) if bounds else rig
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:

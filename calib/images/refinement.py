@@ -148,11 +148,7 @@ def refine(
 
 
 def refine_matches(
-    rig: Rig,
-    frames: Sequence[Pairs],
-    *,
-    free: Iterable[str] = FREE,
-    sigma: Mapping[str, float] | None = None,
+    rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str] = FREE, sigma: Mapping[str, float] | None = None
 ) -> Refinement:
     """`refine` from matched points, without the photometric error."""
     fit, solution = fitted(rig, frames, free=free, sigma=sigma)
@@ -167,26 +163,17 @@ def fitted(
     Those are translations, if `free` is the default, and lenses of views known by F.
     """
     free = tuple(free)
-    found = _fitted(rig, frames, free, sigma)
+    candidates = [(rig, free)]
     if free == FREE and any(isinstance(view, Camera) for view in rig.cameras.values()):
-        found = _nearer(found, _fitted(rig, frames, (*FREE, *EXTRA_FREE), sigma))
-    with_lens = with_lenses(rig, rig.names)
-    return found if with_lens is rig else _nearer(found, _fitted(with_lens, frames, free, sigma))
-
-
-def _fitted(
-    rig: Rig, frames: Sequence[Pairs], free: tuple[str, ...], sigma: Mapping[str, float] | None
-) -> tuple[RefinementProblem, Solution]:
-    fit = RefinementProblem.of(rig, frames, free=free, sigma=sigma)
-    return fit, fit.solve()
-
-
-def _nearer(
-    found: tuple[RefinementProblem, Solution], other: tuple[RefinementProblem, Solution]
-) -> tuple[RefinementProblem, Solution]:
-    """The other fit if held-out points are nearer to their lines in it."""
-    off = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (found, other)]
-    return other if nearer(*off) else found
+        candidates.append((rig, (*FREE, *EXTRA_FREE)))
+    if (with_lens := with_lenses(rig, rig.names)) is not rig:
+        candidates.append((with_lens, free))
+    fits = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
+    best, *others = [(fit, fit.solve()) for fit in fits]
+    for other in others:
+        distances = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (best, other)]
+        best = other if nearer(*distances) else best
+    return best
 
 
 @dataclass(frozen=True)
@@ -200,7 +187,7 @@ class RefinementProblem:
 
     @classmethod
     def of(
-        cls, rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str], sigma: Mapping[str, float] | None
+        cls, rig: Rig, free: Iterable[str], *, frames: Sequence[Pairs], sigma: Mapping[str, float] | None = None
     ) -> RefinementProblem:
         """Raises ValueError if nothing is free."""
         used, held_out = split([related(rig, pairs) for pairs in frames])

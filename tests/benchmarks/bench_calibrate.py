@@ -77,7 +77,7 @@ def bumblebee_pairs(data: Path) -> Iterator[Figure]:
     )
     told = found.deviations()
     deviation = np.degrees(np.hypot(told["right.rotation.0"], told["right.rotation.1"]))
-    yield Figure("turn against published", f"{turn:.2f} degrees (own deviation {deviation:.2f})", "agreement")
+    yield Figure("rotation against published", f"{turn:.2f} degrees (own deviation {deviation:.2f})", "agreement")
     yield Figure("seconds", f"{seconds:.0f}", "")
 
 
@@ -127,15 +127,15 @@ def rendered(boards: Path) -> Iterator[Figure]:
     yield Figure("rendered photographs", f"{len(found.frames)} frames, 4 cameras", "10 or more")
     noise = ", ".join(f"{name} {sigma:.3f}" for name, sigma in found.fit.sigma.items())
     yield Figure("noise of corners", f"{noise} px", "")
-    yield Figure("worst turn", f"{degrees:.4f} degrees", "at most 0.02")
-    yield Figure("worst place", f"{1e3 * metres:.3f} mm", "at most 0.2")
-    yield Figure("worst number", f"{np.abs(relative).max():.2f} deviations ({found.fit.names[worst]})", "at most 3")
-    yield Figure("chi-square of all numbers", f"{square:.0f} of {len(errors)}", "")
+    yield Figure("worst rotation", f"{degrees:.4f} degrees", "at most 0.02")
+    yield Figure("worst position", f"{1e3 * metres:.3f} mm", "at most 0.2")
+    yield Figure("worst parameter", f"{np.abs(relative).max():.2f} deviations ({found.fit.names[worst]})", "at most 3")
+    yield Figure("chi-square of all parameters", f"{square:.0f} of {len(errors)}", "")
     yield Figure("seconds", f"{seconds:.0f}", "")
 
 
 def of_folder(folder: Path, board: str, *, order: tuple[str, ...] | None = None) -> tuple[Calibration, float]:
-    """As `pat calibrate` does it; and the seconds it took."""
+    """The rig as by `pat calibrate`, and the seconds it took."""
     start, known = time.perf_counter(), parse_board(board)
     views = collect_folder(folder, known).views
     found = calibrate({name: views[name] for name in order or views}, known)

@@ -4,8 +4,8 @@
 
 A case is a real pair and a random mistake made with its rig or its images. One that is no more than the rig's own
 misfit is drawn again: where lines move by less than 0.1 px, or by less than 3 times what the rig was off before, a
-mistake cannot be told from the drift of a rig. Shifts of a pixel or half of one are drawn for rigs alone that fit
-their own images to 0.17 px.
+mistake cannot be distinguished from the drift of a rig. Shifts of a pixel or half of one are drawn only for rigs that
+fit their own images to 0.17 px.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ MANY = 60
 
 @dataclass
 class Subject:
-    """A real pair that is in order, with its matched points and what the doctor says of it."""
+    """A real pair that is in order, with its matched points and misfit."""
 
     pair: RealPair
     matches: dict
@@ -110,7 +110,7 @@ def resized(rig: Rig, images: Images, g: Random) -> Made:
     return rig, images | changed
 
 
-def turned(rig: Rig, images: Images, g: Random) -> Made:
+def rotated(rig: Rig, images: Images, g: Random) -> Made:
     words = str(g.choice(list(ROTATIONS)))
     return rig, images | {name: rotated_image(images[name], words) for name in some(rig.names, g)}
 
@@ -158,7 +158,7 @@ def undistorted(rig: Rig, name: str, image: Tensor) -> Tensor:
 MISTAKES: dict[str, Callable[[Rig, Images, Random], Made]] = {
     "nothing": nothing,
     "resized": resized,
-    "rotated or mirrored": turned,
+    "rotated or mirrored": rotated,
     "cameras swapped": swapped,
     "pose inverted": inverted,
     "R transposed": transposed,
@@ -222,7 +222,7 @@ def confusions(data: Path, *, cases: int, seed: int, kinds: Sequence[str] = tupl
             label = found.named.kind
             if label != kind:
                 equal = kind in [r.kind for r in found.equal]
-                label += " (or the truth)" if equal else ""
+                label += " (or the true one)" if equal else ""
                 misses.append(f"{kind}: {name}: {found.verdict}; before {found.before}; after {found.after}")
                 totals["right or equal"] += equal
             totals["right"] += label == kind
@@ -248,8 +248,8 @@ def main() -> None:
     text = confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only)
     print(text)
     if options.out:
-        told = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their images."
-        write_text(options.out, f"# Which remedies the doctor names\n\n{told}\n\n{text}")
+        note = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their images."
+        write_text(options.out, f"# Which remedies the doctor names\n\n{note}\n\n{text}")
 
 
 if __name__ == "__main__":

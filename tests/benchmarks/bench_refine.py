@@ -1,11 +1,11 @@
-"""What `pat rig refine` makes of rigs that were made worse: real pairs, the fast + slow array, rendered rigs.
+"""What `pat rig refine` recovers of perturbed rigs: real pairs, the fast + slow array, rendered rigs.
 
     python -m tests.benchmarks.bench_refine --draws 3 --out tests/benchmarks/RESULTS_refine.md
 
-Every camera is turned by 0.3 degrees and its principal point moved by 5 px, some way or other. Distances are medians
-over points that were held out, from their lines, in pixels of beta. *of points* is how far they are from the lines of
-an F of their own, fitted by MAGSAC++ to all points: less cannot be expected. *of the rig* is the rest, root mean
-square: what the nearest 85% of the points are off, less what they are off that F.
+Every camera is rotated by 0.3 degrees and its principal point moved by 5 px, in random directions. Distances are medians
+over points that were held out, from their lines, in pixels of beta. *of points* is their distance from the lines of
+an F fitted by MAGSAC++ to all points: a lower bound. *of the rig* is the rest, root mean square of the nearest 85%
+of the points: their distance without that from this F.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ TURN, MOVE = math.radians(0.3), 5.0
 
 
 def worse(rig: Rig, g: torch.Generator) -> Rig:
-    """Every camera turned by 0.3 degrees, its principal point moved by 5 px."""
+    """Every camera rotated by 0.3 degrees, its principal point moved by 5 px."""
     changes = rig.parameters(free=["*.rotation", "*.centre"])
     drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
     return rig.perturbed({k: v / v.norm() * (TURN if k.endswith("rotation") else MOVE) for k, v in drawn.items()})
@@ -88,7 +88,7 @@ def own_agreement(pairs: dict) -> LineStatistics:
 
 
 def beyond(found: LineStatistics, own: LineStatistics) -> float:
-    """What is left of a distance without that of the points themselves."""
+    """A distance without that of the points themselves."""
     return math.sqrt(max(found.rms**2 - own.rms**2, 0.0))
 
 
@@ -97,7 +97,7 @@ def _span(values: list[float]) -> str:
 
 
 def fast_and_slow(data: Path) -> Iterator[str]:
-    """F as published; as `pat rig refine` and `pat rig start` leave it, which find lenses; of the points' own."""
+    """F as published; after `pat rig refine` and `pat rig start`, which find lenses; of the points' own."""
     yield (
         "| fast + slow | points held out | published F | F of all points | refined | started |\n| --- "
         + "| ---: " * 5
@@ -122,8 +122,8 @@ def fast_and_slow(data: Path) -> Iterator[str]:
 
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
-    """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at alpha's view."""
-    head = "| rendered | draw | true rig | made worse | by points | and by the fusion's error | from images alone |"
+    """The sample array and scenes rendered before: with ground-truth rigs and ground-truth colours at alpha's view."""
+    head = "| rendered | draw | true rig | made worse | by points | and by photometric error | from images alone |"
     yield head + "\n| --- | " + "---: | " * 6
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
@@ -144,14 +144,14 @@ def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterat
 
 
 def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
-    """The fusion's error without any point, from rigs that are four fifths of the way back."""
-    yield "| sample array | four fifths back | by the fusion's error alone |\n| --- | ---: | ---: |"
+    """The photometric error without any point, from rigs that are four fifths refined."""
+    yield "| sample array | four fifths back | by photometric error alone |\n| --- | ---: | ---: |"
     sample = load_sample()
     points = match_cameras(sample.images)
     (names,) = points
     true = exact_points(sample.rig, names)
     for draw in range(1, draws + 1):
-        fit = RefinementProblem.of(worse(sample.rig, g), [points], free=FREE, sigma=None)
+        fit = RefinementProblem.of(worse(sample.rig, g), FREE, frames=[points])
         near = uninformed(fit)._replace(z=0.8 * fit.solve().z)
         found, _ = polish(
             fit, near._replace(covariance=0.01 * near.covariance), [sample.images], attend_with_statistics
@@ -193,7 +193,7 @@ def main() -> None:
             print(line, flush=True)
             lines.append(line)
     if options.out:
-        write_text(options.out, "# What refining makes of rigs\n\n" + "\n".join(lines))
+        write_text(options.out, "# Refinement of rigs\n\n" + "\n".join(lines))
 
 
 if __name__ == "__main__":

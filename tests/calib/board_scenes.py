@@ -1,4 +1,4 @@
-"""Arrays of cameras with known truth, and what they see of a board: corners by projection."""
+"""Arrays of cameras with known ground truth, and their views of a board: corners by projection."""
 
 import numpy as np
 import torch
@@ -17,7 +17,7 @@ def tensor(*values):
 
 
 def camera(focal, hw, centre=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), lens=(), model="brown-conrady", offset=(3.0, -2.0)):
-    """A camera at `centre` in the world, turned by a rotation vector in degrees."""
+    """A camera at `centre` in the world, rotated by a rotation vector in degrees."""
     middle = (hw[1] - 1) / 2 + offset[0], (hw[0] - 1) / 2 + offset[1]
     pose = Pose.from_centre(rotation_from_vector(torch.deg2rad(tensor(*turn))), tensor(*centre))
     distortion = Distortion(model, tensor(*lens)) if lens else None
@@ -39,7 +39,7 @@ def four_cameras() -> Rig:
 
 
 def board_poses(count, *, seed=0, depth=(0.9, 2.4), tilt=35.0, spread=0.4) -> Pose:
-    """`world_from_board` in front of a camera at the origin: random places, depths and tilts."""
+    """`world_from_board` in front of a camera at the origin: random positions, depths and tilts."""
     random = np.random.default_rng(seed)
     middle = BOARD.points.mean(0)
     rotations, translations = [], []
@@ -71,7 +71,7 @@ def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, Bo
 
 
 def scene_of(rig, boards, views, board: Board = BOARD) -> BundleProblem:
-    """The truth as a problem to adjust."""
+    """The ground truth as a problem to adjust."""
     seen = {}
     for name, v in views.items():
         parts = [(np.full(len(d.ids), frame), board.points[d.ids], d.x) for frame, d in v.seen.items()]
@@ -80,7 +80,7 @@ def scene_of(rig, boards, views, board: Board = BOARD) -> BundleProblem:
 
 
 def errors_of(fit, rig):
-    """Estimate minus truth of every free number, in the order of `fit.names`."""
+    """Estimate minus ground truth of every free parameter, in the order of `fit.names`."""
     found = []
     for name, camera_found in fit.problem.cameras.items():
         ground_truth = rig[name]

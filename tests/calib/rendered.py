@@ -1,4 +1,4 @@
-"""Rendered photographs of a ChArUco board by an array whose every number is known.
+"""Rendered photographs of a ChArUco board by an array whose parameters are all known.
 
     python -m tests.calib.rendered --out out/boards
 
@@ -46,7 +46,7 @@ def rig() -> Rig:
 
 
 def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose]:
-    """`world_from_board`: held by each camera in turn to some place of its image, in view of the others too."""
+    """`world_from_board`: in front of each camera in turn, at a random position, visible to the others too."""
     random = np.random.default_rng(seed)
     found: list[Pose] = []
     while len(found) < count:

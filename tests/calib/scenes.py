@@ -1,4 +1,4 @@
-"""Rigs, points and images whose truth is known."""
+"""Rigs, points and images with known ground truth."""
 
 import cv2
 import numpy as np
@@ -23,7 +23,7 @@ def vector(*numbers) -> torch.Tensor:
 
 
 def unlike_pair(*, lens: bool = False) -> Rig:
-    """Two cameras with nothing in common: other sizes, focal lengths, principal points, turned, apart."""
+    """Two cameras with nothing in common: other sizes, focal lengths, principal points, rotated, apart."""
     first = Camera(
         K=intrinsics((300.0, 310.0), HW, (170.0, 110.0)),
         cam_from_world=Pose.from_centre(rotation_from_vector(vector(0.1, -0.2, 0.05)), vector(0.3, 0.1, -0.2)),

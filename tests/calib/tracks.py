@@ -1,4 +1,4 @@
-"""Corners that other tools' cameras saw, with the rigs and the reprojection errors those tools published."""
+"""Corners observed in other tools' data sets, with the published rigs and reprojection errors."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import csv
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -29,11 +29,7 @@ class FreePoints:
     """Independent points in the world, metres: the `Structure` of tracks without a board."""
 
     X: Float[np.ndarray, "b 3"]
-
-    @property
-    def width(self) -> int:
-        """Coordinates per point."""
-        return 3
+    width: ClassVar[int] = 3
 
     def __len__(self) -> int:
         return len(self.X)

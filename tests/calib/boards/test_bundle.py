@@ -1,4 +1,4 @@
-"""Bundle adjustment: derivatives, the truth recovered, gross errors without a say, a covariance that is true."""
+"""Bundle adjustment: derivatives, recovered ground truth, robustness to outliers, a correct covariance."""
 
 from dataclasses import replace
 
@@ -50,7 +50,7 @@ def shaken(problem, size, seed=0):
 
 @pytest.fixture(scope="module")
 def small():
-    """Two cameras, eight boards, noise of 0.1 px; the truth."""
+    """Two cameras, eight boards, noise of 0.1 px; the ground truth."""
     rig = four_cameras()
     rig = Rig({name: rig[name] for name in ("mono", "colour")})
     boards = board_poses(8, spread=0.2)
@@ -90,7 +90,7 @@ def test_derivatives_of_blocks(kind):
         assert np.abs(numeric - found[..., i]).max() < 1e-8
 
 
-def test_perfect_corners_give_back_the_truth():
+def test_perfect_corners_recover_the_ground_truth():
     rig, boards = four_cameras(), board_poses(10)
     ground_truth = scene_of(rig, boards, see(rig, boards))
     fit = adjust(shaken(ground_truth, 1.0), free_of(ground_truth))
@@ -127,8 +127,8 @@ def test_the_least_squares_are_scipys(small):
     assert np.sqrt(fit.covariance.diagonal()) == pytest.approx(deviations, rel=0.05)
 
 
-def test_what_is_expected_pulls_as_hard_as_it_says(small):
-    """The fit with an expectation is the weighted mean of the fit without and the expectation."""
+def test_a_prior_has_its_stated_weight(small):
+    """The fit with a prior is the weighted mean of the fit without and the prior."""
     _, _, problem = small
     free = free_of(problem)
     alone = adjust(problem, free)
@@ -144,7 +144,7 @@ def test_what_is_expected_pulls_as_hard_as_it_says(small):
     assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)
 
 
-def test_gross_errors_have_no_say(small):
+def test_outliers_have_no_influence(small):
     _, _, problem = small
     clean = adjust(problem, free_of(problem))
     x = problem.seen["mono"].x.copy()
@@ -162,7 +162,7 @@ def test_gross_errors_have_no_say(small):
     assert fit.sigma["mono"] == pytest.approx(0.1, rel=0.25)
 
 
-def test_a_scale_that_nothing_tells_has_no_covariance(small):
+def test_an_unobservable_scale_has_no_covariance(small):
     _, _, problem = small
     points = FreePoints(problem.structure.world(problem.seen["mono"])[:60])
     seen = {}

@@ -17,7 +17,7 @@ RANDOM = np.random.default_rng(0)
 
 
 def seen(text, *, noise=1.5):
-    """A photograph of a board, where its corners are, and their places in squares."""
+    """An image of a board, its true corners, and their positions in squares."""
     board = parse_board(text)
     R = rotation_from_vector(torch.deg2rad(tensor(24.0, -28.0, 9.0)))
     pose = Pose(R, tensor(0.01, -0.005, 0.34) - R @ tensor(*board.points.mean(0)))

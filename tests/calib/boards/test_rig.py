@@ -1,4 +1,4 @@
-"""From what cameras saw to a rig: the truth with its uncertainty, and a word for every set that cannot be used."""
+"""From detections to a rig: ground truth within its uncertainty, and a message for every unusable set."""
 
 import re
 
@@ -58,7 +58,7 @@ def test_a_pair_is_found_within_its_uncertainty(pair, found):
 
 
 def test_the_covariance_says_how_far_predictions_are_off(pair, found):
-    """A point of alpha at 2 m, predicted in beta, by truth and by the calibration."""
+    """A point of alpha at 2 m, predicted in beta, by the true rig and by the calibration."""
     rig, covariance = pair[0], rig_covariance(found)
     x = np.stack(np.meshgrid(np.linspace(200, 760, 5), np.linspace(150, 570, 4)), -1).reshape(-1, 2)
     both = []
@@ -159,17 +159,17 @@ def test_mirrored_sets_are_refused(pair):
 
 
 def test_boards_that_move_between_the_exposures_do_not_bend_the_lenses(pair):
-    """Frames a moment apart: intrinsics stay what each camera's own images tell, and the note says so."""
+    """Frames a moment apart: intrinsics stay those of each camera's own images, and the note states so."""
     rig, boards, views = pair
     moved = Pose(boards.R, boards.t + torch.from_numpy(np.random.default_rng(0).normal(0, 0.004, (10, 3))))
     views = {"mono": views["mono"], "colour": see(rig, moved, noise=0.1)["colour"]}
     result = calibrate(views, BOARD)
     assert any("taken at the same moments" in note for note in result.notes)
     alone = calibrate_single("colour", views["colour"], BOARD)
-    told = dict(zip(alone.fit.names, np.sqrt(alone.fit.covariance.diagonal())))
+    deviations = dict(zip(alone.fit.names, np.sqrt(alone.fit.covariance.diagonal())))
     for i in range(2):
         change = abs(float(result.rig["colour"].K[i, i] - alone.camera.K[i, i]))
-        assert change < told[f"colour.focal.{i}"]
+        assert change < deviations[f"colour.focal.{i}"]
     assert len(set(result.fit.sigma.values())) == 1
 
 
@@ -185,8 +185,8 @@ def test_parallel_boards_are_refused():
         calibrate(see(Rig({"cam": c}), boards), BOARD)
 
 
-def test_what_images_do_not_tell_is_left_alone():
-    """A long lens hardly bends: k2 and k3 stay 0, and the sentence says so; the coverage names what is missing."""
+def test_unobservable_parameters_are_fixed():
+    """A long lens hardly distorts: k2 and k3 stay 0, with a note; the coverage names what is missing."""
     c = camera(4000.0, (480, 640), lens=(0.0, 0.0, 0.0, 0.0, 0.0))
     board = parse_board("charuco:9x7:20mm")
     boards = board_poses(8, depth=(2.5, 2.8), spread=0.02)

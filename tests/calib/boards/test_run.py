@@ -1,4 +1,4 @@
-"""`pat calibrate` on photographs: real sets as good as known, mistakes in one line with nothing written."""
+"""`pat calibrate` on photographs: real sets with the published accuracy, mistakes in one line with nothing written."""
 
 import shutil
 
@@ -51,7 +51,7 @@ def fails(folder, capsys, *more, board=BOARD) -> str:
 
 @pytest.fixture
 def mine(photos, tmp_path):
-    """A copy of the photographs to spoil."""
+    """A copy of the images to corrupt."""
     return shutil.copytree(photos, tmp_path / "photos")
 
 
@@ -136,7 +136,7 @@ def test_videos(mine):
 
 @pytest.mark.slow
 def test_photographs_of_four_cameras(tmp_path):
-    """Through prints, lenses, noise and the detector: the truth within 3.5 deviations for each of some fifty numbers.
+    """Through prints, lenses, noise and detector: ground truth within 3.5 deviations for each of some 50 parameters.
 
     Sixteen boards and corners good to 0.1 px know the poses to about 0.1 degree and half a millimetre.
     """
@@ -192,7 +192,7 @@ def test_bumblebees_pairs(shared_data, tmp_path, capsys):
         assert float(rig[name].K[0, 0]) == pytest.approx(float(published[name].K[0, 0]), rel=0.003)
     ours, theirs = (r.pair("left", "right").beta_from_alpha for r in (rig, published))
     assert float(ours.t.norm()) == pytest.approx(float(theirs.t.norm()), rel=0.003)
-    print("turned by", float((ours.R - theirs.R).norm()) / 2**0.5)
+    print("rotated by", float((ours.R - theirs.R).norm()) / 2**0.5)
     assert float((ours.R - theirs.R).norm()) / 2**0.5 < np.radians(0.35), "eleven small boards know it to 0.1 degrees"
 
 

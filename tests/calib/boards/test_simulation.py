@@ -1,4 +1,4 @@
-"""Photographs of boards that were never printed: corners where the cameras put them, and a rig back from them."""
+"""Photographs of boards that were never printed: corners at their projections, and the rig recovered from them."""
 
 import numpy as np
 import pytest

@@ -56,7 +56,7 @@ def test_points_are_numbered_as_opencv_numbers_them():
         ("charuco:8x6:30mm:22mm:blue", "'blue' is not recognised"),
     ],
 )
-def test_wrong_names_say_what_is_wrong(text, message):
+def test_wrong_names_are_explained(text, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         parse_board(text)
 

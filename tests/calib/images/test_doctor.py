@@ -1,4 +1,4 @@
-"""Every usual mistake made with rigs whose truth is known, and named."""
+"""Every usual mistake made with rigs whose ground truth is known, and the name it is given."""
 
 import dataclasses
 import json

@@ -56,7 +56,7 @@ def test_lines_choose_matches():
     assert 300 <= len(near_lines(both, F, within=1).alpha) < 330
 
 
-def test_a_link_is_made_better_and_its_map_reaches_the_points():
+def test_a_link_is_refined_and_its_map_reaches_the_points():
     rig = rig_of()
     F, matches = rig.pair("left", "right").fundamental, seen_points(rig, noise=0.2)
     shift = torch.tensor([[1.0, 0, 2.0], [0, 1, -2.0], [0, 0, 1]], dtype=torch.float64)
@@ -80,7 +80,7 @@ def test_a_link_needs_points_that_agree():
         fit_link(matches, other)
 
 
-def test_depths_hold_what_was_matched():
+def test_depths_contain_the_matched_points():
     rig = rig_of()
     near, far = seen_depths(rig.pair("left", "right"), seen_points(rig, noise=0.1))
     assert 1.7 < near < 2.0

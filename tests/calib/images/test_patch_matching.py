@@ -37,7 +37,7 @@ def test_points_return_to_where_they_are_seen():
     assert (off < 0.15).mean() > 0.95
 
 
-def test_what_is_not_alike_is_left_alone():
+def test_uncorrelated_patches_are_rejected():
     alpha, _ = warped()
     other = (texture((240, 320), seed=9)[0].numpy() * 255).astype(np.uint8)
     x = points()

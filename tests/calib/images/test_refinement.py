@@ -1,4 +1,4 @@
-"""Rigs made worse and made better again, against their truth."""
+"""Perturbed rigs and their refinement, against ground truth."""
 
 import math
 
@@ -37,7 +37,7 @@ from tests.calib.scenes import (
 
 
 def worse(rig: Rig, *, seed=0) -> Rig:
-    """Each camera turned by 0.3 degrees, each principal point moved by 5 pixels, some way or other."""
+    """Each camera rotated by 0.3 degrees, each principal point moved by 5 pixels, in random directions."""
     g = torch.Generator().manual_seed(seed)
     changes = rig.parameters(free=["*.rotation", "*.centre"])
     drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
@@ -100,8 +100,8 @@ def test_translations_are_freed_where_points_demand_it():
     found = refine_matches(moved, [seen_points(rig, count=400)])
     assert any(change.name == "second.translation" for change in found.changes)
     assert median_off(found.rig, exact) < 0.1
-    turned = refine_matches(worse(rig), [seen_points(rig)])
-    assert not any("translation" in change.name for change in turned.changes)
+    rotated = refine_matches(worse(rig), [seen_points(rig)])
+    assert not any("translation" in change.name for change in rotated.changes)
     only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
     assert not any("translation" in change.name for change in only.changes)
 
@@ -119,7 +119,7 @@ def test_a_good_rig_stays_as_it_is():
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
 
 
-def test_points_held_out_refuse_what_wrong_points_say():
+def test_held_out_points_reject_a_fit_to_wrong_points():
     rig = unlike_pair()
     drifted = rig.perturbed({"second.rotation": vector(0.01, 0.005, 0)})
     found = refine_matches(rig, [seen_points(drifted), seen_points(rig, seed=2)])
@@ -130,7 +130,7 @@ def test_points_held_out_refuse_what_wrong_points_say():
 
 
 def test_deviations_are_those_of_repeated_measurement():
-    """The spread of the answers over draws of noise is what the answer says of itself."""
+    """The standard deviation over draws of noise is the stated one."""
     rig = rectified_pair().perturbed({"right.rotation": vector(0.02, 0.01, -0.03)})
     draws = [refine_matches(worse(rig), [seen_points(rig, noise=0.2, seed=s)], free=["rotation"]) for s in range(12)]
     amounts = torch.tensor([d.changes[0].amount for d in draws])
@@ -203,7 +203,7 @@ def test_photometric_error_is_least_for_the_true_rig():
     assert slope[1] > 0
 
 
-def test_the_fusions_error_brings_a_rig_nearer_its_truth():
+def test_photometric_error_refines_a_rig():
     rig, images = rectified_pair(), rectified_images()
     bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
     found = refine(bad, [images], free=["rotation"], attend=attend_with_statistics)
@@ -213,15 +213,11 @@ def test_the_fusions_error_brings_a_rig_nearer_its_truth():
     assert median_off(found.rig, seen_points(rig, noise=0.0)) < 0.1
 
 
-def test_the_fusions_error_alone_does_too():
+def test_photometric_error_alone_refines_a_rig():
     """No point is used: the gradient through attention's segments moves the rig."""
     rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
-    fit = RefinementProblem.of(
-        rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}),
-        [match_cameras(images)],
-        free=["right.rotation"],
-        sigma=None,
-    )
+    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
+    fit = RefinementProblem.of(bad, ["right.rotation"], frames=[match_cameras(images)])
     ground_truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
     before = median_off(fit.rig, ground_truth)
     found, errors = polish(fit, uninformed(fit), [images], attend_with_statistics)
