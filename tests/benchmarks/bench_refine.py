@@ -2,8 +2,8 @@
 
     python -m tests.benchmarks.bench_refine --draws 3 --out tests/benchmarks/RESULTS_refine.md
 
-Every camera is rotated by 0.3 degrees and its principal point moved by 5 px, in random directions. Distances are medians
-over points that were held out, from their lines, in pixels of beta. *of points* is their distance from the lines of
+Every camera is rotated by 0.3 degrees and its principal point moved by 5 px, in random directions. Distances are
+medians over held-out points, from their lines, in pixels of beta. *of points* is their distance from the lines of
 an F fitted by MAGSAC++ to all points: a lower bound. *of the rig* is the rest, root mean square of the nearest 85%
 of the points: their distance without that from this F.
 """
