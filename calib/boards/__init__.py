@@ -5,23 +5,18 @@
 `run` does all of it from files to files, `simulation` renders the images that a planned rig would take.
 """
 
-from importlib import import_module
-from typing import Any
+from .. import _lazy
 
 __all__ = ["calibrate", "calibrate_photos", "collect_folder", "parse_board", "simulate_photos", "write_board"]
 
-_MODULES = {
-    "calibrate": "rig",
-    "calibrate_photos": "run",
-    "collect_folder": "collect",
-    "parse_board": "target",
-    "simulate_photos": "simulation",
-    "write_board": "run",
-}
-
-
-def __getattr__(name: str) -> Any:
-    """The public functions, imported when first used: OpenCV and matplotlib are slow to load."""
-    if name not in _MODULES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+__getattr__ = _lazy(
+    __name__,
+    {
+        "calibrate": "rig",
+        "calibrate_photos": "run",
+        "collect_folder": "collect",
+        "parse_board": "target",
+        "simulate_photos": "simulation",
+        "write_board": "run",
+    },
+)

@@ -260,7 +260,7 @@ def _mirrored(seen: CalibratedViews, board: Board) -> CalibratedViews:
 
 
 def _shifted(a: CalibratedViews, b: CalibratedViews, shift: int) -> CalibratedViews:
-    """b with each image renumbered as the one `shift` later among all numbers of both."""
+    """b with each image renumbered as the one `shift` positions before it among all numbers of both."""
     keys = sorted({*a.views.seen, *b.views.seen}, key=lambda k: (isinstance(k, str), k))
     renamed = {key: keys[i - shift] for i, key in enumerate(keys) if 0 <= i - shift < len(keys)}
     seen = {renamed[key]: d for key, d in b.views.seen.items() if key in renamed}
