@@ -81,22 +81,22 @@ def calibrate(
     single = {
         name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()
     }
-    begin = initial_rig(
+    initial = initial_rig(
         [CalibratedViews(name, a.camera, a.views, a.cam_from_board) for name, a in single.items()], board
     )
-    cameras = {name: a.camera.replace(cam_from_world=begin.cam_from_world[name]) for name, a in single.items()}
-    together = _joint_fit(_problem(cameras, begin.world_from_board, begin.views, board), single)
+    cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
+    together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), single)
     rig = Rig(together.fit.problem.cameras)
     return Calibration(
         rig=rig,
         board=board,
         fit=together.fit,
-        frames=tuple(begin.world_from_board),
-        views=begin.views,
+        frames=tuple(initial.world_from_board),
+        views=initial.views,
         single={name: a.fit.problem.rms() for name, a in single.items()},
-        epipolar=epipolar_errors(rig, begin.views),
-        held_out=_held_out(cameras, begin.world_from_board, begin.views, board, together),
-        notes=(*_images_left_out(views, single, begin.left_out), *together.notes),
+        epipolar=epipolar_errors(rig, initial.views),
+        held_out=_held_out(cameras, initial.world_from_board, initial.views, board, together),
+        notes=(*_images_left_out(views, single, initial.left_out), *together.notes),
     )
 
 
