@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -53,6 +53,7 @@ class Done(NamedTuple):
     undo: Undo
 
 
+@runtime_checkable
 class Step(Protocol):
     """One step."""
 
@@ -133,7 +134,7 @@ class EqualResolution:
         return Done(views, _as_it_is)
 
     def _cropped(self, views: Views, name: str) -> Views:
-        """A calibrated beta without what no search segment reaches, if that is much: it would be enlarged for nothing.
+        """A calibrated beta without what no search segment touches, if that is much: it would be enlarged for nothing.
 
         Not where the field may depend on the images' sizes.
         """
