@@ -3,8 +3,8 @@
 from pat.data.indices import agreement, index_files, read_indices, write_indices
 from pat.data.pairs import (
     PAPER_DISPARITY,
-    Calibration,
     Disparity,
+    StereoCalibration,
     StereoPair,
     flickr_pairs,
     folder_pairs,
@@ -12,20 +12,20 @@ from pat.data.pairs import (
     middlebury_pairs,
     syntim_pairs,
 )
-from pat.data.patches import Patches, scene_folders
+from pat.data.patches import PatchGrid, scene_folders
 from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
 from pat.evaluation.protocols import MonoColourTask, mono_colour_task, reduce_by
 
 __all__ = [
     "PAPER_DISPARITY",
-    "Calibration",
     "Disparity",
     "MonoColourTask",
     "Patch",
-    "Patches",
+    "PatchGrid",
     "RenderedScenes",
     "ScenePatches",
     "SceneShuffle",
+    "StereoCalibration",
     "StereoPair",
     "agreement",
     "collate",

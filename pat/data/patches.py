@@ -1,4 +1,4 @@
-"""Patches of rendered scenes: cut on the fly, reduced, each with the rig of its own windows.
+"""PatchGrid of rendered scenes: cut on the fly, reduced, each with the rig of its own windows.
 
 The paper's are 49 windows of 384x128 of every 2048x1536 view, reduced cubically to 96x32. Each camera's window has
 about alpha's angle of view and lies where the middle of alpha's window would be seen at the middle inverse depth of
@@ -30,7 +30,7 @@ PAPER_WIDTH = 2048
 
 
 @dataclass(frozen=True, kw_only=True)
-class Patches:
+class PatchGrid:
     """`grid` rows and columns of windows of height and width `hw`, spread evenly, reduced `reduce` times."""
 
     hw: HW = (128, 384)
@@ -44,11 +44,11 @@ class Patches:
             )
 
     @classmethod
-    def like_the_papers(cls, hw: HW) -> Patches:
+    def like_the_papers(cls, hw: HW) -> PatchGrid:
         """96x32 patches that cover of an image of this size what the paper's cover of its own.
 
-        >>> Patches.like_the_papers((384, 512))
-        Patches(hw=(32, 96), grid=(7, 7), reduce=1)
+        >>> PatchGrid.like_the_papers((384, 512))
+        PatchGrid(hw=(32, 96), grid=(7, 7), reduce=1)
         """
         reduce = max(round(4 * hw[1] / PAPER_WIDTH), 1)
         return cls(hw=(32 * reduce, 96 * reduce), reduce=reduce)
@@ -116,7 +116,7 @@ def scene_rig(folder: Path) -> Rig:
         return Rendered(folder).rig
 
 
-def cut(folder: Path, patches: Patches, *, alpha: str) -> Stack:
+def cut(folder: Path, patches: PatchGrid, *, alpha: str) -> Stack:
     """All patches of a scene.
 
     Raises ValueError, naming the folder, for images that cannot be read, patches that do not fit, and a rig
@@ -142,7 +142,7 @@ def cut(folder: Path, patches: Patches, *, alpha: str) -> Stack:
 Corners = list[tuple[int, int]]
 
 
-def _windows(rig: Rig, alpha: str, patches: Patches) -> dict[str, tuple[Corners, HW]]:
+def _windows(rig: Rig, alpha: str, patches: PatchGrid) -> dict[str, tuple[Corners, HW]]:
     """For each camera, the corners of its windows and their size."""
     corners = patches.corners(rig[alpha].hw)
     found = {alpha: (corners, patches.hw)}
@@ -165,7 +165,7 @@ def _placed(x: list[float], hw: HW, whole: HW) -> tuple[int, int]:
     return min(max(top, 0), whole[0] - hw[0]), min(max(left, 0), whole[1] - hw[1])
 
 
-def _beta_size(alpha: Camera, beta: Camera, patches: Patches) -> HW:
+def _beta_size(alpha: Camera, beta: Camera, patches: PatchGrid) -> HW:
     """About alpha's angle of view, a multiple of the reduction, and within beta's image."""
     ratio = [float(beta.K[i, :2].norm() / alpha.K[i, :2].norm()) for i in (1, 0)]
     r = patches.reduce

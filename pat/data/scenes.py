@@ -18,9 +18,9 @@ from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
 from pat.networks.protocol import Look
 from pat.sensors import (
-    Case,
     Clip,
-    Coded,
+    DegradationCase,
+    EncodeSRGB,
     Noise,
     Quantise,
     Spectral,
@@ -32,7 +32,7 @@ from pat.sensors import (
 )
 from pat.synthesis.layered import ArrayBatch
 
-from .patches import Patches, Stack, cut, same_cameras, scene_folders, scene_rig, select, stacked
+from .patches import PatchGrid, Stack, cut, same_cameras, scene_folders, scene_rig, select, stacked
 
 LOADED = 64
 """Scenes whose patches are kept in memory by each process."""
@@ -72,9 +72,9 @@ class ScenePatches(Dataset[Patch]):
         root: str | Path,
         *,
         alpha: str | None = None,
-        patches: Patches | None = None,
+        patches: PatchGrid | None = None,
         chains: Mapping[str, Sequence[Step]] | None = None,
-        cases: Sequence[Case] = (),
+        cases: Sequence[DegradationCase] = (),
         seed: int = 0,
     ):
         self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
@@ -122,12 +122,12 @@ class ScenePatches(Dataset[Patch]):
 class SceneStacks:
     """The scenes of a folder, cut into patches when asked for; the latest `LOADED` stay in memory."""
 
-    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: Patches | None = None):
+    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: PatchGrid | None = None):
         self.folders = scene_folders(root)
         self._kept: OrderedDict[int, Stack] = OrderedDict()
         self.rig = scene_rig(self.folders[0])
         self.alpha = self.rig.require(alpha or self.rig.names[0])
-        self.patches = patches or Patches.like_the_papers(self.rig[self.alpha].hw)
+        self.patches = patches or PatchGrid.like_the_papers(self.rig[self.alpha].hw)
 
     def __len__(self) -> int:
         return len(self.folders)
@@ -178,13 +178,13 @@ def collate(patches: Sequence[Patch]) -> Patch:
 
 
 class RenderedScenes:
-    """Patches of rendered scenes where layered ones are expected: `sample` is that of `LayeredScenes`.
+    """PatchGrid of rendered scenes where layered ones are expected: `sample` is that of `LayeredScenes`.
 
     A batch mixes patches of several scenes that are in memory; `mixed` of them are, and one is exchanged about
     every time that as many patches as it has were given. Raises ValueError for cameras with a lens model.
     """
 
-    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: Patches | None = None, mixed: int = 16):
+    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: PatchGrid | None = None, mixed: int = 16):
         self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
         for name, camera in self.scenes.rig.cameras.items():
             if isinstance(camera, Camera) and camera.distortion is not None:
@@ -228,13 +228,13 @@ def _draw(below: int, generator: Generator) -> int:
 
 def coded(rgb: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
     """Linear light as an sRGB image."""
-    return record(rgb, [Clip(), Coded()], Generator()).image
+    return record(rgb, [Clip(), EncodeSRGB()], Generator()).image
 
 
 def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
     """What each camera's response says, a little noise, 8 bits, sRGB coding."""
     return {
-        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), Coded(), Quantise(8)) for name, c in rig.cameras.items()
+        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), EncodeSRGB(), Quantise(8)) for name, c in rig.cameras.items()
     }
 
 

@@ -23,15 +23,15 @@ from typing import Any
 
 from pat.support.schema import from_document, near
 
-from .cases import Case
+from .cases import DegradationCase
 from .chain import Step
 from .electronics import Clip, Exposure, Jitter, Noise, Quantise
 from .grids import Crop, Demosaic, Mosaic, Resample
 from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting
-from .spectral import Coded, Gamma, Linear, Spectral
+from .spectral import DecodeSRGB, EncodeSRGB, Gamma, Spectral
 
 _CLASSES: tuple[type[Step], ...] = (
-    *(Linear, Coded, Gamma, Spectral, Exposure, Vignetting),
+    *(DecodeSRGB, EncodeSRGB, Gamma, Spectral, Exposure, Vignetting),
     *(BoxBlur, GaussianBlur, DiscBlur, Defocus, MotionBlur),
     *(Resample, Crop, Mosaic, Demosaic, Noise, Clip, Quantise, Jitter),
 )
@@ -43,7 +43,7 @@ def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
     """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest name.
 
     >>> read_chain(["linear", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
-    (Linear(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
+    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
     """
     if not isinstance(value, list):
         raise ValueError(f"{where}: wanted a list of steps, such as [linear, {{noise: {{full_well: 8000}}}}]")
@@ -57,21 +57,21 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
     return {str(name): read_chain(steps, f"{where}.{name}") for name, steps in value.items()}
 
 
-def read_cases(value: Any, where: str = "cases") -> tuple[Case, ...]:
+def read_cases(value: Any, where: str = "cases") -> tuple[DegradationCase, ...]:
     """Cases for pairs, from a list of mappings with `name` and, if degraded, `alpha` and `beta`."""
     if not isinstance(value, list) or not value:
         raise ValueError(f"{where}: wanted a list of cases, such as [{{name: blur beta, beta: [{{box-blur: 5}}]}}]")
     return tuple(_case(entry, f"{where}[{i}]") for i, entry in enumerate(value))
 
 
-def _case(entry: Any, where: str) -> Case:
+def _case(entry: Any, where: str) -> DegradationCase:
     if not isinstance(entry, Mapping) or "name" not in entry:
         raise ValueError(f"{where}: wanted a mapping with name, alpha and beta")
     for key in entry:
         if key not in ("name", "alpha", "beta"):
             raise ValueError(f"{where}.{key}: unknown key{near(key, ('name', 'alpha', 'beta'))}")
     alpha, beta = (read_chain(entry.get(side, []), f"{where}.{side}") for side in ("alpha", "beta"))
-    return Case(str(entry["name"]), alpha, beta)
+    return DegradationCase(str(entry["name"]), alpha, beta)
 
 
 def _step(entry: Any, where: str) -> Step:

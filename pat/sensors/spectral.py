@@ -24,7 +24,7 @@ _VISIBLE, _NEAR_INFRARED = (400.0, 700.0), (400.0, 1000.0)
 
 
 @dataclass(frozen=True)
-class Linear(Step):
+class DecodeSRGB(Step):
     """sRGB coding to linear light (IEC 61966-2-1)."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
@@ -33,7 +33,7 @@ class Linear(Step):
 
 
 @dataclass(frozen=True)
-class Coded(Step):
+class EncodeSRGB(Step):
     """Linear light to sRGB coding, the inverse of `Linear`."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:

@@ -29,7 +29,7 @@ from ..media.colour import luminance_of
 from ..media.images import read_image
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights
-from ..sensors import Clip, Coded, Exposure, record
+from ..sensors import Clip, EncodeSRGB, Exposure, record
 
 PAIRS = ("kitti", "middlebury", "flickr1024")
 SYNTIM = ("Color", "Serfaty", "Poly")
@@ -198,4 +198,4 @@ def _coded(image: Float[Tensor, "_ h w"], *, brightest: float | None = None) -> 
     """Linear values coded as sRGB; with `brightest`, exposed so that this share of the pixels stays below white."""
     linear = luminance_of(image)
     gain = 1.0 if brightest is None else 1 / float(linear.flatten().sort().values[int(brightest * linear.numel())])
-    return record(linear[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
+    return record(linear[None], (Exposure(gain), Clip(), EncodeSRGB()), torch.Generator()).image[0]

@@ -37,7 +37,7 @@ from pat.media.raw import as_bright
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.sensors import Coded
+from pat.sensors import EncodeSRGB
 from pat.support.memory import watch_peak
 from pat.systems.hdr import merged, usable_range
 
@@ -376,7 +376,7 @@ def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], al
 
 def coded(linear: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
     """Linear light coded as sRGB."""
-    return Coded().apply(linear[None], Generator())[0]
+    return EncodeSRGB().apply(linear[None], Generator())[0]
 
 
 def mosaic(rgb: Float[Tensor, "3 h w"], pattern: str) -> Float[Tensor, "1 h w"]:

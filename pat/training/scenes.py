@@ -40,7 +40,7 @@ DECENTRED = 0.1
 """How far a beta's window misses what alpha's middle may see, as a fraction of its size."""
 
 
-class View(NamedTuple):
+class RenderedView(NamedTuple):
     """An image in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its pinhole."""
 
     rgb: Float[Tensor, "3 h w"]
@@ -102,7 +102,7 @@ class RenderedCrops(Crops):
             drawn = [self._windows(one_of(scenes, generator), sizes, generator) for _ in range(batch)]
         return batched(drawn, self.device)
 
-    def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[View]:
+    def _windows(self, scene: int, sizes: list[HW], g: Generator) -> list[RenderedView]:
         """Alpha's window and one of each beta."""
         name = one_of(self.alphas[scene], g)
         names = [n for n in self.names[scene] if n != name]
@@ -154,7 +154,7 @@ def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     return names
 
 
-def read_view(folder: Path, name: str) -> View:
+def read_view(folder: Path, name: str) -> RenderedView:
     """The first frame of a camera. Raises ValueError, naming the folder, for one that cannot be used."""
     with reading(folder):
         frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
@@ -168,14 +168,14 @@ def read_view(folder: Path, name: str) -> View:
     return straight(frame, camera.to(torch.float64))
 
 
-def straight(frame: RenderedFrame, camera: Camera) -> View:
+def straight(frame: RenderedFrame, camera: Camera) -> RenderedView:
     """A frame without its lens's bending."""
     if camera.distortion is None:
-        return View(frame.rgb, frame.depth, camera)
+        return RenderedView(frame.rgb, frame.depth, camera)
     pinhole = pinhole_of(camera)
     rgb = resampled(frame.rgb, camera, pinhole, extended=True).values[0].clamp(min=0)
     depth = resampled(frame.depth[None], camera, pinhole, interpolation="nearest")
-    return View(rgb, torch.where(depth.valid[0], depth.values[0, 0], torch.nan), pinhole)
+    return RenderedView(rgb, torch.where(depth.valid[0], depth.values[0, 0], torch.nan), pinhole)
 
 
 def pinhole_of(camera: Camera) -> Camera:
@@ -183,7 +183,7 @@ def pinhole_of(camera: Camera) -> Camera:
     return camera if camera.distortion is None else pinhole_view(camera)
 
 
-def beside(alpha: View, beta: View, size: HW, hw: HW, g: Generator) -> View:
+def beside(alpha: RenderedView, beta: RenderedView, size: HW, hw: HW, g: Generator) -> RenderedView:
     """A window of beta of alpha's angle of view, about where alpha's middle would be seen at a random depth."""
     sharper = pitch(beta.camera) / pitch(alpha.camera)
     wanted = (max(round(hw[0] * sharper), 1), max(round(hw[1] * sharper), 1))
@@ -210,7 +210,7 @@ def pitch(camera: Camera) -> float:
     return float(camera.K[:2, :2].det().abs().sqrt())
 
 
-def window(view: View, top: int, left: int, size: HW, hw: HW) -> View:
+def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
     """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge is repeated, without depth."""
     rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
     h, w = view.camera.hw
@@ -218,7 +218,7 @@ def window(view: View, top: int, left: int, size: HW, hw: HW) -> View:
     rows, columns = rows.clamp(0, h - 1)[:, None], columns.clamp(0, w - 1)
     depth = torch.where(there, view.depth[rows, columns], torch.nan)
     camera = view.camera.crop(top, left, size).resize(hw)
-    return View(
+    return RenderedView(
         reduced(view.rgb[:, rows, columns][None], hw)[0], finite(reduced_depth(depth[None], hw)[0], camera), camera
     )
 
@@ -236,7 +236,7 @@ def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
     return torch.stack([near, torch.maximum(near, torch.where(unseen, 0.0, depth).flatten(1).amax(1))], -1)
 
 
-def batched(drawn: Sequence[Sequence[View]], device: str) -> ArrayBatch:
+def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     """Samples of views of the same sizes, each with alpha first, as one batch."""
     views = list(zip(*drawn))
     images = [coded(torch.stack([v.rgb for v in same])).to(device) for same in views]

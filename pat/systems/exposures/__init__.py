@@ -12,7 +12,7 @@ from torch import Tensor
 from arraygeom import Band
 from pat.media.colour import luminance
 from pat.media.raw import light_of
-from pat.sensors import Clip, Linear, Noise, Spectral, record
+from pat.sensors import Clip, DecodeSRGB, Noise, Spectral, record
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded
 
@@ -49,7 +49,7 @@ def light(stage: Stage, name: str) -> Tensor:
     lit = DARKEST ** torch.rand(count, generator=g)
     lit[1], lit[2] = 1.0, DARKEST
     strength = stage.seen(name, stage.painted(lit.sqrt().tolist()))[0].square()
-    return record(stage.seen(name)[0], (Linear(),), g).image * strength * OVER
+    return record(stage.seen(name)[0], (DecodeSRGB(),), g).image * strength * OVER
 
 
 def banded(linear: Tensor, response: object) -> Tensor:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pat.media.colour import luminance
-from pat.sensors import Clip, Linear, Noise, record
+from pat.sensors import Clip, DecodeSRGB, Noise, record
 from pat.systems.exposures import banded
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded
@@ -31,7 +31,7 @@ def record_scene(stage: Stage) -> Recording:
     ground_truth = []
     for name in rig.names:
         for time in times[name]:
-            lit = record(stage.seen(name, stage.moved(layer, velocity * time))[0], (Linear(),), generator).image
+            lit = record(stage.seen(name, stage.moved(layer, velocity * time))[0], (DecodeSRGB(),), generator).image
             own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
             raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
             if name == stage.alpha:

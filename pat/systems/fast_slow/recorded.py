@@ -16,7 +16,7 @@ from pat.media.colour import luminance_of
 from pat.media.images import read_image
 from pat.media.video import write_video
 from pat.networks.weights import load_weights
-from pat.sensors import Clip, Coded, Exposure, record
+from pat.sensors import Clip, EncodeSRGB, Exposure, record
 from pat.systems.showcase import FAST, SCENE, SLOW, Array, fast_and_slow_array
 from pat.systems.system import Result
 
@@ -65,7 +65,7 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
 
 
 def _coded(image: Tensor, gain: float) -> Tensor:
-    return record(luminance_of(image)[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
+    return record(luminance_of(image)[None], (Exposure(gain), Clip(), EncodeSRGB()), torch.Generator()).image[0]
 
 
 def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 
 from pat.media.colour import from_luma_chroma, to_luma_chroma
-from pat.sensors import Clip, Linear, Noise, record
+from pat.sensors import Clip, DecodeSRGB, Noise, record
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded
 
@@ -24,7 +24,7 @@ HAZE = 0.002
 def record_scene(stage: Stage) -> Recording:
     """One frame."""
     generator = stage.generator("record")
-    infrared = record(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1], (Linear(),), generator).image
+    infrared = record(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1], (DecodeSRGB(),), generator).image
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
     colour = record(other, (Noise(6_000, 3), Clip()), generator).image
@@ -46,5 +46,5 @@ def infrared_weights(stage: Stage) -> torch.Tensor:
 
 def hazed(image: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     """Linear light of a visible image, with the air's own light in it by distance."""
-    clear = record(image, (Linear(),), torch.Generator()).image
+    clear = record(image, (DecodeSRGB(),), torch.Generator()).image
     return torch.lerp(torch.full_like(clear, 0.6), clear, torch.exp(-HAZE * depth))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from arraygeom import Rig
 from pat.media.colour import luminance
-from pat.sensors import Clip, GaussianBlur, Linear, Noise, record
+from pat.sensors import Clip, DecodeSRGB, GaussianBlur, Noise, record
 from pat.systems.stage import Stage
 from pat.systems.system import Recording, coded, mosaic
 
@@ -25,10 +25,10 @@ def record_scene(stage: Stage) -> Recording:
     """One frame."""
     image, depth = stage.seen("narrow")
     generator = stage.generator("record")
-    sharp = record(image, (Linear(),), generator).image
+    sharp = record(image, (DecodeSRGB(),), generator).image
     ground_truth = defocused(sharp, depth, stage.rig)
     tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator).image
-    wide = record(stage.seen("wide")[0], (Linear(), Noise(6_000, 3), Clip()), generator).image
+    wide = record(stage.seen("wide")[0], (DecodeSRGB(), Noise(6_000, 3), Clip()), generator).image
     return Recording({"narrow": [tele[0]], "wide": [mosaic(wide[0], "RGGB")]}, [coded(ground_truth[0])])
 
 

@@ -1,4 +1,4 @@
-"""Patches of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
+"""PatchGrid of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
 
 import shutil
 
@@ -12,7 +12,7 @@ from arraygeom.distortion import Distortion
 from arraygeom.fields import look
 from pat.cli.main import main
 from pat.data import (
-    Patches,
+    PatchGrid,
     RenderedScenes,
     ScenePatches,
     SceneShuffle,
@@ -27,10 +27,10 @@ from pat.data.patches import cut, reduced_depth, select
 from pat.data.scenes import _bounds
 from pat.farm.backends import LayeredSettings
 from pat.media.images import read_image
-from pat.sensors import BoxBlur, Case, Clip, Resample
-from pat.synthesis.check import Limits, look_across
+from pat.sensors import BoxBlur, Clip, DegradationCase, Resample
+from pat.synthesis.check import CheckLimits, look_across
 
-SMALL = Patches(hw=(32, 48), grid=(2, 3), reduce=2)
+SMALL = PatchGrid(hw=(32, 48), grid=(2, 3), reduce=2)
 
 
 def make_rig(width: int = 128) -> Rig:
@@ -50,7 +50,7 @@ def make_rig(width: int = 128) -> Rig:
 def rendered(tmp_path_factory):
     """Three layered scenes of patterns; copy what you break."""
     root = tmp_path_factory.mktemp("data")
-    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), CheckLimits())
     for seed in range(3):
         renderer.render(seed, root / "scenes" / f"{seed:06d}")
     return root
@@ -67,15 +67,15 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_the_papers_windows_reach_from_edge_to_edge():
-    corners = Patches().corners((1536, 2048))
-    assert len(corners) == Patches().count == 49
+    corners = PatchGrid().corners((1536, 2048))
+    assert len(corners) == PatchGrid().count == 49
     assert corners[0] == (0, 0)
     assert corners[-1] == (1536 - 128, 2048 - 384)
-    assert Patches.like_the_papers((1536, 2048)) == Patches()
+    assert PatchGrid.like_the_papers((1536, 2048)) == PatchGrid()
     with pytest.raises(ValueError, match="patches of 384x128 do not fit into an image of 300x200"):
-        Patches().corners((200, 300))
+        PatchGrid().corners((200, 300))
     with pytest.raises(ValueError, match="cannot be reduced 3 times"):
-        Patches(reduce=3)
+        PatchGrid(reduce=3)
 
 
 def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(rendered):
@@ -174,7 +174,7 @@ def test_the_rig_follows_the_chains(rendered):
 
 
 def test_cases_degrade_alpha_or_the_betas(rendered):
-    cases = (Case("alpha", alpha=(BoxBlur(5),)), Case("beta", beta=(BoxBlur(5),)))
+    cases = (DegradationCase("alpha", alpha=(BoxBlur(5),)), DegradationCase("beta", beta=(BoxBlur(5),)))
     data = ScenePatches(rendered, patches=SMALL, chains={}, cases=cases)
     plain = ScenePatches(rendered, patches=SMALL, chains={})
     changed = [
@@ -213,7 +213,7 @@ def test_scenes_that_cannot_be_read_are_told(broken):
 
 def test_images_of_changing_size_are_told(broken):
     shutil.rmtree(broken / "scenes/000002")
-    LayeredSettings(oversampling=1).renderer(make_rig(160), Limits()).render(2, broken / "scenes/000002")
+    LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits()).render(2, broken / "scenes/000002")
     with pytest.raises(
         ValueError, match=r"000002: has images of other sizes than the first \(mono 160x96, .*mono 128x96"
     ):

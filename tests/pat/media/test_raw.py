@@ -10,7 +10,7 @@ from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import write_image
 from pat.media.raw import as_bright, demosaiced, develop, developed
-from pat.sensors import Coded
+from pat.sensors import EncodeSRGB
 
 HW = (48, 64)
 
@@ -23,7 +23,7 @@ def light(*, channels=3, white=1.0):
 
 
 def coded(linear):
-    return Coded().apply(linear[None], torch.Generator())[0]
+    return EncodeSRGB().apply(linear[None], torch.Generator())[0]
 
 
 def counts(linear, *, bits, black, shift=0):

@@ -21,13 +21,13 @@ from pat.farm.backends import LayeredSettings
 from pat.media.colour import luminance
 from pat.media.images import write_image
 from pat.networks.paper import PATConfig
-from pat.synthesis.check import Limits
+from pat.synthesis.check import CheckLimits
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
 from pat.synthesis.rigs import RigDistribution
-from pat.training.config import Recording, TrainConfig, parse_config
+from pat.training.config import RecordingConfig, TrainConfig, parse_config
 from pat.training.lenses import lens_over, one_camera, through_lenses
 from pat.training.loop import new_network
 from pat.training.losses import explained, match_loss, validation
@@ -39,7 +39,7 @@ from pat.training.train import save_config, train
 from .runs import losses, short_run
 from .test_loop import command, one_thread, stopped  # noqa: F401
 
-EXACT = Recording(gain=0, blur=0, noise=0, paper=0)
+EXACT = RecordingConfig(gain=0, blur=0, noise=0, paper=0)
 
 
 def generator(seed: int = 0) -> Generator:
@@ -62,7 +62,7 @@ def make_rig() -> Rig:
 def rendered(tmp_path_factory):
     """Four layered scenes of patterns; copy what you break."""
     root = tmp_path_factory.mktemp("rendered")
-    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), CheckLimits())
     for seed in range(4):
         renderer.render(seed, root / "scenes" / f"{seed:06d}")
     return root
@@ -408,7 +408,7 @@ def mixed(rendered, tmp_path_factory):
         "photos": (),
         "cache": None,
     }
-    config = replace(short_run(folder), **sources, **cheap, recording=Recording(lens=0.5), out=folder / "whole")
+    config = replace(short_run(folder), **sources, **cheap, recording=RecordingConfig(lens=0.5), out=folder / "whole")
     train(config)
     return config
 
