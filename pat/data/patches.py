@@ -1,4 +1,4 @@
-"""PatchGrid of rendered scenes: cut on the fly, reduced, each with the rig of its own windows.
+"""Patches of rendered scenes: cut on the fly, reduced, each with the rig of its own windows.
 
 The paper's are 49 windows of 384x128 of every 2048x1536 view, reduced cubically to 96x32. Each camera's window has
 about alpha's angle of view and lies where the middle of alpha's window would be seen at the middle inverse depth of

@@ -16,6 +16,7 @@ from arraygeom.camera import Camera
 from arraygeom.fields import ReceptiveField
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
+from pat.media.colour import srgb_image
 from pat.networks.protocol import Look
 from pat.sensors import (
     Clip,
@@ -26,7 +27,6 @@ from pat.sensors import (
     Spectral,
     Step,
     generator_for,
-    record,
     record_array,
     seed_for,
 )
@@ -104,7 +104,7 @@ class ScenePatches(Dataset[Patch]):
         recorded = record_array(rgb, rig, self._chains(alpha, seed), seed=seed, depth=depth)
         return Patch(
             images={name: recorded.images[name][0] for name in (alpha, *rig.betas(alpha))},
-            ground_truth=coded(rgb[alpha])[0],
+            ground_truth=srgb_image(rgb[alpha])[0],
             depth=depth[alpha][0],
             rig=recorded.rig,
             alpha=alpha,
@@ -178,13 +178,15 @@ def collate(patches: Sequence[Patch]) -> Patch:
 
 
 class RenderedScenes:
-    """PatchGrid of rendered scenes where layered ones are expected: `sample` is that of `LayeredScenes`.
+    """Patches of rendered scenes where layered ones are expected: `sample` is that of `LayeredScenes`.
 
     A batch mixes patches of several scenes that are in memory; `mixed` of them are, and one is exchanged about
     every time that as many patches as it has were given. Raises ValueError for cameras with a lens model.
     """
 
-    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: PatchGrid | None = None, mixed: int = 16):
+    def __init__(
+        self, root: str | Path, *, alpha: str | None = None, patches: PatchGrid | None = None, mixed: int = 16
+    ):
         self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
         for name, camera in self.scenes.rig.cameras.items():
             if isinstance(camera, Camera) and camera.distortion is not None:
@@ -200,7 +202,7 @@ class RenderedScenes:
         stacks = [(self.scenes[scene], number) for scene, number in drawn]
         rig = stacked([select(stack.rig, number) for stack, number in stacks])
         names = (self.scenes.alpha, *rig.betas(self.scenes.alpha))
-        images = [coded(torch.stack([stack.rgb[n][i] for stack, i in stacks])) for n in names]
+        images = [srgb_image(torch.stack([stack.rgb[n][i] for stack, i in stacks])) for n in names]
         depth = [torch.stack([stack.depth[n][i] for stack, i in stacks]) for n in names]
         cameras = [rig[n].to(torch.float32) for n in names]
         K, R, t, hw = ([getattr(c, key) for c in cameras] for key in ("K", "R", "t", "hw"))
@@ -226,15 +228,11 @@ def _draw(below: int, generator: Generator) -> int:
     return int(torch.randint(below, (), generator=generator))
 
 
-def coded(rgb: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Linear light as an sRGB image."""
-    return record(rgb, [Clip(), EncodeSRGB()], Generator()).image
-
-
 def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
     """What each camera's response says, a little noise, 8 bits, sRGB coding."""
     return {
-        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), EncodeSRGB(), Quantise(8)) for name, c in rig.cameras.items()
+        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), EncodeSRGB(), Quantise(8))
+        for name, c in rig.cameras.items()
     }
 
 

@@ -12,13 +12,12 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
-from pat.sensors import DecodeSRGB, record
+from pat.media.colour import linear_from_srgb
 from pat.support.schema import from_document
 from pat.synthesis.blender.lens import lens_for
 from pat.synthesis.blender.settings import RenderSettings
@@ -176,13 +175,9 @@ def _bank(settings: LayeredSettings) -> PhotoBank:
 
 def _frames(batch: ArrayBatch) -> list[RenderedFrame]:
     return [
-        RenderedFrame(time=0.0, rgb=_linear(image)[0], depth=depth[0], index=index[0])
+        RenderedFrame(time=0.0, rgb=linear_from_srgb(image)[0], depth=depth[0], index=index[0])
         for image, depth, index in zip(batch.images, batch.depth, batch.index)
     ]
-
-
-def _linear(image: Tensor) -> Tensor:
-    return record(image, [DecodeSRGB()], torch.Generator()).image
 
 
 class BlenderRenderer:

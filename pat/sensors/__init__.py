@@ -1,9 +1,9 @@
 """The forward model: what becomes of an ideal image until a camera has recorded it.
 
-A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1 on any device. OpticalImage adds up
+A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1 on any device. Light adds up
 in linear values only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:
 
-    [DecodeSRGB(), Spectral("luminance"), DiscBlur(1.5), Resample(0.5), Noise(2000, 5), Clip(), EncodeSRGB(), Quantise(8)]
+    [DecodeSRGB(), Spectral("luminance"), DiscBlur(1.5), Noise(2000, 5), Clip(), EncodeSRGB(), Quantise(8)]
 
 Steps with randomness draw it from the generator given to `record`, separately for each image of the batch.
 Steps that change the pixel grid say how through `pixel_matrix`; K' = A K with the A that `record` returns, and

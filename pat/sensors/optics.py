@@ -65,7 +65,7 @@ class Defocus(LitStep):
     """Defocus by depth: a thin lens of `lens` mm at f / `f_number`, focused at `focus` metres.
 
     A point at depth z becomes a disc of diameter f_pixels (lens / f_number / 1000) |1 / focus - 1 / z| pixels (an
-    ellipse where fx and fy differ), or a Gaussian with the same variance. OpticalImage is spread from every pixel and
+    ellipse where fx and fy differ), or a Gaussian with the same variance. Light is spread from every pixel and
     what is nearer covers what is farther; what the sharp image does not show behind an edge is filled from
     around it. Needs depth and a camera. Differentiable in the image, and in depth through the size of the blur.
     """

@@ -1,13 +1,13 @@
 """Chains as lists in a file.
 
     mono:
-      - linear
+      - decode-srgb
       - spectral: luminance
       - defocus: {focus: 3, f_number: 2, lens: 25}
       - resample: 0.5
       - noise: {full_well: 8000, read: 3}
       - clip
-      - coded
+      - encode-srgb
       - quantise: 8
 
 A step is its name, or its name with its options; a single value is its first option. Steps are named as their
@@ -35,18 +35,19 @@ _CLASSES: tuple[type[Step], ...] = (
     *(BoxBlur, GaussianBlur, DiscBlur, Defocus, MotionBlur),
     *(Resample, Crop, Mosaic, Demosaic, Noise, Clip, Quantise, Jitter),
 )
-STEPS: dict[str, type[Step]] = {re.sub(r"(?<!^)(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
-"""Every step by its name in files."""
+STEPS: dict[str, type[Step]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
+STEPS |= {"linear": DecodeSRGB, "coded": EncodeSRGB}
+"""Every step by its name in files; "linear" and "coded" are former names of the sRGB conversions."""
 
 
 def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
     """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest name.
 
-    >>> read_chain(["linear", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
+    >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
     (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
     """
     if not isinstance(value, list):
-        raise ValueError(f"{where}: wanted a list of steps, such as [linear, {{noise: {{full_well: 8000}}}}]")
+        raise ValueError(f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]")
     return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
 
 

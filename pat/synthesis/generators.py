@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 
+from ..media.colour import linear_from_srgb
 from .furnish import Setting, furnished, seeded, vec
 from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
 
@@ -113,8 +114,8 @@ def _paints(rng: Generator) -> tuple[Paint, ...]:
     paints = []
     for i in range(int(rng.integers(2, 5))):
         value = rng.uniform(0.25, 0.5) if (i + dark_first) % 2 else rng.uniform(0.6, 0.95)
-        coded = colorsys.hsv_to_rgb((hue + rng.uniform(-spread, spread)) % 1, rng.uniform(0.1, 0.9), value)
-        r, g, b = (_linear(c) for c in coded)
+        encoded = colorsys.hsv_to_rgb((hue + rng.uniform(-spread, spread)) % 1, rng.uniform(0.1, 0.9), value)
+        r, g, b = linear_from_srgb(torch.tensor(encoded, dtype=torch.float64)).tolist()
         paints.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
     return tuple(paints)
 
@@ -149,11 +150,6 @@ def _blackness(file: str) -> float:
     """The share of pixels that are nearly black; 1 for what is no image."""
     small = cv2.imread(file, cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return 1.0 if small is None else float((small < 24).mean())
-
-
-def _linear(coded: float) -> float:
-    """sRGB to linear."""
-    return coded / 12.92 if coded <= 0.04045 else ((coded + 0.055) / 1.055) ** 2.4
 
 
 # Boards -----------------------------------------------------------------------------------------------------------

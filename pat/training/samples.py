@@ -172,7 +172,9 @@ class SampleSource:
             del self.kept[key]
 
 
-def scenes(config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu") -> tuple[SampleSource, SampleSource]:
+def scenes(
+    config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu"
+) -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
     layered = config.rendered + config.pairs < 1
     bank, unseen = photographs(config) if layered else (None, None)

@@ -21,7 +21,7 @@ from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.undistortion import pinhole_view, resampled
 from pat.data.patches import reading, reduced, reduced_depth, scene_folders, scene_rig
-from pat.data.scenes import coded
+from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
 from pat.synthesis.rendered import Rendered, RenderedFrame
@@ -239,7 +239,7 @@ def bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
 def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     """Samples of views of the same sizes, each with alpha first, as one batch."""
     views = list(zip(*drawn))
-    images = [coded(torch.stack([v.rgb for v in same])).to(device) for same in views]
+    images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
     relative = [[v.camera.cam_from_world @ one[0].camera.cam_from_world.inverse() for v in one] for one in drawn]
     poses = [Pose(torch.stack([p.R for p in same]), torch.stack([p.t for p in same])) for same in zip(*relative)]

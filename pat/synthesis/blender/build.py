@@ -274,7 +274,7 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 
 
 def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> Any:
-    image = _image(bpy, texture, scratch)
+    image = _loaded(bpy, texture, scratch)
     node = nodes.new("TexImage", image=image, extension=_MIRRORED)
     (w, h), (left, top) = _laid(image.size, texture)
     onto = (1 / w, -1 / h, 0), (left / w + texture.offset[0], 1 - top / h + texture.offset[1], 0)
@@ -314,7 +314,7 @@ def _infrared(nodes: _Nodes, rgb: Any) -> Any:
     return joined.outputs[0]
 
 
-def _image(bpy: Any, texture: Texture, scratch: Path) -> Any:
+def _loaded(bpy: Any, texture: Texture, scratch: Path) -> Any:
     if texture.kind == "image":
         if not Path(texture.image).is_file():
             raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")

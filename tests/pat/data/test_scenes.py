@@ -1,4 +1,4 @@
-"""PatchGrid of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
+"""Patches of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
 
 import shutil
 

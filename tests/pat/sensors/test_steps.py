@@ -237,4 +237,9 @@ def test_mistakes_are_told():
     with pytest.raises(ValueError, match="full_well > 0"):
         Noise(0)
     with pytest.raises(ValueError, match="must keep the size"):
-        augment(noise_image(1, 1, 8, 8), noise_image(1, 3, 8, 8), [DegradationCase("halve", beta=(Resample(0.5),))], generator())
+        augment(
+            noise_image(1, 1, 8, 8),
+            noise_image(1, 3, 8, 8),
+            [DegradationCase("halve", beta=(Resample(0.5),))],
+            generator(),
+        )
