@@ -12,17 +12,15 @@ from pat.data.pairs import (
     middlebury_pairs,
     syntim_pairs,
 )
-from pat.data.patches import PatchGrid, scene_folders
-from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
-from pat.evaluation.protocols import MonoColourTask, mono_colour_task, reduce_by
+from pat.data.patches import PatchGrid
+from pat.data.scenes import Patch, ScenePatches, SceneShuffle, collate, default_chains
+from pat.data.windows import scene_folders
 
 __all__ = [
     "PAPER_DISPARITY",
     "Disparity",
-    "MonoColourTask",
     "Patch",
     "PatchGrid",
-    "RenderedScenes",
     "ScenePatches",
     "SceneShuffle",
     "StereoCalibration",
@@ -35,9 +33,7 @@ __all__ = [
     "index_files",
     "kitti_pairs",
     "middlebury_pairs",
-    "mono_colour_task",
     "read_indices",
-    "reduce_by",
     "scene_folders",
     "syntim_pairs",
     "write_indices",
