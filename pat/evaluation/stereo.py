@@ -29,9 +29,7 @@ from pat.data import (
     PAPER_DISPARITY,
     Disparity,
     StereoPair,
-    flickr_pairs,
     folder_pairs,
-    kitti_pairs,
     middlebury_pairs,
 )
 from pat.data.sample_array import BETA, SAMPLE
@@ -170,9 +168,9 @@ METHODS = {name: BASELINES[name] for name in ("alpha", "classical")}
 
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
-    "kitti": kitti_pairs,
+    "kitti": folder_pairs,
     "middlebury": middlebury_pairs,
-    "flickr1024": flickr_pairs,
+    "flickr1024": folder_pairs,
     "folder": folder_pairs,
 }
 """How the folder of each data set is read."""

@@ -10,7 +10,6 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -87,10 +86,6 @@ class Rendered:
         with np.load(self.folder / entry["file"]) as arrays:
             tensors = {k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32)) for k in arrays}
         return RenderedFrame(time=entry["time"], **tensors)
-
-    def first_frames(self) -> Mapping[str, RenderedFrame]:
-        """The first frame of every camera."""
-        return {name: self.frame(name) for name in self.rig.names}
 
 
 _STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals": np.float16, "index": np.uint16}
