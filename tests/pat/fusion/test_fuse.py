@@ -23,6 +23,7 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.images.matches import match_points, seen_depths
+from pat.data.pairs import folder_pairs
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse

@@ -32,7 +32,7 @@ from pat.training.config import RecordingConfig, TrainConfig, parse_config
 from pat.training.lenses import lens_over, one_camera, through_lenses
 from pat.training.loop import new_network
 from pat.training.losses import explained, match_loss, validation
-from pat.training.samples import degraded, pair_of, plan, scenes, truth_in
+from pat.training.samples import degraded, pair_of, plan, scenes, transfer
 from pat.training.scenes import ACTIVE, GROUPS_PER_EXCHANGE, SKY, RenderedCrops, active_items, batched, finite_window
 from pat.training.stereo import PairCrops
 from pat.training.train import save_config, train
@@ -227,7 +227,7 @@ def test_the_sky_is_seen_by_both_at_infinity():
     views = [finite_window(RenderedView(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras]
     batch = batched([views], "cpu")
     assert batch.depth_range.max() <= SKY
-    position, visible = truth_in(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
+    position, visible = transfer(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
     x = K @ turn @ torch.linalg.inv(K) @ torch.tensor([20.0, 12.0, 1.0]).double()
     torch.testing.assert_close(position[0, 12, 20].double(), (x / x[2])[:2], atol=1e-3, rtol=0)
     assert visible[0, 12, 20]
@@ -278,7 +278,7 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         sides |= set(baseline.sign().tolist())
         reductions |= set((120 / (48 / near)).round().int().tolist())
         depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
-        where, _ = truth_in(pair_of(batch, 1, generator()), depth, depth)
+        where, _ = transfer(pair_of(batch, 1, generator()), depth, depth)
         found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(2, (32, 48))
         assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
