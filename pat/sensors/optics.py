@@ -62,8 +62,9 @@ class Defocus(LitStep):
     """Defocus by depth: a thin lens of `lens` mm at f / `f_number`, focused at `focus` metres.
 
     A point at depth z becomes a disc of diameter f_pixels (lens / f_number / 1000) |1 / focus - 1 / z| pixels (an
-    ellipse where fx and fy differ), or a Gaussian with the same variance. Every pixel scatters its light, and
-    nearer pixels occlude farther ones; what the sharp image lacks behind an edge is filled from around it. Needs depth and a camera. Differentiable in the image, and in depth through the size of the blur.
+    ellipse where fx and fy differ), or a Gaussian with the same variance. Every pixel scatters its light, and nearer
+    pixels occlude farther ones; what the sharp image lacks behind an edge is filled from around it. Needs depth and
+    a camera. Differentiable in the image, and in depth through the size of the blur.
     """
 
     focus: float

@@ -44,7 +44,7 @@ class CheckLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCheck:
-    """Figures by view and by "alpha > beta", and what is wrong (nothing if accepted)."""
+    """Figures by view and by "alpha > beta", and the reasons for refusal (none if accepted)."""
 
     views: dict[str, dict[str, float]] = field(default_factory=dict)
     pairs: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -52,7 +52,7 @@ class SceneCheck:
 
     @property
     def accepted(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there is no reason for refusal."""
         return not self.reasons
 
     def to_document(self) -> dict[str, Any]:
@@ -77,14 +77,14 @@ def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimi
 
 def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Brightness, texture and depths of one image."""
-    there = frame.depth.isfinite()
-    depths = frame.depth[there] if there.any() else frame.depth.new_tensor([torch.inf])
+    finite = frame.depth.isfinite()
+    depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
     figures = {
         "mean": frame.rgb.mean(),
         "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
         "bright": (frame.rgb.amin(0) > 1).float().mean(),
         "texture": texture(frame.rgb),
-        "covered": there.float().mean(),
+        "covered": finite.float().mean(),
         "near": depths.min(),
         "far": depths.max(),
     }
@@ -92,10 +92,10 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
-    """The share of patches whose luminance deviates by more than 2 % of its mean."""
-    luminance = rgb.mean(0)[None, None].clamp(0, 1)
-    mean = avg_pool2d(luminance, min(patch, *rgb.shape[1:]))
-    square = avg_pool2d(luminance**2, min(patch, *rgb.shape[1:]))
+    """The share of patches whose brightness deviates by more than 2 % of its mean."""
+    grey = rgb.mean(0)[None, None].clamp(0, 1)
+    mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))
+    square = avg_pool2d(grey**2, min(patch, *rgb.shape[1:]))
     deviation = (square - mean**2).clamp(min=0).sqrt()
     return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
 
@@ -139,11 +139,11 @@ def pair_figures(
 
 
 def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels that see something, evenly thinned: x (n, 2), depth and index."""
+    """Pixels with finite depth, evenly subsampled: x (n, 2), depth and index."""
     grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
-    there = frame.depth.isfinite()
-    step = max(1, int(there.sum()) // most)
-    return grid[there][::step], frame.depth[there][::step].double(), frame.index[there][::step]
+    finite = frame.depth.isfinite()
+    step = max(1, int(finite.sum()) // most)
+    return grid[finite][::step], frame.depth[finite][::step].double(), frame.index[finite][::step]
 
 
 def _compared(

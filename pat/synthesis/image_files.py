@@ -21,10 +21,10 @@ _SUFFIX = {"png8": ".png", "png16": ".png", "jpeg": ".jpg", "exr": ".exr"}
 
 
 def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels: Channels = "rgb") -> list[Path]:
-    """Write all frames of a rendered folder as images named like its arrays; the paths written.
+    """Write all frames of a rendered folder as images named like its arrays; returns the paths.
 
-    PNG and JPEG are sRGB and cut at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without the
-    pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
+    PNG and JPEG are sRGB and clipped at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without
+    the pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
     """
     written = []
     for name in rendered.rig.names:

@@ -1,8 +1,8 @@
 """Scenes of layers: textured planes at random depths and slants with random outlines, seen by any cameras.
 
-A layer is a plane in the world with a painter: a camera with K = I that looks at it squarely from distance 1, so
+A layer is a plane in the world with a painter: a camera with K = I that faces it from distance 1, so
 that the painter's image is the plane itself in metres. The plane's homography from each view to the painter
-gives, at any pixel, the place on the plane and (as its third entry) the inverse depth: images, depth and
+gives, at any pixel, the position on the plane and (as its third entry) the inverse depth: images, depth and
 occlusion are exact, and no geometry is approximated. All surfaces are opaque and diffuse.
 """
 
@@ -32,11 +32,11 @@ _MAX_OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class ArrayBatch:
-    """Images and truth, one entry a camera, alpha first.
+    """Images and ground truth, one entry a camera, alpha first.
 
-    `images` 0..1 (sRGB as the photographs have it); `depth` in metres along each camera's own axis at the
+    `images` 0..1 (sRGB, as the photographs); `depth` in metres along each camera's own axis at the
     pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths;
-    `index` says which layer is seen there, counted from 1.
+    `index` is the number of the visible layer, from 1.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
