@@ -134,9 +134,9 @@ def _normals(surface: Mesh) -> NDArray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def _noise(points: NDArray, seed: int, waves: int = 24) -> NDArray:
+def _noise(points: NDArray, seed: int) -> NDArray:
     """Smooth noise in -1..1 with features about 1 across: plane waves of random directions."""
-    rng = np.random.default_rng(seed)
+    waves, rng = 24, np.random.default_rng(seed)
     direction = rng.normal(size=(waves, 3))
     direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(direction, axis=1, keepdims=True)
     total = np.cos(points @ direction.T + rng.uniform(0, 2 * np.pi, waves)).sum(1)

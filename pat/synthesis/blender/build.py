@@ -224,10 +224,10 @@ def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
     return node.outputs[0]
 
 
-def _pattern(kind: str, source: str = "Object", **inputs: float) -> Callable[[_Nodes, Texture], Any]:
+def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Texture], Any]:
     def make(nodes: _Nodes, texture: Texture) -> Any:
         node = nodes.new(f"Tex{kind}")
-        nodes.give(node.inputs["Vector"], _coordinates(nodes, texture, source))
+        nodes.give(node.inputs["Vector"], _coordinates(nodes, texture))
         for name, value in inputs.items():
             node.inputs[name].default_value = value
         if "Distortion" in node.inputs and texture.distortion:
