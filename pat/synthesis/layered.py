@@ -35,24 +35,15 @@ class ArrayBatch:
     """Images and ground truth, one entry a camera, alpha first.
 
     `images` 0..1 (sRGB, as the photographs); `depth` in metres along each camera's own axis at the
-    pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths;
+    pixels' centres; `cameras` are batched (B); `depth_range` holds bounds (near, far) of alpha's depths;
     `index` is the number of the visible layer, from 1.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
     depth: list[Float[Tensor, "b _ _"]]
-    K: list[Float[Tensor, "b 3 3"]]
-    R: list[Float[Tensor, "b 3 3"]]
-    t: list[Float[Tensor, "b 3"]]
-    hw: list[HW]
+    cameras: list[Camera]
     depth_range: Float[Tensor, "b 2"]
     index: list[Int[Tensor, "b _ _"]] = field(default_factory=list)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """The cameras, each batched (B)."""
-        poses = (Pose(R, t) for R, t in zip(self.R, self.t))
-        return [Camera(K=K, cam_from_world=p, hw=hw) for K, p, hw in zip(self.K, poses, self.hw)]
 
 
 class LayeredScenes:
@@ -97,8 +88,7 @@ class LayeredScenes:
         images, depth, index = zip(*(self._seen(layers, v, f) for v, f in zip(rigs.cameras, factors)))
         bounds = torch.stack(depth[0].flatten(1).aminmax(dim=1), -1)
         cameras = [c.to(device=self.device, dtype=torch.float32) for c in rigs.cameras]
-        K, R, t, hw = ([getattr(c, k) for c in cameras] for k in ("K", "R", "t", "hw"))
-        return ArrayBatch(list(images), list(depth), K, R, t, hw, bounds, list(index))
+        return ArrayBatch(list(images), list(depth), cameras, bounds, list(index))
 
     def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor, Tensor]:
         """Image, and depth at the pixels' centres and index of the surface that covers most of each pixel."""

@@ -235,7 +235,7 @@ def degraded(
     for i, image in enumerate(images[1:], 1):
         band = image if alone else image[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
-        betas.append(_enlarged(seen.values, scene.hw[0]))
+        betas.append(_enlarged(seen.values, scene.cameras[0].hw))
         if alone and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
@@ -287,7 +287,7 @@ def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
     loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
     depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
     cameras = [c.to(torch.float64) for c in scene.cameras]
-    return Pair(cameras[0], cameras[beta].resize(scene.hw[0]), depth)
+    return Pair(cameras[0], cameras[beta].resize(scene.cameras[0].hw), depth)
 
 
 def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:

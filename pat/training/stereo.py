@@ -77,11 +77,11 @@ def assumed_cameras(
     t = torch.zeros(batch, 3, dtype=torch.float64)
     alpha = Camera(K=K, cam_from_world=Pose(torch.eye(3, dtype=torch.float64).expand(batch, 3, 3), t), hw=(h, w))
     beta = alpha.replace(cam_from_world=Pose(alpha.R, torch.stack([-side, t[:, 1], t[:, 2]], -1)))
-    cameras = [alpha, *(beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:])]
-    Ks, Rs, ts = ([getattr(c, name).to(device, torch.float32) for c in cameras] for name in ("K", "R", "t"))
+    betas = [beta.resize((p.shape[-2], p.shape[-1])) for p in images[1:]]
+    cameras = [camera.to(device, torch.float32) for camera in (alpha, *betas)]
     near = w / disparity
     bounds = torch.stack([near, torch.full_like(near, torch.inf)], -1).to(device, torch.float32)
-    return ArrayBatch([p.to(device) for p in images], [], Ks, Rs, ts, [c.hw for c in cameras], bounds)
+    return ArrayBatch([p.to(device) for p in images], [], cameras, bounds)
 
 
 def check_pair(pair: PairFiles, hw: HW) -> None:

@@ -145,7 +145,7 @@ def test_a_given_rig_keeps_its_cameras(rich):
     scenes = LayeredScenes(rich, RigDistribution(), hw=HW)
     batch = scenes.render(rig, torch.Generator().manual_seed(0), oversampling=2)
     assert batch.hw == [(60, 90), (50, 80)]
-    torch.testing.assert_close(batch.R[1].double(), turned.R)
+    torch.testing.assert_close(batch.cameras[1].R.double(), turned.R)
     assert 1.9 < batch.depth[0].min() < batch.depth[0].max() < 14
 
 
