@@ -71,7 +71,7 @@ def mean_shift(batch: ArrayBatch) -> torch.Tensor:
 
 @pytest.mark.parametrize("mode", ["rectified", "general"])
 @pytest.mark.parametrize("resolution", [1.0, 0.5, 0.25])
-def test_depth_and_cameras_foretell_the_other_view(smooth, mode, resolution):
+def test_depth_and_cameras_predict_the_other_view(smooth, mode, resolution):
     batch = draw(smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)))
     across = transferred(batch)
     assert across.visible.float().mean() > 0.3
