@@ -49,15 +49,9 @@ from arraygeom.pixels import HW
 from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
-<<<<<<< HEAD
-from ..fusion.steps import pitch_ratio
+from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance, srgb_image
 from ..media.figures import save_figure
-=======
-from ..fusion.results import save_figure
-from ..fusion.steps import resolution_ratio
-from ..media.colour import luminance
->>>>>>> main
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from ..sensors import Clip, Noise, Quantise, record

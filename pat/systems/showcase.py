@@ -23,15 +23,9 @@ from ..evaluation.baseline import classical
 from ..evaluation.metrics import score
 from ..evaluation.stereo import METHODS, Row, evaluate_sets, markdown, rectified_fusion, sets_markdown, structure_kept
 from ..fusion.fuse import fuse
-<<<<<<< HEAD
-from ..fusion.steps import normalised, pitch_ratio
+from ..fusion.steps import normalised, resolution_ratio
 from ..media.colour import luminance_of, srgb_image
 from ..media.figures import colour_depth, save_panels
-=======
-from ..fusion.results import colour_depth, save_panels
-from ..fusion.steps import normalised, resolution_ratio
-from ..media.colour import luminance_of
->>>>>>> main
 from ..media.images import read_image
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights
