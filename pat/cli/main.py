@@ -467,7 +467,7 @@ class Calibrate:
             depth=self.depth,
             progress=bar,
         )
-        print("\n".join(said.lines))
+        print("\n".join(said.messages))
         console.print(f"written: {', '.join(map(str, said.written))}")
 
 
@@ -708,7 +708,7 @@ class Refine:
 
     def run(self) -> None:
         """Do it."""
-        from calib.images.refine import refine
+        from calib.images.refinement import refine
 
         from ..attention import attend_with_statistics
 
@@ -744,13 +744,13 @@ class Start:
 
     def run(self) -> None:
         """Do it."""
-        from calib.images.from_images import start
+        from calib.images.from_images import rig_from_images
 
         from ..media.images import read_image
 
         files = _files_by_name(self.image)
         images = {name: read_image(path, name=name) for name, path in files.items()}
-        found = start(images, focal=_numbers_by_name("--focal", self.focal))
+        found = rig_from_images(images, focal=_numbers_by_name("--focal", self.focal))
         print(found.as_text())
         found.rig.save(self.out)
         console.print(f"written: {self.out}")

@@ -32,7 +32,7 @@ def save_frame(
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The image
-    is written last: where it is, the others are. Each appears whole or not at all. Without any known depth there are
+    is written last: where it is, the others are. Each is written atomically. Without any known depth there are
     no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on, their mean to fused.png.
     Returns what was written.
     """
@@ -70,8 +70,8 @@ class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.
-    depth: (H, W), metres along alpha's axis; NaN where no calibrated beta tells it.
-    confidence: (H, W), 0 to 1: that every band's beta sees the point, and that it is known where.
+    depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
+    confidence: (H, W), 0 to 1: that every band's beta sees the point and its position is right.
     """
 
     image: Float[Tensor, "c h w"]

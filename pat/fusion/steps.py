@@ -134,7 +134,7 @@ class EqualResolution:
         return Done(views, _as_it_is)
 
     def _cropped(self, views: Views, name: str) -> Views:
-        """A calibrated beta without what no search segment reaches, if that is much: it would be enlarged for nothing.
+        """A calibrated beta without what no search segment touches, if that is much: it would be enlarged for nothing.
 
         Not where the field may depend on the images' sizes.
         """
