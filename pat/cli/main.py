@@ -365,7 +365,7 @@ class Show:
         from arraygeom import Camera
         from arraygeom.viz import draw_fields, draw_rig
 
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..media.images import read_image
 
         rig = Rig.load(self.rig)
@@ -549,7 +549,7 @@ class DataShow:
 
         from ..data import ScenePatches
         from ..data.show import draw_patches
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..sensors import generator_for, read_chains
         from ..support.schema import read_yaml
 

@@ -49,12 +49,12 @@ from arraygeom.pixels import HW
 from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
-from ..fusion.results import save_figure
 from ..fusion.steps import resolution_ratio
-from ..media.colour import luminance
+from ..media.colour import luminance, srgb_image
+from ..media.figures import save_figure
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
-from ..sensors import Clip, Coded, Noise, Quantise, record
+from ..sensors import Clip, Noise, Quantise, record
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rendered import RENDER_FILE, Rendered, is_rendered
@@ -188,7 +188,7 @@ def _rendered_case(name: str, folder: Path, alpha: str | None, beta: str | None,
     first = scene.rig.require(alpha or scene.rig.names[0])
     second = scene.rig.require(beta or next(n for n in scene.rig.names if n != first))
     frames = [scene.frame(name) for name in (first, second)]
-    ground_truth, seen = (record(f.rgb[None], [Clip(), Coded()], g).image[0] for f in frames)
+    ground_truth, seen = (srgb_image(f.rgb) for f in frames)
     rig = Rig({ALPHA: scene.rig[first], BETA: scene.rig[second]})
     return _recorded(name, rig, ground_truth, seen, frames[0].depth, g)
 

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Rig
-from pat.media.colour import from_luma_chroma, luminance, luminance_of
+from pat.media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 
 Image = NDArray[Any]
 
@@ -193,7 +193,7 @@ def _carried_chroma(mono: Image, colours: Image, inside: Image, max_disparity: f
     """
     soft = _softened(mono, sharpness)
     match = _matched(soft, _normalised(_luma(colours), mono, inside), max_disparity)
-    guide = _bytes(mono)
+    guide = to_bytes(mono)
     disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
     columns, rows = _grid(mono.shape)
     columns = columns - np.where(match.consistent, match.disparity, disparity)
@@ -209,7 +209,7 @@ def _carried_chroma(mono: Image, colours: Image, inside: Image, max_disparity: f
 
 def _carried_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
     """What `band` has more than `mono`, at `mono`'s pixels; both (h, w) on one rectified grid."""
-    soft, guide = _softened(mono, sharpness), _bytes(mono)
+    soft, guide = _softened(mono, sharpness), to_bytes(mono)
     match = _matched(soft, _normalised(band, mono, inside), max_disparity)
     disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
     columns, rows = _grid(mono.shape)
@@ -231,9 +231,9 @@ def _softened(mono: Image, sharpness: float) -> Image:
 
 def _matched(mono: Image, luma: Image, max_disparity: float) -> _Match:
     columns, rows = _grid(mono.shape)
-    ours = _disparity(_bytes(mono), _bytes(luma), max_disparity)
+    ours = _disparity(to_bytes(mono), to_bytes(luma), max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
-    theirs = _disparity(_bytes(luma[:, ::-1]), _bytes(mono[:, ::-1]), max_disparity)[:, ::-1]
+    theirs = _disparity(to_bytes(luma[:, ::-1]), to_bytes(mono[:, ::-1]), max_disparity)[:, ::-1]
     back = _looked_up(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
     return _Match(ours, (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5))
 
@@ -307,10 +307,6 @@ def _planes(image: Float[Tensor, "c h w"]) -> Image:
 
 def _luma(colours: Image) -> Image:
     return luminance(torch.from_numpy(colours).permute(2, 0, 1))[0].numpy()
-
-
-def _bytes(plane: Image) -> NDArray[np.uint8]:
-    return np.rint(np.clip(plane, 0, 1) * 255).astype(np.uint8)
 
 
 def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:

@@ -28,17 +28,14 @@ from arraygeom.pixels import HW
 from pat.data import (
     PAPER_DISPARITY,
     Disparity,
-    MonoColourTask,
     StereoPair,
-    flickr_pairs,
     folder_pairs,
-    kitti_pairs,
     middlebury_pairs,
-    mono_colour_task,
 )
 from pat.data.sample_array import BETA, SAMPLE
 from pat.evaluation.baseline import classical_fusion
 from pat.evaluation.metrics import bootstrap_interval, disparity_score, score
+from pat.evaluation.protocols import MonoColourTask, mono_colour_task
 from pat.fusion.fuse import fuse
 from pat.media.images import read_image, write_image
 from pat.networks.protocol import FusionNetwork
@@ -171,9 +168,9 @@ METHODS = {name: BASELINES[name] for name in ("alpha", "classical")}
 
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
-    "kitti": kitti_pairs,
+    "kitti": folder_pairs,
     "middlebury": middlebury_pairs,
-    "flickr1024": flickr_pairs,
+    "flickr1024": folder_pairs,
     "folder": folder_pairs,
 }
 """How the folder of each data set is read."""

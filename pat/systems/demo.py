@@ -7,7 +7,8 @@ from pathlib import Path
 from torch import Tensor
 
 from ..data.sample_array import ALPHA, BETA, SampleArray
-from ..fusion.results import Frame, colour_depth, save_panels
+from ..fusion.results import Frame
+from ..media.figures import colour_depth, save_panels
 
 
 def report_figure(sample: SampleArray, baseline: Tensor, frame: Frame, path: Path) -> None:

@@ -9,14 +9,13 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import Camera, Rig, pixel_grid, sample
 
 from ..fusion.results import Frame
-from ..media.colour import linear_from_srgb
+from ..media.colour import linear_from_srgb, srgb_from_linear
 from ..media.raw import light_of
-from ..sensors import Coded
 
 WHITE = 0.97
 """Values from here on count as cut off."""
@@ -43,7 +42,7 @@ def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]],
     total = believed + known
     light = torch.where(total > 0, (believed * theirs + known * own) / total.clamp(min=1e-12), own)
     light = torch.where((own >= WHITE) & noise.isfinite(), torch.maximum(theirs, own), light)
-    brighter = Coded().apply(light[None, None], Generator())[0] - images[alpha]
+    brighter = srgb_from_linear(light[None]) - images[alpha]
     return frame._replace(image=frame.image + brighter)
 
 

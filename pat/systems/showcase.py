@@ -23,13 +23,12 @@ from ..evaluation.baseline import classical
 from ..evaluation.metrics import score
 from ..evaluation.stereo import METHODS, Row, evaluate_sets, markdown, rectified_fusion, sets_markdown, structure_kept
 from ..fusion.fuse import fuse
-from ..fusion.results import colour_depth, save_panels
 from ..fusion.steps import normalised, resolution_ratio
-from ..media.colour import luminance_of
+from ..media.colour import luminance_of, srgb_image
+from ..media.figures import colour_depth, save_panels
 from ..media.images import read_image
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights
-from ..sensors import Clip, Coded, Exposure, record
 
 PAIRS = ("kitti", "middlebury", "flickr1024")
 SYNTIM = ("Color", "Serfaty", "Poly")
@@ -158,8 +157,8 @@ def _fast_and_slow(network: FusionNetwork, array: Array, out: Path) -> str:
 
 def fast_and_slow_array(folder: Path) -> Array:
     """The array from its images and `fundamental_matrices.json`."""
-    images = {FAST: _coded(read_image(folder / SCENE / f"{FAST_FRAME}.png"), brightest=0.995)}
-    images |= {name: _coded(read_image(folder / SCENE / f"{name}_{SLOW_FRAME}.png")) for name in SLOW}
+    images = {FAST: _exposed(read_image(folder / SCENE / f"{FAST_FRAME}.png"), brightest=0.995)}
+    images |= {name: _exposed(read_image(folder / SCENE / f"{name}_{SLOW_FRAME}.png")) for name in SLOW}
     published = published_matrices(folder / "fundamental_matrices.json")
     fits, lines = {}, ["| beta | points | off the published lines, px | off the fitted ones, px | along, px |"]
     lines.append("| --- | ---: | ---: | ---: | ---: |")
@@ -194,8 +193,8 @@ def transformed(array: Array) -> Float[Tensor, "3 h w"]:
     return torch.cat(bands)
 
 
-def _coded(image: Float[Tensor, "_ h w"], *, brightest: float | None = None) -> Float[Tensor, "1 h w"]:
-    """Linear values coded as sRGB; with `brightest`, exposed so that this share of the pixels stays below white."""
+def _exposed(image: Float[Tensor, "_ h w"], *, brightest: float | None = None) -> Float[Tensor, "1 h w"]:
+    """Linear values as an sRGB image; with `brightest`, exposed so that this share of the pixels stays below white."""
     linear = luminance_of(image)
     gain = 1.0 if brightest is None else 1 / float(linear.flatten().sort().values[int(brightest * linear.numel())])
-    return record(linear[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
+    return srgb_image(linear * gain)

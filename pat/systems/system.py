@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import itertools
 import json
 import os
 import subprocess
@@ -20,7 +19,7 @@ from jaxtyping import Float
 from safetensors import safe_open
 from safetensors.torch import save_file
 from tifffile import imread
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import Rig
 from arraygeom.atomic import write_atomically, write_text
@@ -28,16 +27,16 @@ from arraygeom.io.native import write as rig_text
 from pat.evaluation.baseline import classical, classical_band_calibrated
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.results import Frame, colour_depth, save_frame, save_panels, view_of
+from pat.fusion.results import Frame, save_frame, view_of
 from pat.fusion.sequence import ImageFiles, SequenceFusion, flicker
 from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
+from pat.media.figures import colour_depth, save_panels
 from pat.media.images import read_image, write_image
 from pat.media.raw import as_bright
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.sensors import Coded
 from pat.support.memory import watch_peak
 from pat.systems.hdr import merged, usable_range
 
@@ -372,16 +371,3 @@ def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], al
     same = score(other.clamp(0, 1), frame.image[order].clamp(0, 1)).psnr
     left = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
     return ["", f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {left:.1f} dB)."]
-
-
-def coded(linear: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
-    """Linear light coded as sRGB."""
-    return Coded().apply(linear[None], Generator())[0]
-
-
-def mosaic(rgb: Float[Tensor, "3 h w"], pattern: str) -> Float[Tensor, "1 h w"]:
-    """What a sensor behind a colour filter mosaic records: one of the three colours at each pixel."""
-    raw = torch.empty_like(rgb[:1])
-    for i, (row, column) in enumerate(itertools.product((0, 1), (0, 1))):
-        raw[0, row::2, column::2] = rgb["RGB".index(pattern[i]), row::2, column::2]
-    return raw

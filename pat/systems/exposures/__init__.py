@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from arraygeom import Band
-from pat.media.colour import luminance
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
-from pat.sensors import Clip, Linear, Noise, Spectral, record
+from pat.sensors import Clip, Noise, Spectral, record
 from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded
+from pat.systems.system import Recording
 
 TITLE = "four mono cameras, three filters, four exposures: more range than any one of them has"
 REDUCED = 2 / 5
@@ -40,7 +40,7 @@ def record_scene(stage: Stage) -> Recording:
         raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name)).image[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
-    return Recording(raw, [coded(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
+    return Recording(raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
 
 
 def light(stage: Stage, name: str) -> Tensor:
@@ -49,7 +49,7 @@ def light(stage: Stage, name: str) -> Tensor:
     lit = DARKEST ** torch.rand(count, generator=g)
     lit[1], lit[2] = 1.0, DARKEST
     strength = stage.seen(name, stage.painted(lit.sqrt().tolist()))[0].square()
-    return record(stage.seen(name)[0], (Linear(),), g).image * strength * OVER
+    return linear_from_srgb(stage.seen(name)[0]) * strength * OVER
 
 
 def banded(linear: Tensor, response: object) -> Tensor:

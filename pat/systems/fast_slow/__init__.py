@@ -8,11 +8,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pat.media.colour import luminance
-from pat.sensors import Clip, Linear, Noise, record
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
+from pat.sensors import Clip, Noise, record
 from pat.systems.exposures import banded
 from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded
+from pat.systems.system import Recording
 
 TITLE = "fast mono alpha, three slow cameras with filters, not synchronised; an object moves"
 REDUCED = 1 / 4
@@ -31,12 +31,12 @@ def record_scene(stage: Stage) -> Recording:
     ground_truth = []
     for name in rig.names:
         for time in times[name]:
-            lit = record(stage.seen(name, stage.moved(layer, velocity * time))[0], (Linear(),), generator).image
+            lit = linear_from_srgb(stage.seen(name, stage.moved(layer, velocity * time))[0])
             own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
             raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
             if name == stage.alpha:
                 bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
-                ground_truth.append(coded(torch.cat(bands)))
+                ground_truth.append(srgb_from_linear(torch.cat(bands)))
     return Recording(raw, ground_truth)
 
 

@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
-from pat.fusion.results import Frame, save_frame, save_panels
+from pat.fusion.results import Frame, save_frame
 from pat.fusion.sequence import SequenceFusion, flicker
-from pat.media.colour import luminance_of
+from pat.media.colour import luminance_of, srgb_image
+from pat.media.figures import save_panels
 from pat.media.images import read_image
 from pat.media.video import write_video
 from pat.networks.weights import load_weights
-from pat.sensors import Clip, Coded, Exposure, record
 from pat.systems.showcase import FAST, SCENE, SLOW, Array, fast_and_slow_array
 from pat.systems.system import Result
 
@@ -61,11 +60,9 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
     raw |= {name: [read_image(folder / SCENE / f"{name}_{i}.png") for i in SLOW_FRAMES] for name in SLOW}
     first = luminance_of(raw[FAST][0]).flatten()
     gain = 1 / float(first.sort().values[int(0.995 * len(first))])
-    return {n: [_coded(p, gain if n == FAST else 1.0) for p in images] for n, images in raw.items()}
-
-
-def _coded(image: Tensor, gain: float) -> Tensor:
-    return record(luminance_of(image)[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
+    return {
+        n: [srgb_image(luminance_of(p) * (gain if n == FAST else 1.0)) for p in images] for n, images in raw.items()
+    }
 
 
 def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:

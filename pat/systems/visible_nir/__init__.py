@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import torch
 
-from pat.media.colour import from_luma_chroma, to_luma_chroma
-from pat.sensors import Clip, Linear, Noise, record
+from pat.media.colour import from_luma_chroma, linear_from_srgb, srgb_from_linear, to_luma_chroma
+from pat.sensors import Clip, Noise, record
 from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded
+from pat.systems.system import Recording
 
 TITLE = "near infrared alpha, colour beta: the same materials look different"
 REDUCED = 1 / 5
@@ -24,11 +24,11 @@ HAZE = 0.002
 def record_scene(stage: Stage) -> Recording:
     """One frame."""
     generator = stage.generator("record")
-    infrared = record(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1], (Linear(),), generator).image
+    infrared = linear_from_srgb(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1])
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
     colour = record(other, (Noise(6_000, 3), Clip()), generator).image
-    ground_truth = from_luma_chroma(coded(infrared[0]), to_luma_chroma(coded(own[0]))[1])
+    ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1])
     return Recording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 
 
@@ -46,5 +46,5 @@ def infrared_weights(stage: Stage) -> torch.Tensor:
 
 def hazed(image: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
     """Linear light of a visible image, with the air's own light in it by distance."""
-    clear = record(image, (Linear(),), torch.Generator()).image
+    clear = linear_from_srgb(image)
     return torch.lerp(torch.full_like(clear, 0.6), clear, torch.exp(-HAZE * depth))

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from arraygeom import Rig
-from pat.media.colour import luminance
-from pat.sensors import Clip, GaussianBlur, Linear, Noise, record
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
+from pat.sensors import Clip, DecodeSRGB, GaussianBlur, Mosaic, Noise, record
 from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded, mosaic
+from pat.systems.system import Recording
 
 TITLE = "mono telephoto, and a wide colour camera with 10 times fewer pixels on what both see"
 REDUCED = 1 / 8
@@ -25,11 +25,11 @@ def record_scene(stage: Stage) -> Recording:
     """One frame."""
     image, depth = stage.seen("narrow")
     generator = stage.generator("record")
-    sharp = record(image, (Linear(),), generator).image
+    sharp = linear_from_srgb(image)
     ground_truth = defocused(sharp, depth, stage.rig)
     tele = record(luminance(ground_truth), (Noise(10_000, 3), Clip()), generator).image
-    wide = record(stage.seen("wide")[0], (Linear(), Noise(6_000, 3), Clip()), generator).image
-    return Recording({"narrow": [tele[0]], "wide": [mosaic(wide[0], "RGGB")]}, [coded(ground_truth[0])])
+    wide = record(stage.seen("wide")[0], (DecodeSRGB(), Noise(6_000, 3), Clip(), Mosaic("RGGB")), generator).image
+    return Recording({"narrow": [tele[0]], "wide": [wide[0]]}, [srgb_from_linear(ground_truth[0])])
 
 
 def defocused(image: Tensor, depth: Tensor, rig: Rig) -> Tensor:

@@ -3,9 +3,10 @@ import numpy as np
 import pytest
 import torch
 
-from pat.data import StereoPair, middlebury_pairs, mono_colour_task
+from pat.data import StereoPair, middlebury_pairs
 from pat.evaluation.baseline import _rectified_plane, _regressed, classical_fusion, classical_fusion_calibrated
 from pat.evaluation.metrics import score
+from pat.evaluation.protocols import mono_colour_task
 from pat.media.colour import luminance, to_luma_chroma
 
 

@@ -10,15 +10,15 @@ import pat.systems.stage
 from arraygeom import Rig
 from pat.cli.main import main
 from pat.fusion.results import Frame
-from pat.fusion.steps import pitch_ratio
+from pat.fusion.steps import resolution_ratio
 from pat.fusion.views import read_views
-from pat.media.colour import linear_from_srgb
+from pat.media.colour import linear_from_srgb, srgb_from_linear
 from pat.media.images import read_image
 from pat.media.raw import demosaiced
+from pat.sensors import Mosaic
 from pat.systems import NAMES, load_system, run_system
 from pat.systems.hdr import merged, usable_range
 from pat.systems.stage import Stage
-from pat.systems.system import coded, mosaic
 
 
 def angle(focal: float, pixels: int) -> float:
@@ -28,7 +28,7 @@ def angle(focal: float, pixels: int) -> float:
 def test_the_arrays_are_the_papers():
     wide, nir, exposures, fast = (load_system(name).rig for name in NAMES)
     assert [c.hw for c in wide.cameras.values()] == [(3036, 4024), (3684, 4912)]
-    assert 9 < 1 / pitch_ratio(wide.pair("narrow", "wide")) ** 2 < 13
+    assert 9 < 1 / resolution_ratio(wide.pair("narrow", "wide")) ** 2 < 13
     assert angle(float(wide["wide"].K[0, 0]), 4912) > 3 * angle(float(wide["narrow"].K[0, 0]), 4024)
     assert {c.hw for c in nir.cameras.values()} == {(2048, 2048)}
     assert [round(c.sensor.exposure / 12e-6) for c in exposures.cameras.values()] == [150, 500, 300, 800]
@@ -102,7 +102,9 @@ def test_large_images_are_rendered_in_bands(tiny, monkeypatch):
 def test_a_mosaic_is_undone_by_its_pattern():
     rgb = torch.rand(3, 1, 1).expand(3, 12, 14)
     for pattern in ("RGGB", "GBRG"):
-        torch.testing.assert_close(demosaiced(mosaic(rgb, pattern), pattern), rgb, atol=1e-4, rtol=0)
+        torch.testing.assert_close(
+            demosaiced(Mosaic(pattern).apply(rgb[None], torch.Generator())[0], pattern), rgb, atol=1e-4, rtol=0
+        )
 
 
 def test_recordings_are_files_as_cameras_write_them(tiny, tmp_path):
@@ -160,7 +162,7 @@ def test_merged_exposures_tell_more_than_alpha(tiny):
     for name in rig.betas("alpha"):
         rig = rig.with_camera(name, rig["alpha"].replace(cam_from_world=one_place, sensor=rig[name].sensor))
     limit = {"alpha": 1.0, "red": 1 / 0.9, "green": 1 / 0.54, "blue": 1 / 1.44}
-    images = {name: coded(light.clamp(max=limit[name])) for name in rig.names}
+    images = {name: srgb_from_linear(light.clamp(max=limit[name])) for name in rig.names}
     frame = Frame(images["alpha"].expand(3, -1, -1), torch.full((h, w), 5.0), torch.ones(h, w))
     told = linear_from_srgb(merged(frame, rig, images, "alpha").image)[1]
     off = ((told - light[0]) / light[0]).abs()
