@@ -25,7 +25,7 @@ from torch import Generator, Tensor
 from arraygeom import Rig
 from arraygeom.atomic import write_atomically, write_text
 from arraygeom.io.native import write as rig_text
-from pat.evaluation.baseline import classical, classical_band_calibrated
+from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame, colour_depth, save_frame, save_panels, view_of
@@ -291,21 +291,6 @@ def _sequence(
 
 def _images(job: SequenceFusion, i: int) -> dict[str, Tensor]:
     return {job.alpha: job.grey(i), **{n: job.frames[n][j] for n, j in job.timeline.at(i).items()}}
-
-
-def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "3 h w"]:
-    """The classical fusion: with the one colour beta, or with each of the betas that see one band."""
-    betas = [name for name in rig.betas(alpha) if name in images]
-    if images[betas[0]].shape[0] == 3:
-        return classical(rig, dict(images), alpha, betas[0])
-    return torch.cat([_band(rig, images, alpha, name) for name in betas])
-
-
-def _band(rig: Rig, images: Mapping[str, Tensor], alpha: str, name: str) -> Tensor:
-    pair = rig.pair(alpha, name)
-    (a, b), pose = pair.cameras, pair.beta_from_alpha
-    near, far = (float(d) for d in pair.depth_range)
-    return classical_band_calibrated(images[alpha], images[name], a.K, b.K, pose.R, pose.t, depth=(near, far))
 
 
 def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:

@@ -18,7 +18,7 @@ import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig
-from pat.evaluation.baseline import classical
+from pat.evaluation.baseline import classical, classical_baseline
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.media.colour import luminance
@@ -27,7 +27,6 @@ from pat.networks.weights import load_weights
 from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.rigs import RigDistribution
-from pat.systems.system import classical_baseline
 from pat.training.config import TrainConfig
 from pat.training.samples import photographs
 from pat.training.spectra import Spectra
