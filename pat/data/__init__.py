@@ -14,13 +14,11 @@ from pat.data.pairs import (
 )
 from pat.data.patches import Patches, scene_folders
 from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
-from pat.evaluation.protocols import MonoColourTask, mono_colour_task, reduce_by
 
 __all__ = [
     "PAPER_DISPARITY",
     "Calibration",
     "Disparity",
-    "MonoColourTask",
     "Patch",
     "Patches",
     "RenderedScenes",
@@ -35,9 +33,7 @@ __all__ = [
     "index_files",
     "kitti_pairs",
     "middlebury_pairs",
-    "mono_colour_task",
     "read_indices",
-    "reduce_by",
     "scene_folders",
     "syntim_pairs",
     "write_indices",

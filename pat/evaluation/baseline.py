@@ -66,7 +66,7 @@ def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> 
 
 
 def classical_fusion(
-    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "3 hb wb"], *, max_disparity: float
+    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "3 hb wb"], max_disparity: float
 ) -> Float[Tensor, "3 h w"]:
     """Alpha in beta's colours, for a (near-)rectified pair with alpha on the left.
 

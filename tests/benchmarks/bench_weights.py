@@ -11,7 +11,7 @@ import time
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from pat.evaluation.stereo import rectified_fusion
+from pat.evaluation.protocols import rectified_fusion
 from pat.networks.weights import SHIPPED, load_weights
 
 HW = (384, 448)

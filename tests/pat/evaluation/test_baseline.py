@@ -4,9 +4,10 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pair, Pose
-from pat.data import StereoPair, middlebury_pairs, mono_colour_task
+from pat.data import StereoPair, middlebury_pairs
 from pat.evaluation.baseline import _rectified_plane, _regressed, classical_calibrated, classical_fusion
 from pat.evaluation.metrics import score
+from pat.evaluation.protocols import mono_colour_task
 from pat.media.colour import luminance, to_luma_chroma
 
 
