@@ -69,7 +69,11 @@ def test_a_result_that_cannot_be_scored_names_method_and_pair(result, complaint)
         evaluate_pairs(pairs(1), {"ours": lambda *_: result}, [2])
 
 
-ROWS = [StereoRow("a", 2, "ours", 30.0, 0.9), StereoRow("a", 4, "ours", 28.0, 0.8), StereoRow("b", 2, "ours", 34.0, 0.96)]
+ROWS = [
+    StereoRow("a", 2, "ours", 30.0, 0.9),
+    StereoRow("a", 4, "ours", 28.0, 0.8),
+    StereoRow("b", 2, "ours", 34.0, 0.96),
+]
 
 
 def test_summaries_are_means_by_rate_and_method():
@@ -170,7 +174,8 @@ def test_controls_take_the_reference_away():
 
 def test_falls_are_means_and_the_least():
     rows = [
-        StereoRow(p, 2, m, v, 0.9) for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
+        StereoRow(p, 2, m, v, 0.9)
+        for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
     ]
     assert falls(rows, names=["no"]) == "- no: 4.00 dB below fusion, at least 3.00 dB\n"
 
@@ -245,7 +250,11 @@ def test_sets_are_read_by_their_own_rules_and_shown_apart(tmp_path):
 
 
 def test_lost_structure_is_named():
-    rows = [StereoRow("p", 2, "alpha", 20, 0.9), StereoRow("p", 2, "fusion", 30, 0.9), StereoRow("q", 2, "alpha", 20, 0.9)]
+    rows = [
+        StereoRow("p", 2, "alpha", 20, 0.9),
+        StereoRow("p", 2, "fusion", 30, 0.9),
+        StereoRow("q", 2, "alpha", 20, 0.9),
+    ]
     rows.append(StereoRow("q", 2, "fusion", 30, 0.91))
     assert structure_kept(rows) == "SSIM of fusion is at least that of alpha in 2 of 2 cases."
     rows[1] = rows[1]._replace(ssim=0.8999)
