@@ -69,7 +69,7 @@ class Demo:
         from ..evaluation.baseline import classical
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
-        from ..systems.demo import report_figure
+        from ..systems.demo import save_demo_figure
 
         sample = load_sample()
         console.print("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
@@ -77,7 +77,7 @@ class Demo:
         console.print(f"fusion with the weights '{self.weights}'")
         frame = fuse_frame(self.weights, sample.rig, sample.images, alpha=ALPHA)
         written = save_frame(frame, self.out)
-        report_figure(sample, baseline, frame, self.out / "demo.png")
+        save_demo_figure(sample, baseline, frame, self.out / "demo.png")
         rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
         scores = {name: score(image.clamp(0, 1), sample.ground_truth) for name, image in rows.items()}
         lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]
@@ -357,7 +357,7 @@ class Show:
         from arraygeom import Camera
         from arraygeom.viz import draw_fields, draw_rig
 
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..media.images import read_image
 
         rig = Rig.load(self.rig)
@@ -541,7 +541,7 @@ class DataShow:
 
         from ..data import ScenePatches
         from ..data.show import draw_patches
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..sensors import generator_for, read_chains
         from ..support.schema import read_yaml
 

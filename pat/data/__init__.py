@@ -3,8 +3,8 @@
 from pat.data.indices import agreement, index_files, read_indices, write_indices
 from pat.data.pairs import (
     PAPER_DISPARITY,
-    Calibration,
     Disparity,
+    StereoCalibration,
     StereoPair,
     flickr_pairs,
     folder_pairs,
@@ -12,18 +12,18 @@ from pat.data.pairs import (
     middlebury_pairs,
     syntim_pairs,
 )
-from pat.data.patches import Patches, scene_folders
-from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
+from pat.data.patches import PatchGrid
+from pat.data.scenes import Patch, ScenePatches, SceneShuffle, collate, default_chains
+from pat.data.windows import scene_folders
 
 __all__ = [
     "PAPER_DISPARITY",
-    "Calibration",
     "Disparity",
     "Patch",
-    "Patches",
-    "RenderedScenes",
+    "PatchGrid",
     "ScenePatches",
     "SceneShuffle",
+    "StereoCalibration",
     "StereoPair",
     "agreement",
     "collate",

@@ -27,7 +27,7 @@ class Disparity(NamedTuple):
     valid: Bool[Tensor, "h w"]
 
 
-class Calibration(NamedTuple):
+class StereoCalibration(NamedTuple):
     """Two pinhole cameras: X_right = R X_left + t, t in metres; the centre of the first pixel is (0, 0)."""
 
     K_left: Float[Tensor, "3 3"]
@@ -48,7 +48,7 @@ class StereoPair:
     right: Float[Tensor, "cr hr wr"]
     max_disparity: float | None = None
     disparity: Disparity | None = None
-    calibration: Calibration | None = None
+    calibration: StereoCalibration | None = None
 
 
 class PairFiles(NamedTuple):
@@ -222,14 +222,14 @@ def _with_kitti_calibration(pair: StereoPair, left: Path) -> StereoPair:
     return replace(pair, calibration=_read_kitti(file)) if file else pair
 
 
-def _read_kitti(file: Path) -> Calibration | None:
+def _read_kitti(file: Path) -> StereoCalibration | None:
     """Cameras 2 and 3 from their projections K [I | K^-1 p]: rectified, they share their rotation."""
     rows = dict(line.split(":", 1) for line in file.read_text().splitlines() if ":" in line)
     if not {"P2", "P3"} <= rows.keys():
         return None
     left, right = (torch.tensor([float(x) for x in rows[key].split()]).reshape(3, 4) for key in ("P2", "P3"))
     centre = torch.linalg.solve(right[:, :3], right[:, 3]) - torch.linalg.solve(left[:, :3], left[:, 3])
-    return Calibration(left[:, :3], right[:, :3], torch.eye(3), centre)
+    return StereoCalibration(left[:, :3], right[:, :3], torch.eye(3), centre)
 
 
 def _syntim_right(left: Path) -> Path:
@@ -241,7 +241,7 @@ def _syntim_pair(left: Path) -> StereoPair:
     cameras = (_read_syntim(left.with_name(f"cam_{scene}_{side}")) for side in "gd")
     (K_left, R_left, t_left), (K_right, R_right, t_right) = cameras
     R = R_right @ R_left.mT
-    calibration = Calibration(K_left, K_right, R, t_right - R @ t_left)
+    calibration = StereoCalibration(K_left, K_right, R, t_right - R @ t_left)
     images = read_image(left), read_image(_syntim_right(left))
     return StereoPair(left.stem.replace("0_", "_"), *images, calibration=calibration)
 

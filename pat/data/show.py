@@ -11,7 +11,7 @@ from torch import Tensor
 
 from arraygeom.fields import ReceptiveField
 from arraygeom.viz import COLOURS, draw_look, numpy, show_image, suitable_field
-from pat.fusion.results import colour_depth
+from pat.media.figures import colour_depth
 
 from .scenes import Patch
 

@@ -47,12 +47,12 @@ from arraygeom.pixels import HW
 from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
-from ..fusion.results import save_figure
 from ..fusion.steps import pitch_ratio
-from ..media.colour import luminance
+from ..media.colour import luminance, srgb_image
+from ..media.figures import save_figure
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
-from ..sensors import Clip, Coded, Noise, Quantise, record
+from ..sensors import Clip, Noise, Quantise, record
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rendered import RENDER_FILE, Rendered, is_rendered
@@ -189,7 +189,7 @@ def _rendered_case(name: str, folder: Path, g: Generator) -> AblationCase:
     scene = Rendered(folder)
     first, second = scene.rig.names[:2]
     frames = [scene.frame(name) for name in (first, second)]
-    ground_truth, seen = (record(f.rgb[None], [Clip(), Coded()], g).image[0] for f in frames)
+    ground_truth, seen = (srgb_image(f.rgb) for f in frames)
     rig = Rig({ALPHA: scene.rig[first], BETA: scene.rig[second]})
     return _recorded(name, rig, ground_truth, seen, frames[0].depth, g)
 

@@ -181,9 +181,9 @@ def _correspondence(
     soft: Image, other: Image, guide: NDArray[np.uint8], inside: Image, max_disparity: float
 ) -> _Correspondence:
     """`other` is luminance normalised to mono's, `inside` is 1 where it has content."""
-    ours = _disparity(_bytes(soft), _bytes(other), max_disparity)
+    ours = _disparity(to_bytes(soft), to_bytes(other), max_disparity)
     # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
-    theirs = _disparity(_bytes(other[:, ::-1]), _bytes(soft[:, ::-1]), max_disparity)[:, ::-1]
+    theirs = _disparity(to_bytes(other[:, ::-1]), to_bytes(soft[:, ::-1]), max_disparity)[:, ::-1]
     columns, rows = _grid(soft.shape)
     back = _sampled(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
     consistent = (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5)
@@ -198,7 +198,7 @@ def _warped_chroma(mono: Image, colours: Image, inside: Image, max_disparity: fl
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
     """
-    soft, guide = _softened(mono, sharpness), _bytes(mono)
+    soft, guide = _softened(mono, sharpness), to_bytes(mono)
     match = _correspondence(soft, _normalised(_luma(colours), mono, inside), guide, inside, max_disparity)
     warped = _sampled(colours, match.columns, match.rows)
     warped_luma = _luma(warped)
@@ -211,7 +211,7 @@ def _warped_chroma(mono: Image, colours: Image, inside: Image, max_disparity: fl
 
 def _warped_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
     """What `band` has more than `mono`, at `mono`'s pixels; both (h, w) on one rectified grid."""
-    soft, guide = _softened(mono, sharpness), _bytes(mono)
+    soft, guide = _softened(mono, sharpness), to_bytes(mono)
     match = _correspondence(soft, _normalised(band, mono, inside), guide, inside, max_disparity)
     difference = (_sampled(band, match.columns, match.rows) - soft)[..., None]
     filled = _diffused(difference, match.weight + 1e-4, guide, COLOUR_FILL)
@@ -296,10 +296,6 @@ def _planes(image: Float[Tensor, "c h w"]) -> Image:
 
 def _luma(colours: Image) -> Image:
     return luminance(torch.from_numpy(colours).permute(2, 0, 1))[0].numpy()
-
-
-def _bytes(plane: Image) -> NDArray[np.uint8]:
-    return to_bytes(torch.from_numpy(plane.copy()))
 
 
 def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:

@@ -12,6 +12,8 @@ from torch import Tensor
 
 from arraygeom import pixel_grid, sample
 
+from ..media.colour import to_bytes
+
 ASTRAY = 1.0
 """Flow that does not lead back to within this many pixels is trusted less than 1 / e."""
 UNLIKE = 0.08
@@ -56,12 +58,8 @@ def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow = engine.calc(_bytes(a), _bytes(b), np.empty(0, np.float32))
+    flow = engine.calc(to_bytes(a[0]), to_bytes(b[0]), np.empty(0, np.float32))
     return torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return np.rint(image[0].clamp(0, 1).numpy() * 255).astype(np.uint8)
 
 
 def _inside(step: Tensor) -> Tensor:

@@ -69,22 +69,33 @@ def read_image(path: str | Path, *, name: str | None = None, bits: int | None = 
     return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
 
 
-def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
-    """Write a grey or RGB image, whole or not at all, in the format its name ends in (.png, .tif, .jpg, .exr).
+def write_image(
+    path: str | Path,
+    image: Float[Tensor, "c h w"],
+    *,
+    bits: int = 8,
+    coverage: Float[Tensor, "1 h w"] | None = None,
+) -> None:
+    """Write a grey or RGB image atomically, in the format its name ends in (.png, .tif, .jpg, .exr).
 
-    8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif and .exr only) keep
-    floats as they are. An .exr file needs the extra `synthesis`. Raises ValueError for an image with NaN or another
-    number of channels, and for a format that cannot hold it.
+    8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
+    `coverage` makes the image RGBA (.png and .exr). An .exr file needs the extra `synthesis`. Raises ValueError for
+    an image with NaN or another number of channels, and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
         raise ValueError(f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
+    if coverage is not None:
+        if path.suffix.lower() not in (".png", ".exr"):
+            raise ValueError(f"{path}: only PNG and EXR hold coverage (rgba)")
+        planes = np.concatenate([planes, coverage.detach().cpu().numpy()])
     if not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
-    content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
+    order = [2, 1, 0, 3] if coverage is not None else slice(None, None, -1)
+    content = _encode(path, np.ascontiguousarray(planes[order].transpose(1, 2, 0)), bits)
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
 
@@ -173,7 +184,7 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
         raise ValueError(
             f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
         ) from None
-    names = "Y" if planes.shape[0] == 1 else "RGB"
+    names = {1: "Y", 3: "RGB", 4: "RGBA"}[len(planes)]
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with write_atomically(path) as temporary:

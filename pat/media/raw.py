@@ -92,7 +92,7 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
     fringes of false colour at fine detail would be carried to where alpha sees it sharp.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
-    counts = np.rint(raw[0].clamp(0, 1).numpy().astype(np.float64) * 65535).astype(np.uint16)
+    counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)
     colours = cv2.demosaicing(counts, code).astype(np.float32) / np.float32(65535)
     green = colours[..., 1]
     for i in (0, 2):

@@ -23,6 +23,7 @@ from torch.nn.functional import avg_pool2d, interpolate
 from arraygeom import Segments
 from arraygeom.sampling import on_image, sample
 
+from ..media.colour import to_bytes
 from ..support.threads import in_parallel
 from . import semi_global_kernels as kernels
 
@@ -163,7 +164,7 @@ def agreement(
     geometry = _geometry(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
     found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
-    planes = zip(found, consistent, _bytes(avg_pool2d(alpha, FINE)))
+    planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
     spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
     smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, spread)])
     disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
@@ -330,7 +331,7 @@ def spread_from(
     matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], trust: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b fills c h w"]:
     """Bands spread by trust over what is connected in alpha, in each of the `FILLS` ways."""
-    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
+    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), to_bytes(alpha[:, 0])))
     spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
 
     def along_brightness(i: int) -> None:
@@ -407,7 +408,3 @@ def _filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, 
 
 def _numpy(x: Tensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)
-
-
-def _bytes(image: Tensor) -> NDArray[np.uint8]:
-    return np.rint(np.clip(_numpy(image[:, 0]), 0, 1) * 255).astype(np.uint8)

@@ -17,7 +17,7 @@ from .optics import BoxBlur
 
 
 @dataclass(frozen=True)
-class Case:
+class DegradationCase:
     """One way in which the two images of a pair are degraded."""
 
     name: str
@@ -25,17 +25,17 @@ class Case:
     beta: tuple[Step, ...] = ()
 
 
-def paper_cases(blur: int = 5) -> tuple[Case, Case, Case, Case]:
+def paper_cases(blur: int = 5) -> tuple[DegradationCase, DegradationCase, DegradationCase, DegradationCase]:
     """The paper's four augmentations for two inputs; each is to be drawn with probability 1/4.
 
     The paper does not give the blur; here it is a box of `blur` pixels.
     """
     reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
     return (
-        Case("blur alpha", alpha=(BoxBlur(blur),)),
-        Case("blur beta", beta=(BoxBlur(blur),)),
-        Case("reduce beta", beta=reduced),
-        Case("blur and reduce beta", beta=(BoxBlur(blur), *reduced)),
+        DegradationCase("blur alpha", alpha=(BoxBlur(blur),)),
+        DegradationCase("blur beta", beta=(BoxBlur(blur),)),
+        DegradationCase("reduce beta", beta=reduced),
+        DegradationCase("blur and reduce beta", beta=(BoxBlur(blur), *reduced)),
     )
 
 
@@ -50,7 +50,7 @@ class Pairs(NamedTuple):
 def augment(
     alpha: Float[Tensor, "b ca ha wa"],
     beta: Float[Tensor, "b cb hb wb"],
-    cases: Sequence[Case],
+    cases: Sequence[DegradationCase],
     generator: Generator,
 ) -> Pairs:
     """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must come out as they went in."""

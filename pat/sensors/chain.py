@@ -19,7 +19,7 @@ from arraygeom.sampling import sample
 
 
 @dataclass(frozen=True)
-class Light:
+class OpticalImage:
     """Images on their way through a chain, and what is known of what they show, all of the same pixels.
 
     `depth` in metres along the optical axis; `motion` (x, y) in pixels a second; `camera` with K of these pixels;
@@ -37,7 +37,7 @@ class Light:
         """Height and width."""
         return self.image.shape[-2], self.image.shape[-1]
 
-    def moved(self, A: Float[Tensor, "3 3"], image: Float[Tensor, "b c2 h2 w2"]) -> Light:
+    def moved(self, A: Float[Tensor, "3 3"], image: Float[Tensor, "b c2 h2 w2"]) -> OpticalImage:
         """New images whose pixels are x' ~ A x; depth and motion are those of the nearest former pixels."""
         hw = image.shape[-2], image.shape[-1]
         if hw == self.hw and torch.equal(A, torch.eye(3, dtype=A.dtype)):
@@ -45,7 +45,7 @@ class Light:
         depth = None if self.depth is None else _looked_up(self.depth[:, None], A, hw)[:, 0]
         motion = None if self.motion is None else _turned(_looked_up(self.motion, A, hw), A)
         camera = None if self.camera is None else self.camera.transformed(A, hw)
-        return Light(image, A @ self.pixels, depth, motion, camera)
+        return OpticalImage(image, A @ self.pixels, depth, motion, camera)
 
 
 def _looked_up(values: Tensor, A: Tensor, hw: HW) -> Tensor:
@@ -69,7 +69,7 @@ class Step(ABC):
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
         """The images afterwards."""
 
-    def expose(self, light: Light, generator: Generator) -> Light:
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         """The images afterwards, with what is known of them."""
         return light.moved(self.pixel_matrix(light.hw), self.apply(light.image, generator))
 
@@ -79,10 +79,10 @@ class LitStep(Step):
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """The images afterwards, if what `light` holds beside the image is not needed after all."""
-        return self.expose(Light(image, torch.eye(3, dtype=torch.float64)), generator).image
+        return self.expose(OpticalImage(image, torch.eye(3, dtype=torch.float64)), generator).image
 
     @abstractmethod
-    def expose(self, light: Light, generator: Generator) -> Light:
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         """The images afterwards, with what is known of them."""
 
 
@@ -107,7 +107,7 @@ def record(
     `depth` (metres) and `camera` are needed by `Defocus`, `motion` (pixels a second) by `MotionBlur` without a
     velocity of its own. Raises ValueError if a step misses what it needs.
     """
-    light = Light(image, torch.eye(3, dtype=torch.float64), depth, motion, camera)
+    light = OpticalImage(image, torch.eye(3, dtype=torch.float64), depth, motion, camera)
     for step in steps:
         light = step.expose(light, generator)
     return Recorded(light.image, light.pixels)

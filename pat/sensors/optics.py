@@ -15,7 +15,7 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
 
-from .chain import Light, LitStep, Step
+from .chain import LitStep, OpticalImage, Step
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Defocus(LitStep):
             if not getattr(self, name) > 0:
                 raise ValueError(f"defocus: {name} must be positive, got {getattr(self, name):g}")
 
-    def expose(self, light: Light, generator: Generator) -> Light:
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         """The defocused images."""
         if light.depth is None or light.camera is None:
             raise ValueError(
@@ -151,7 +151,7 @@ class MotionBlur(LitStep):
         if self.shutter < 0:
             raise ValueError(f"motion blur: shutter is a time in seconds, got {self.shutter:g}")
 
-    def expose(self, light: Light, generator: Generator) -> Light:
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         """The blurred images."""
         way = self.shutter * self._motion(light).movedim(1, -1)
         steps = max(math.ceil(2 * float(way.detach().norm(dim=-1).max())), 1)
@@ -163,7 +163,7 @@ class MotionBlur(LitStep):
         )
         return replace(light, image=torch.stack(list(looked)).mean(0))
 
-    def _motion(self, light: Light) -> Tensor:
+    def _motion(self, light: OpticalImage) -> Tensor:
         if self.velocity is not None:
             b, _, h, w = light.image.shape
             return light.image.new_tensor(self.velocity)[:, None, None].expand(b, 2, h, w)
@@ -183,7 +183,7 @@ class Vignetting(LitStep):
     falloff: tuple[float, ...] = ()
     natural: bool = False
 
-    def expose(self, light: Light, generator: Generator) -> Light:
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         """The darkened images."""
         grid = pixel_grid(light.hw, dtype=light.image.dtype, device=light.image.device)
         gain = self._falloff(grid, light)
@@ -191,7 +191,7 @@ class Vignetting(LitStep):
             gain = gain * _cos4(grid, light.camera)
         return replace(light, image=light.image * gain.reshape(-1, 1, *light.hw))
 
-    def _falloff(self, grid: Tensor, light: Light) -> Tensor:
+    def _falloff(self, grid: Tensor, light: OpticalImage) -> Tensor:
         h, w = light.hw
         middle = grid.new_tensor([[(w - 1) / 2, (h - 1) / 2]])
         centre = middle if light.camera is None else light.camera.K[..., :2, 2].to(grid).reshape(-1, 2)

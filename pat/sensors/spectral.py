@@ -12,19 +12,18 @@ from torch import Generator, Tensor
 
 from arraygeom.sensor import Band, Curve
 
-from ..media.colour import linear_from_srgb, srgb_from_linear
+from ..media.colour import REC601, linear_from_srgb, srgb_from_linear
 from .chain import Step
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
 """What the channels R, G, B and NIR of an ideal image are taken to hold: Gaussians, centre and sigma in nm."""
 
 NAMES = ("rgb", "luminance", "nir")
-_REC601 = (0.299, 0.587, 0.114)
 _VISIBLE, _NEAR_INFRARED = (400.0, 700.0), (400.0, 1000.0)
 
 
 @dataclass(frozen=True)
-class Linear(Step):
+class DecodeSRGB(Step):
     """sRGB coding to linear light (IEC 61966-2-1)."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
@@ -33,7 +32,7 @@ class Linear(Step):
 
 
 @dataclass(frozen=True)
-class Coded(Step):
+class EncodeSRGB(Step):
     """Linear light to sRGB coding, the inverse of `Linear`."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
@@ -82,7 +81,7 @@ class Spectral(Step):
 
     def _weights(self, channels: int) -> tuple[float, ...]:
         if self.response == "luminance":
-            return (*_REC601, 0.0)[:channels]
+            return (*REC601, 0.0)[:channels]
         if self.response == "nir":
             if channels == 3:
                 raise ValueError("the response 'nir' needs an image with a NIR channel, got RGB alone")

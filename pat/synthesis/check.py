@@ -52,7 +52,7 @@ def foretell(alpha: Camera, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class CheckLimits:
     """What a rendered scene must keep to.
 
     `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its pixel on
@@ -73,7 +73,7 @@ class Limits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class SceneCheck:
     """Figures by view and by "alpha > beta", and what is wrong (nothing if accepted)."""
 
     views: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -90,19 +90,19 @@ class Report:
         return {"accepted": self.accepted, "reasons": list(self.reasons), "views": self.views, "pairs": self.pairs}
 
 
-def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: Limits | None = None) -> Report:
+def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits | None = None) -> SceneCheck:
     """Check one frame of every camera against each other and against the limits.
 
     Pairs of frames of different times are left out.
     """
-    limits = limits or Limits()
+    limits = limits or CheckLimits()
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
     pairs = {f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b]) for a, b in together}
     reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
     reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
     reasons += _overlap_reasons(pairs, {a for a, _ in together}, limits)
-    return Report(views=views, pairs=pairs, reasons=tuple(reasons))
+    return SceneCheck(views=views, pairs=pairs, reasons=tuple(reasons))
 
 
 def view_figures(frame: RenderedFrame) -> dict[str, float]:
@@ -198,7 +198,7 @@ def _camera(rig: Rig, name: str) -> Camera:
     return camera
 
 
-def _view_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
+def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> list[str]:
     found = []
     if figures["dark"] > limits.dark:
         found.append(f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})")
@@ -209,7 +209,7 @@ def _view_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> li
     return found
 
 
-def _pair_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
+def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> list[str]:
     found = []
     if figures.get("p95", 0.0) > limits.error:
         found.append(f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})")
@@ -220,7 +220,7 @@ def _pair_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> li
     return found
 
 
-def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: Limits) -> list[str]:
+def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: CheckLimits) -> list[str]:
     """Views of which no other view sees enough."""
     best = {n: max(f["visible"] for p, f in pairs.items() if p.startswith(f"{n} > ")) for n in sorted(names)}
     return [

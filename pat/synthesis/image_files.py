@@ -5,22 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.atomic import write_atomically
-
+from ..media.colour import REC709, luminance, srgb_image
 from ..media.images import write_image
 from .rendered import Rendered, RenderedFrame
 
 Channels = Literal["bw", "rgb", "rgba", "nir"]
 Kind = Literal["png8", "png16", "jpeg", "exr"]
-
-REC709 = (0.2126, 0.7152, 0.0722)
-"""Weights of linear red, green and blue in luminance."""
 
 _SUFFIX = {"png8": ".png", "png16": ".png", "jpeg": ".jpg", "exr": ".exr"}
 
@@ -45,7 +39,7 @@ def light(frame: RenderedFrame, channels: Channels) -> Float[Tensor, "c h w"]:
     if channels == "rgb":
         return frame.rgb
     if channels == "bw":
-        return (frame.rgb * frame.rgb.new_tensor(REC709)[:, None, None]).sum(0, keepdim=True)
+        return luminance(frame.rgb, REC709)
     extra = frame.nir if channels == "nir" else frame.alpha
     if extra is None:
         needed = "nir" if channels == "nir" else "alpha"
@@ -54,37 +48,14 @@ def light(frame: RenderedFrame, channels: Channels) -> Float[Tensor, "c h w"]:
 
 
 def write_light(path: Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
-    """Write linear light to a file, whole or not at all, in the format its name ends in (.png, .jpg, .exr)."""
-    if path.suffix == ".exr":
-        _write_exr(path, image)
-    elif len(image) == 4:
-        _write_rgba(path, image, bits)
-    else:
-        write_image(path, coded(image), bits=bits)
+    """Write linear light, with its coverage if it has four channels, in the format its name ends in.
 
-
-def coded(light: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light as sRGB, cut to 0..1."""
-    light = light.clamp(0, 1)
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=1e-9) ** (1 / 2.4) - 0.055)
-
-
-def _write_rgba(path: Path, image: Float[Tensor, "4 h w"], bits: int) -> None:
-    """PNG holds colours that are not multiplied by coverage."""
-    if path.suffix != ".png":
-        raise ValueError(f"{path}: only PNG and EXR hold coverage (rgba)")
-    colours = coded(image[:3] / image[3:].clamp(min=1e-6))
-    full = 2**bits - 1
-    planes = torch.cat([colours.flip(0), image[3:].clamp(0, 1)]).movedim(0, -1).mul(full).round().numpy()
-    with write_atomically(path) as temporary:
-        cv2.imwrite(str(temporary), planes.astype(np.uint8 if bits == 8 else np.uint16))
-
-
-def _write_exr(path: Path, image: Float[Tensor, "c h w"]) -> None:
-    import OpenEXR
-
-    name = {1: "Y", 3: "RGB", 4: "RGBA"}[len(image)]
-    planes = np.ascontiguousarray(image.float().movedim(0, -1).numpy())
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with write_atomically(path) as temporary:
-        OpenEXR.File(header, {name: planes[..., 0].copy() if name == "Y" else planes}).write(str(temporary))
+    .exr stays linear and multiplied by coverage; .png and .jpg are sRGB-encoded, and .png holds colours that are not
+    multiplied by coverage.
+    """
+    linear = path.suffix == ".exr"
+    coverage = image[3:] if len(image) == 4 else None
+    if linear:
+        return write_image(path, image[:3], bits=32, coverage=coverage)
+    colours = image if coverage is None else image[:3] / coverage.clamp(min=1e-6)
+    write_image(path, srgb_image(colours), bits=bits, coverage=coverage)

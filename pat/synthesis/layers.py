@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 from arraygeom.camera import Camera
 from arraygeom.pose import Pose, matvec
 
+from ..media.colour import REC601
 from .photos import PhotoBank
 from .rigs import RigBatch, log_uniform, uniform
 
@@ -212,7 +213,7 @@ def _texture(
 
 
 _YCC_FROM_RGB = torch.tensor(
-    [[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], dtype=torch.float64
+    [list(REC601), [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], dtype=torch.float64
 )
 
 

@@ -39,7 +39,7 @@ class Paint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Board:
+class BoardObject:
     """A calibration target, printed in black on white.
 
     `squares` are (columns, rows) of `square` metres; a ChArUco board has markers of `marker` metres from an OpenCV
@@ -79,7 +79,7 @@ class Texture:
     distortion: float = 0.0
     grain: float = 0.0
     image: str = ""
-    board: Board | None = None
+    board: BoardObject | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

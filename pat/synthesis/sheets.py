@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom.atomic import write_atomically
 from arraygeom.rig import Rig
 
+from ..media.colour import srgb_image
 from ..media.images import write_image
+from ..media.video import write_video
 from .blender import RenderSettings, Worker
-from .image_files import coded, light
+from .image_files import light
 from .rendered import Rendered, RenderedFrame
 from .scene import Scene
 
@@ -28,7 +27,7 @@ def contact_sheet(
     """Render scenes into folders under `out`, and the first camera's images into `out/sheet.png`."""
     with Worker() as worker:
         done = [_rendered(worker, s, rig, out / f"{s.generator}-{s.seed:04d}", settings) for s in scenes]
-    write_image(out / "sheet.png", tiled([coded(r.frame(r.rig.names[0]).rgb) for r in done], columns))
+    write_image(out / "sheet.png", tiled([srgb_image(r.frame(r.rig.names[0]).rgb) for r in done], columns))
     return done
 
 
@@ -48,17 +47,12 @@ def infrared_sheet(rendered: Rendered, path: Path) -> None:
 
 
 def video(rendered: Rendered, camera: str, path: Path) -> None:
-    """The frames of a camera as an MP4 file, at its frame rate. Raises ValueError if there is only one."""
+    """The frames of a camera as a video (.mp4, .mkv), at its frame rate. Raises ValueError if there is only one."""
     count = rendered.frames(camera)
     if count < 2:
         raise ValueError(f"camera '{camera}' has one frame: render with a duration")
-    rate, (h, w) = rendered.rig[camera].sensor.frame_rate or 30.0, rendered.rig[camera].hw
-    with write_atomically(path) as temporary:
-        writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), rate, (w, h))
-        for k in range(count):
-            image = coded(rendered.frame(camera, k).rgb).mul(255).round().byte()
-            writer.write(np.ascontiguousarray(image.flip(0).movedim(0, -1).numpy()))
-        writer.release()
+    frames = (srgb_image(rendered.frame(camera, k).rgb) for k in range(count))
+    write_video(path, frames, rate=rendered.rig[camera].sensor.frame_rate or 30.0)
 
 
 def _rendered(worker: Worker, scene: Scene, rig: Rig, folder: Path, settings: RenderSettings) -> Rendered:
@@ -66,5 +60,5 @@ def _rendered(worker: Worker, scene: Scene, rig: Rig, folder: Path, settings: Re
 
 
 def _with_infrared(frame: RenderedFrame) -> list[Tensor]:
-    grey = [coded(light(frame, "bw")), coded(light(frame, "nir"))]
-    return [coded(frame.rgb), *(g.expand(3, -1, -1) for g in grey)]
+    grey = [srgb_image(light(frame, "bw")), srgb_image(light(frame, "nir"))]
+    return [srgb_image(frame.rgb), *(g.expand(3, -1, -1) for g in grey)]

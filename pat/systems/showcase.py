@@ -25,13 +25,12 @@ from ..evaluation.protocols import BASELINES, rectified_fusion
 from ..evaluation.stereo import StereoRow, evaluate_sets, markdown, sets_markdown, structure_kept
 from ..evaluation.tables import markdown_table
 from ..fusion.fuse import fuse
-from ..fusion.results import colour_depth, save_panels
 from ..fusion.steps import normalised, pitch_ratio
-from ..media.colour import luminance_of
+from ..media.colour import luminance_of, srgb_image
+from ..media.figures import colour_depth, save_panels
 from ..media.images import read_image
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_weights
-from ..sensors import Clip, Coded, Exposure, record
 
 PAIRS = ("kitti", "middlebury", "flickr1024")
 SYNTIM = ("Color", "Serfaty", "Poly")
@@ -43,7 +42,7 @@ SCENE, FAST_FRAME, SLOW_FRAME = "pillow_1", "141", "4"
 
 
 def showcase(data: Path, out: Path, weights: str = "mono-colour", rates: Sequence[int] = (2, 4)) -> str:
-    """Fuse the images in `data`; write showcase.md, the figures and the rig files into `out`. Returns showcase.md's text.
+    """Fuse the images in `data`; write showcase.md, figures and rig files into `out`. Returns showcase.md's text.
 
     Raises FileNotFoundError or ValueError naming what is missing, before any work where possible.
     """
@@ -63,9 +62,9 @@ def _pairs(network: FusionNetwork, data: Path, out: Path, rates: Sequence[int]) 
     rows = evaluate_sets({name: data / name for name in PAIRS}, methods, rates, out=out / "pairs")
     return (
         "### Stereo pairs\n\n"
-        "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the ground truth.\n"
-        "PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Every image is in `pairs/`: beta enlarged,\n"
-        f"alpha, classical, fusion, ground truth.\n\n{sets_markdown(rows)}"
+        "The left image made grey is alpha, the right one reduced is beta, the left one in colour is the ground\n"
+        "truth. PSNR in dB / SSIM; behind a mean, its 95% bootstrap interval. Every image is in `pairs/`: beta\n"
+        f"enlarged, alpha, classical, fusion, ground truth.\n\n{sets_markdown(rows)}"
     )
 
 
@@ -132,7 +131,7 @@ class FastSlowArray(NamedTuple):
 
     @property
     def displacement(self) -> float:
-        """Largest displacement along the lines, in alpha's pixels: `fuse` resizes betas to alpha's angular resolution."""
+        """Largest displacement along the lines, in alpha's pixels, to which `fuse` resizes betas."""
         pairs = {name: self.rig.pair(FAST, name) for name in self.fits}
         return 1.25 * max(fit.displacement / pitch_ratio(pairs[name]) for name, fit in self.fits.items())
 
@@ -149,10 +148,10 @@ def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> s
         "### The paper's fast + slow array\n\n"
         "Alpha is a frame of the fast camera; the slow ones have filters: 600 nm is shown as red, 550 nm as green,\n"
         "450 nm as blue. Only fundamental matrices are published. They put points seen in both images some pixels\n"
-        "beside their lines, so F is fitted to those points, and with it a rough homography H and the displacement along\n"
-        "the line. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest 0.5% are brought to\n"
-        "white, all are sRGB-encoded, and each beta is normalised to alpha's mean and standard deviation: so\n"
-        "colours are in proportion to a grey world, not measured. There is no ground truth.\n\n"
+        "beside their lines, so F is fitted to those points, and with it a rough homography H and the displacement\n"
+        "along the line. All that is in `fast_slow.yaml`. Values are taken to be linear, alpha's brightest 0.5% are\n"
+        "brought to white, all are sRGB-encoded, and each beta is normalised to alpha's mean and standard deviation:\n"
+        "so colours are in proportion to a grey world, not measured. There is no ground truth.\n\n"
         f"{array.table}\n"
         f"Search segments: +-{array.displacement:.0f} pixels of alpha.\n\n![fast + slow](fast_slow.png)\n"
     )
@@ -160,9 +159,11 @@ def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> s
 
 def fast_and_slow_array(folder: Path) -> FastSlowArray:
     """The array from its images and `fundamental_matrices.json`."""
-    fast = read_image(folder / SCENE / f"{FAST_FRAME}.png")
-    images = {FAST: srgb_encoded(fast, gain=bright_gain(fast))}
-    images |= {name: srgb_encoded(read_image(folder / SCENE / f"{name}_{SLOW_FRAME}.png")) for name in SLOW}
+    files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
+    files |= {name: folder / SCENE / f"{name}_{SLOW_FRAME}.png" for name in SLOW}
+    linear = {name: luminance_of(read_image(file)) for name, file in files.items()}
+    linear[FAST] = linear[FAST] * bright_gain(linear[FAST])
+    images = {name: srgb_image(light) for name, light in linear.items()}
     published = published_matrices(folder / "fundamental_matrices.json")
     columns = ("beta", "points", "off the published lines, px", "off the fitted ones, px", "along, px")
     fits, rows = {}, []
@@ -186,7 +187,7 @@ def published_matrices(file: Path) -> dict[str, Float[Tensor, "3 3"]]:
 
 
 def transformed(array: FastSlowArray) -> Float[Tensor, "3 h w"]:
-    """The slow images at alpha's view by their rough homographies, as red, green and blue, normalised to alpha: no matching."""
+    """The slow images at alpha's view by their rough homographies, as red, green and blue normalised to alpha."""
     alpha = array.images[FAST]
     x = pixel_grid((alpha.shape[1], alpha.shape[2]))
     bands = []
@@ -194,11 +195,6 @@ def transformed(array: FastSlowArray) -> Float[Tensor, "3 h w"]:
         position = apply_homography(array.rig.pair(FAST, name).homography.to(x), x).x
         bands.append(sample(normalised(array.images[name], alpha)[None], position[None]).values[0])
     return torch.cat(bands)
-
-
-def srgb_encoded(image: Float[Tensor, "_ h w"], *, gain: float = 1.0) -> Float[Tensor, "1 h w"]:
-    """The luminance of an image of linear values times `gain`, clipped and sRGB-encoded."""
-    return record(luminance_of(image)[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
 
 
 def bright_gain(image: Float[Tensor, "_ h w"]) -> float:

@@ -29,7 +29,7 @@ UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 
 
 @dataclass(frozen=True)
-class Recording:
+class RecordingConfig:
     """How each camera degrades what it sees."""
 
     gain: float = 0.3
@@ -108,7 +108,7 @@ class TrainConfig:
     """Share of the batches made of stereo pairs."""
     pairs_from: tuple[Path, ...] = ()
     """Folders of rectified stereo pairs in colour."""
-    recording: Recording = Recording()
+    recording: RecordingConfig = RecordingConfig()
     field: FieldName = "epipolar"
     """Where the network looks."""
     held_out: int = 12

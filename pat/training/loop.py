@@ -26,7 +26,7 @@ from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_
 from .config import TrainConfig, config_text, difference, parse_config, save_config
 from .losses import Objective, validation
 from .processes import Process, process
-from .samples import Sample, Source, alone, scenes
+from .samples import Sample, SampleSource, alone, scenes
 from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
@@ -162,7 +162,7 @@ class Run:
     def _minutes(self) -> float:
         return (time.monotonic() - self.began) / 60
 
-    def _scenes(self, field: ReceptiveField | None) -> tuple[Source, Source]:
+    def _scenes(self, field: ReceptiveField | None) -> tuple[SampleSource, SampleSource]:
         """Photographs are read by the first process first, which may leave a cache to the others."""
         if not self.here.first:
             self.here.wait()

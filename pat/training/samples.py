@@ -45,7 +45,7 @@ from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augme
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
-from .config import FieldName, Recording, TrainConfig
+from .config import FieldName, RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
 from .scenes import RenderedCrops
 from .spectra import MOST, Spectra
@@ -115,7 +115,7 @@ def _source(config: TrainConfig, draw: random.Random) -> str | None:
     return "rendered" if drawn < config.rendered else "pairs" if drawn < config.rendered + config.pairs else None
 
 
-class Source:
+class SampleSource:
     """Samples by the number of the step: called with a count it gives the first group of that many steps.
 
     `photos` may be missing where all batches come from `folders`, which are by the kind of scenes that they hold.
@@ -172,7 +172,9 @@ class Source:
             del self.kept[key]
 
 
-def scenes(config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu") -> tuple[Source, Source]:
+def scenes(
+    config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu"
+) -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
     layered = config.rendered + config.pairs < 1
     bank, unseen = photographs(config) if layered else (None, None)
@@ -183,8 +185,8 @@ def scenes(config: TrainConfig, *, field: ReceptiveField | None = None, device: 
         crops(config, examine, device, lambda i: i % n == 0),
     )
     return (
-        Source(bank, config, learn, look, device, folders=known),
-        Source(unseen, config, examine, look, device, folders=new),
+        SampleSource(bank, config, learn, look, device, folders=known),
+        SampleSource(unseen, config, examine, look, device, folders=new),
     )
 
 
@@ -223,7 +225,7 @@ def degraded(
     g: Generator,
     *,
     field: ReceptiveField = Epipolar(),  # noqa: B008
-    recording: Recording = Recording(),  # noqa: B008
+    recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
     """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
     images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
@@ -255,7 +257,7 @@ def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
     return [spectra.of(image) for image in scene.images]
 
 
-def recorded(image: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Sampled:
+def recorded(image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0) -> Sampled:
     """What a camera makes of an image: perhaps bent by a lens and straightened, up to `lost` of it on each side."""
 
     def record_here(image: Tensor) -> Tensor:
@@ -267,7 +269,7 @@ def recorded(image: Tensor, camera: Camera, g: Generator, recording: Recording, 
     return Sampled(record_here(image), image.new_ones(b, h, w, dtype=torch.bool))
 
 
-def steps(g: Generator, recording: Recording) -> list[Step]:
+def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
     """Gain, blur and noise of one camera; each with its own chance."""
     steps: list[Step] = []
     if _chance(recording.gain, g):

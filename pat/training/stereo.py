@@ -19,11 +19,11 @@ from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose
 from pat.data.pairs import PairFiles, pair_files
-from pat.data.patches import reduced
+from pat.data.windows import reduced
 from pat.media.images import read_image
 from pat.synthesis.layered import ArrayBatch
 
-from .scenes import HELD, Crops, below, chosen, in_hand, one_of
+from .scenes import ACTIVE, Crops, active_items, below, chosen, one_of
 
 REDUCED = 2
 """How many times a window is reduced at most: images from the net are often less sharp than their pixels."""
@@ -41,16 +41,16 @@ class PairCrops(Crops):
         self.pairs = chosen(found, choose, f"stereo pairs of {', '.join(map(str, roots))}")
         for pair in self.pairs:
             check_pair(pair, self.hw)
-        self._images = lru_cache(HELD)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
+        self._images = lru_cache(ACTIVE)(lambda i: (read_image(self.pairs[i].left), read_image(self.pairs[i].right)))
 
     def sample(self, batch: int, generator: Generator, *, number: int, betas: int = 1) -> ArrayBatch:
         """Windows of group `number`, of the pairs whose turn it is. Several betas are in one place.
 
         There is no `depth`.
         """
-        hand = in_hand(number, len(self.pairs), self.seed)
+        active = active_items(number, len(self.pairs), self.seed)
         sizes = self.beta_sizes(betas, generator)
-        drawn = [self._window(one_of(hand, generator), generator) for _ in range(batch)]
+        drawn = [self._window(one_of(active, generator), generator) for _ in range(batch)]
         alpha, beta = (torch.stack(images) for images in list(zip(*drawn))[:2])
         side, disparity = (torch.tensor(numbers, dtype=torch.float64) for numbers in list(zip(*drawn))[2:])
         chosen_images = [alpha, *(reduced(beta, size).clamp(max=1) for size in sizes)]

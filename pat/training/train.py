@@ -8,13 +8,13 @@ The parts are in `pat.training`: recipes (`config`), samples, losses, checkpoint
 
 from __future__ import annotations
 
-from .config import Recording, TrainConfig, load_config, recipes, save_config
+from .config import RecordingConfig, TrainConfig, load_config, recipes, save_config
 from .loop import train
 from .losses import image_loss, match_loss, validation
 from .samples import Sample, degraded, pair_of, photographs, scenes, truth_in
 
 __all__ = [
-    "Recording",
+    "RecordingConfig",
     "Sample",
     "TrainConfig",
     "degraded",

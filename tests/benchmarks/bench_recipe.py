@@ -29,7 +29,7 @@ from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import FIELDS, Sample, Source, photographs
+from pat.training.samples import FIELDS, Sample, SampleSource, photographs
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -125,8 +125,8 @@ class Bench:
             facts = validation(load_weights(best), self.held_out)
         return Found(facts["psnr"], facts["matched"], seconds)
 
-    def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> Source:
-        return Source(bank, config, seed, FIELDS[config.field]())
+    def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> SampleSource:
+        return SampleSource(bank, config, seed, FIELDS[config.field]())
 
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:

@@ -20,10 +20,10 @@ import torch
 from arraygeom import Camera, Pose, Rig, rotation_from_vector
 from arraygeom.sensor import Sensor
 from pat.synthesis.boards import inner_corners
-from pat.synthesis.scene import Board
+from pat.synthesis.scene import BoardObject
 from tests.calib.boards_seen import camera, tensor
 
-SHEET = Board(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
+SHEET = BoardObject(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
 BOARD = "charuco:12x9:60mm:45mm:5x5_250"
 DEPTHS = 0.9, 2.6
 TILT = 40.0

@@ -22,7 +22,7 @@ _MIRRORED = "MIRROR"
 
 
 @dataclass(frozen=True)
-class Stage:
+class BuiltScene:
     """A scene in Blender: its objects in order, and what to do to light and paint it in a spectrum."""
 
     objects: list[Any]
@@ -34,9 +34,9 @@ class Stage:
             paint(spectrum)
 
 
-def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> Stage:
+def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> BuiltScene:
     """All objects and lights of a scene. `scratch` is a folder for files that are needed until the end."""
-    stage = Stage([], [])
+    stage = BuiltScene([], [])
     for i, thing in enumerate(scene.objects):
         item = _object(bpy, thing)
         item.pass_index = i + 1
@@ -68,7 +68,7 @@ def _object(bpy: Any, thing: Object) -> Any:
     return item
 
 
-def _light(bpy: Any, light: Light, stage: Stage) -> None:
+def _light(bpy: Any, light: Light, stage: BuiltScene) -> None:
     data = bpy.data.lights.new(light.kind, light.kind.upper())
     data.energy = light.power
     _set_size(data, light)
@@ -100,7 +100,7 @@ def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float
     return w, x, y, z
 
 
-def _world(world: Any, given: World, stage: Stage) -> None:
+def _world(world: Any, given: World, stage: BuiltScene) -> None:
     background = world.node_tree.nodes["Background"]
 
     def paint(spectrum: Spectrum) -> None:
@@ -144,7 +144,7 @@ class _Nodes:
         return node.outputs[0]
 
 
-def _material(bpy: Any, thing: Object, stage: Stage, scratch: Path) -> Any:
+def _material(bpy: Any, thing: Object, stage: BuiltScene, scratch: Path) -> Any:
     material = thing.material
     made = bpy.data.materials.new(thing.name)
     compat.use_nodes(made)
@@ -174,7 +174,7 @@ def _principled(material: Material) -> dict[str, float]:
     }
 
 
-def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> tuple[Any, Any]:
+def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> tuple[Any, Any]:
     """The output that has the paint, and the one that has the height of bumps (None for images)."""
     if texture.kind in ("image", "board"):
         return _image(bpy, nodes, texture, stage, scratch), None
@@ -273,8 +273,8 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 }
 
 
-def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> Any:
-    image = _image(bpy, texture, scratch)
+def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> Any:
+    image = _loaded(bpy, texture, scratch)
     node = nodes.new("TexImage", image=image, extension=_MIRRORED)
     (w, h), (left, top) = _laid(image.size, texture)
     onto = (1 / w, -1 / h, 0), (left / w + texture.offset[0], 1 - top / h + texture.offset[1], 0)
@@ -314,7 +314,7 @@ def _infrared(nodes: _Nodes, rgb: Any) -> Any:
     return joined.outputs[0]
 
 
-def _image(bpy: Any, texture: Texture, scratch: Path) -> Any:
+def _loaded(bpy: Any, texture: Texture, scratch: Path) -> Any:
     if texture.kind == "image":
         if not Path(texture.image).is_file():
             raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")

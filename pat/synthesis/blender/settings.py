@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ..check import Limits
+from ..check import CheckLimits
 
 Pass = Literal["normals", "flow", "nir", "alpha"]
 
@@ -55,7 +55,7 @@ class RenderSettings:
     passes: tuple[Pass, ...] = ()
     duration: float = 0.0
     optics: dict[str, Optics] = field(default_factory=dict)
-    limits: Limits = field(default_factory=Limits)
+    limits: CheckLimits = field(default_factory=CheckLimits)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> RenderSettings:

@@ -20,7 +20,7 @@ from arraygeom.camera import Camera
 
 from ..scene import Motion, Scene
 from . import compat
-from .build import Spectrum, Stage, build
+from .build import BuiltScene, Spectrum, build
 from .settings import Optics, RenderSettings
 
 NOTHING = 1e9
@@ -41,7 +41,7 @@ class Studio:
         self.camera = self.bpy.data.objects.new("camera", self.bpy.data.cameras.new("camera"))
         self.blender.collection.objects.link(self.camera)
         self.blender.camera = self.camera
-        self.stage: Stage = build(self.bpy, scene, self.blender.world, scratch)
+        self.stage: BuiltScene = build(self.bpy, scene, self.blender.world, scratch)
         self._quality()
 
     def colours(self, camera: Camera, time: float, optics: Optics, spectrum: Spectrum) -> dict[str, Tensor]:

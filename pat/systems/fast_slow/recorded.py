@@ -10,12 +10,14 @@ from torch import Tensor
 from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
 from pat.evaluation.tables import markdown_table
-from pat.fusion.results import Frame, save_frame, save_panels
+from pat.fusion.results import Frame, save_frame
 from pat.fusion.sequence import SequenceFusion, flicker
+from pat.media.colour import luminance_of, srgb_image
+from pat.media.figures import save_panels
 from pat.media.images import read_image
 from pat.media.video import write_video
 from pat.networks.weights import load_weights
-from pat.systems.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array, srgb_encoded
+from pat.systems.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
 from pat.systems.system import SystemResult
 
 FAST_FRAMES, SLOW_FRAMES = range(141, 148), (4, 5)
@@ -58,7 +60,7 @@ def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
     raw = {FAST: [read_image(folder / SCENE / f"{i}.png") for i in FAST_FRAMES]}
     raw |= {name: [read_image(folder / SCENE / f"{name}_{i}.png") for i in SLOW_FRAMES] for name in SLOW}
     gains = {FAST: bright_gain(raw[FAST][0])}
-    return {n: [srgb_encoded(p, gain=gains.get(n, 1.0)) for p in images] for n, images in raw.items()}
+    return {n: [srgb_image(luminance_of(p) * gains.get(n, 1.0)) for p in images] for n, images in raw.items()}
 
 
 def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:

@@ -7,13 +7,11 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
-from arraygeom.distortion import Distortion
+from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, lazily, rotation_from_vector
 from arraygeom.fields import look
 from pat.cli.main import main
 from pat.data import (
-    Patches,
-    RenderedScenes,
+    PatchGrid,
     ScenePatches,
     SceneShuffle,
     agreement,
@@ -23,14 +21,14 @@ from pat.data import (
     scene_folders,
     write_indices,
 )
-from pat.data.patches import cut, reduced_depth, select
-from pat.data.scenes import _bounds
+from pat.data.patches import cut
+from pat.data.windows import reduced_depth, select
 from pat.farm.backends import LayeredSettings
 from pat.media.images import read_image
-from pat.sensors import BoxBlur, Case, Clip, Resample
-from pat.synthesis.check import Limits, look_across
+from pat.sensors import BoxBlur, Clip, DegradationCase, Resample
+from pat.synthesis.check import CheckLimits
 
-SMALL = Patches(hw=(32, 48), grid=(2, 3), reduce=2)
+SMALL = PatchGrid(hw=(32, 48), grid=(2, 3), reduce=2)
 
 
 def make_rig(width: int = 128) -> Rig:
@@ -50,7 +48,7 @@ def make_rig(width: int = 128) -> Rig:
 def rendered(tmp_path_factory):
     """Three layered scenes of patterns; copy what you break."""
     root = tmp_path_factory.mktemp("data")
-    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), CheckLimits())
     for seed in range(3):
         renderer.render(seed, root / "scenes" / f"{seed:06d}")
     return root
@@ -67,15 +65,15 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_the_papers_windows_reach_from_edge_to_edge():
-    corners = Patches().corners((1536, 2048))
-    assert len(corners) == Patches().count == 49
+    corners = PatchGrid().corners((1536, 2048))
+    assert len(corners) == PatchGrid().count == 49
     assert corners[0] == (0, 0)
     assert corners[-1] == (1536 - 128, 2048 - 384)
-    assert Patches.like_the_papers((1536, 2048)) == Patches()
+    assert PatchGrid.like_the_papers((1536, 2048)) == PatchGrid()
     with pytest.raises(ValueError, match="patches of 384x128 do not fit into an image of 300x200"):
-        Patches().corners((200, 300))
+        PatchGrid().corners((200, 300))
     with pytest.raises(ValueError, match="cannot be reduced 3 times"):
-        Patches(reduce=3)
+        PatchGrid(reduce=3)
 
 
 def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(rendered):
@@ -87,34 +85,6 @@ def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(re
         torch.testing.assert_close(select(stack.rig, i)["mono"].project(X).x, wanted)
     assert stack.rgb["mono"].shape == (6, 3, 16, 24)
     assert stack.rgb["colour"].shape[0] == 6
-
-
-def test_depth_and_cameras_of_patches_foretell_the_other_view(rendered):
-    batch = RenderedScenes(rendered, patches=SMALL).sample(12, generator())
-    across = look_across(batch)
-    assert across.visible.float().mean() > 0.6
-    error = (across.image - batch.images[0]).abs().amax(1)[across.visible]
-    assert error.median() < 0.02
-    shifted = batch.images[0].roll(1, -1)
-    assert (across.image - shifted).abs().amax(1)[across.visible].mean() > 1.3 * error.mean()
-
-
-def test_samples_are_seeded_and_mix_scenes(rendered):
-    one, two, other = (RenderedScenes(rendered, patches=SMALL).sample(8, generator(s)) for s in (1, 1, 2))
-    assert torch.equal(one.images[0], two.images[0])
-    assert not torch.equal(one.images[0], other.images[0])
-    assert one.K[0].shape == (8, 3, 3)
-    assert len({round(float(d.max()), 4) for d in one.depth[0]}) > 3
-
-
-def test_training_scenes_are_of_pinholes_and_know_what_is_there(broken):
-    depth = torch.tensor([[[2.0, torch.inf], [torch.nan, 5.0]], [[torch.inf, torch.inf], [3.0, torch.nan]]])
-    assert _bounds(depth).tolist() == [[2, 5], [3, 3]]
-    rig = make_rig()
-    lens = Distortion("brown-conrady", torch.tensor([-0.1, 0.01, 0, 0]).double())
-    rig.with_camera("mono", rig["mono"].replace(distortion=lens)).save(broken / "scenes/000000/rig.yaml")
-    with pytest.raises(ValueError, match="'mono' has a lens model"):
-        RenderedScenes(broken)
 
 
 def test_reduced_depth_is_exact_on_planes_and_takes_sides_at_edges():
@@ -145,15 +115,14 @@ def test_patches_are_recorded_as_responses_say_and_anew_each_epoch(rendered):
         data[18]
 
 
-def test_a_batch_says_where_to_look(rendered):
+def test_segments_of_a_batch_contain_the_true_points(rendered):
     data = ScenePatches(rendered, patches=SMALL)
     loader = DataLoader(data, batch_size=6, sampler=SceneShuffle(data), collate_fn=collate)
     batch = next(iter(loader))
     assert batch.images["mono"].shape == (6, 1, 16, 24)
     pair = batch.rig.pair("mono", "colour")
-    (where,) = batch.looks(Epipolar())
     X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
-    found = where.at(torch.tensor([[12.0, 8.0]]))
+    found = lazily(Epipolar(), pair)(torch.tensor([[12.0, 8.0]]))
     seen = pair.cameras[1].project(X).x[:, 0].float()
     inside = found.valid[:, 0] & pair.beta.contains(seen)
     along = found.fraction(seen[:, None])[:, 0]
@@ -174,7 +143,7 @@ def test_the_rig_follows_the_chains(rendered):
 
 
 def test_cases_degrade_alpha_or_the_betas(rendered):
-    cases = (Case("alpha", alpha=(BoxBlur(5),)), Case("beta", beta=(BoxBlur(5),)))
+    cases = (DegradationCase("alpha", alpha=(BoxBlur(5),)), DegradationCase("beta", beta=(BoxBlur(5),)))
     data = ScenePatches(rendered, patches=SMALL, chains={}, cases=cases)
     plain = ScenePatches(rendered, patches=SMALL, chains={})
     changed = [
@@ -213,7 +182,7 @@ def test_scenes_that_cannot_be_read_are_told(broken):
 
 def test_images_of_changing_size_are_told(broken):
     shutil.rmtree(broken / "scenes/000002")
-    LayeredSettings(oversampling=1).renderer(make_rig(160), Limits()).render(2, broken / "scenes/000002")
+    LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits()).render(2, broken / "scenes/000002")
     with pytest.raises(
         ValueError, match=r"000002: has images of other sizes than the first \(mono 160x96, .*mono 128x96"
     ):

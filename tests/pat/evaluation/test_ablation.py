@@ -21,10 +21,10 @@ from pat.evaluation.ablation import (
 )
 from pat.evaluation.baseline import classical
 from pat.evaluation.metrics import score
+from pat.media.colour import linear_from_srgb
 from pat.media.images import read_image
 from pat.networks.paper import PAT, PATConfig
 from pat.networks.weights import load_weights
-from pat.sensors import Linear, record
 from pat.synthesis.rendered import RenderedFrame, save_frame
 
 CHOSEN = ("calibrated", "rectified assumption", "rotated by 1 deg", "centre off by 10 px", "local 5x5", "dense")
@@ -117,7 +117,7 @@ def test_rendered_folders(tmp_path, case):
     case.rig.save(folder / "rig.yaml")
     images = {ALPHA: case.ground_truth, BETA: case.images[BETA]}
     for name, image in images.items():
-        linear = record(image[None], [Linear()], torch.Generator()).image[0]
+        linear = linear_from_srgb(image)
         index = torch.ones(image.shape[1:], dtype=torch.long)
         save_frame(folder / f"{name}.npz", RenderedFrame(time=0.0, rgb=linear, depth=case.depth, index=index))
     frames = {name: [{"file": f"{name}.npz", "time": 0.0}] for name in images}

@@ -163,7 +163,7 @@ def test_groups_must_be_shared_evenly():
 
 def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "nan")
-    ordinary = loop.Source.sample
+    ordinary = loop.SampleSource.sample
 
     def poisoned(self, planned, step, group):
         given = ordinary(self, planned, step, group)
@@ -171,7 +171,7 @@ def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatc
             given.ground_truth[1, :, 5, 5] = torch.nan
         return given
 
-    monkeypatch.setattr(loop.Source, "sample", poisoned)
+    monkeypatch.setattr(loop.SampleSource, "sample", poisoned)
     with pytest.raises(FloatingPointError, match=r"step 5: .*, by sample 1 of group 1; "):
         train(config)
     (file,) = config.out.glob("offending-*")

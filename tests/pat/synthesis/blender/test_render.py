@@ -21,7 +21,7 @@ from pat.synthesis.boards import inner_corners
 from pat.synthesis.generators import abstract, board, photographs
 from pat.synthesis.image_files import export
 from pat.synthesis.rendered import is_rendered
-from pat.synthesis.scene import Board, Key, Light, Material, Motion, Object, Paint, Scene, Texture
+from pat.synthesis.scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture
 from pat.synthesis.shapes import inside
 from pat.synthesis.sheets import infrared_sheet, video
 from tests.pat.synthesis.scenes import posed, room_scene, unlike_cameras
@@ -267,7 +267,7 @@ def test_images_in_every_format(worker, tmp_path):
 @pytest.mark.slow
 def test_a_rendered_board_has_its_corners_where_it_should(worker, tmp_path):
     """OpenCV refines the corners of a chessboard to where arraygeom projects them."""
-    spec = Board(kind="chessboard", squares=(7, 5), square=0.3, margin=0.1)
+    spec = BoardObject(kind="chessboard", squares=(7, 5), square=0.3, margin=0.1)
     pose = Pose(posed((20, -15, 5)).R, torch.tensor([-1.0, -0.6, 3.5], dtype=torch.float64))
     rig = Rig({n: unlike_cameras(192)[n] for n in ("oblong", "bent")})
     done = worker.render(board([pose], spec), rig, tmp_path / "x", settings=replaced(CLEAN, samples=32))
