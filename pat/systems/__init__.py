@@ -1,4 +1,4 @@
-"""The paper's four demonstrations, each a folder: the poses of its cameras (`rig.yaml`), how they record, and the expected figures.
+"""The paper's four demonstrations, each a folder: the rig (`rig.yaml`), how it records, and the expected figures.
 
 `pat systems list` names them, `pat systems run NAME` renders a scene for the rig, records it, fuses it and compares
 with the ground truth.

@@ -28,7 +28,7 @@ BAND = 4_000_000
 class SystemScene(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
-    Textures are the images of a folder, or patterns and the images that scikit-image ships. The seed determines all of it.
+    Textures are the images of a folder, or patterns and the images that scikit-image ships; `seed` determines all.
     """
 
     def __init__(

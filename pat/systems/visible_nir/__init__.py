@@ -1,8 +1,8 @@
 """Visible - near infrared: alpha sees 800 to 1000 nm, beta colours; the same materials differ in each.
 
-The weights were not trained on near infrared. Here each surface has a near-infrared reflectance of its own: the farthest (the
-sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes the visible
-image alone. The ground truth is alpha's brightness with the colour differences that beta's colours have at alpha's view.
+The weights were not trained on near infrared. Here each surface has a near-infrared reflectance of its own: the
+farthest (the sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes
+the visible image alone. The ground truth is alpha's brightness with the colour differences of beta at alpha's view.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The four arrays: their rigs are the paper's, recordings are as a user's files would be, fusion improves on alpha alone."""
+"""The four arrays: rigs are the paper's, recordings are files as cameras write them, fusion improves on alpha."""
 
 import math
 import re
