@@ -99,6 +99,7 @@ def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
     return ends_of(Segments(field.pixels.start[some], field.pixels.end[some], field.pixels.valid[some]))
 
 
+@runtime_checkable
 class State(Protocol):
     """What a network has found out about whole images before parts of them are fused; opaque to the fusion."""
 
