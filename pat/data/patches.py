@@ -26,7 +26,7 @@ PAPER_WIDTH = 2048
 
 @dataclass(frozen=True, kw_only=True)
 class PatchGrid:
-    """`grid` rows and columns of windows of height and width `hw`, spread evenly, reduced `reduce` times."""
+    """`grid` rows and columns of windows of height and width `hw`, evenly spaced, reduced `reduce` times."""
 
     hw: HW = (128, 384)
     grid: tuple[int, int] = (7, 7)
@@ -59,11 +59,11 @@ class PatchGrid:
             raise ValueError(
                 f"patches of {self.hw[1]}x{self.hw[0]} do not fit into an image of {hw[1]}x{hw[0]}: give smaller ones"
             )
-        tops, lefts = (_spread(whole - part, n) for whole, part, n in zip(hw, self.hw, self.grid))
+        tops, lefts = (_evenly(whole - part, n) for whole, part, n in zip(hw, self.hw, self.grid))
         return [(top, left) for top in tops for left in lefts]
 
 
-def _spread(room: int, count: int) -> list[int]:
+def _evenly(room: int, count: int) -> list[int]:
     return [round(room * (i + 0.5) / count) if count == 1 else round(room * i / (count - 1)) for i in range(count)]
 
 

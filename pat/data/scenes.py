@@ -144,14 +144,14 @@ class SceneStacks:
 class SceneShuffle(Sampler[int]):
     """A random order that reads each scene once: `mixed` scenes at a time, their patches shuffled together."""
 
-    def __init__(self, data: ScenePatches, *, mixed: int = 16, seed: int = 0):
-        self.data, self.mixed, self.seed = data, mixed, seed
+    def __init__(self, data: ScenePatches, *, mixed: int = 16):
+        self.data, self.mixed = data, mixed
 
     def __len__(self) -> int:
         return len(self.data)
 
     def __iter__(self) -> Iterator[int]:
-        g = generator_for(self.seed, "order", self.data.epoch)
+        g = generator_for(self.data.seed, "order", self.data.epoch)
         count = self.data.scenes.patches.count
         for scenes in torch.randperm(len(self.data.scenes), generator=g).split(self.mixed):
             patches = (scenes[:, None] * count + torch.arange(count)).flatten()

@@ -17,9 +17,7 @@ from ..data.pairs import (
     PAPER_DISPARITY,
     Disparity,
     StereoPair,
-    flickr_pairs,
     folder_pairs,
-    kitti_pairs,
     middlebury_pairs,
 )
 from ..media.images import write_image
@@ -30,9 +28,9 @@ from .tables import markdown_table
 T = TypeVar("T")
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
-    "kitti": kitti_pairs,
+    "kitti": folder_pairs,
     "middlebury": middlebury_pairs,
-    "flickr1024": flickr_pairs,
+    "flickr1024": folder_pairs,
     "folder": folder_pairs,
 }
 """Readers of the folders, by data set."""

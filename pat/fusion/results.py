@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jaxtyping import Float
+from torch import Tensor
 
 from arraygeom import Rig
 

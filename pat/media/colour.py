@@ -1,4 +1,4 @@
-"""Luminance, chroma and the sRGB transfer function: the one place for each."""
+"""Luminance, chroma and the sRGB transfer function: one definition of each."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light of sRGB-encoded values (IEC 61966-2-1); the straight part of the curve continues below zero."""
+    """Linear light of sRGB-encoded values (IEC 61966-2-1); the linear part of the curve continues below zero."""
     toe = values <= 0.04045
     return torch.where(toe, values / 12.92, ((torch.where(toe, 0.5, values) + 0.055) / 1.055) ** 2.4)
 

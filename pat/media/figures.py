@@ -11,6 +11,7 @@ from jaxtyping import Float
 from matplotlib import colormaps
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 

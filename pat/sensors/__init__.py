@@ -1,4 +1,4 @@
-"""The forward model: what becomes of an ideal image until a camera has recorded it.
+"""The forward model: how a camera records an ideal image.
 
 A chain is a list of steps, applied in order to images (B, C, H, W) with values 0..1 on any device. Light adds up
 in linear values only, so a chain for ordinary images begins with `DecodeSRGB()` and ends with `EncodeSRGB()`:
@@ -6,7 +6,7 @@ in linear values only, so a chain for ordinary images begins with `DecodeSRGB()`
     [DecodeSRGB(), Spectral("luminance"), DiscBlur(1.5), Noise(2000, 5), Clip(), EncodeSRGB(), Quantise(8)]
 
 Steps with randomness draw it from the generator given to `record`, separately for each image of the batch.
-Steps that change the pixel grid say how through `pixel_matrix`; K' = A K with the A that `record` returns, and
+Steps that change the pixel grid define `pixel_matrix`; K' = A K with the A that `record` returns, and
 `record_array` composes it into the rig.
 """
 

@@ -37,17 +37,14 @@ class Resample(Step):
             raise ValueError(f"resample: give a positive factor or a (height, width), got {self.to}")
 
     def hw(self, hw: HW) -> HW:
-        """The size that comes out for a size that goes in."""
         if isinstance(self.to, tuple):
             return self.to
         return max(round(hw[0] * self.to), 1), max(round(hw[1] * self.to), 1)
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """The resize matrix."""
         return resize_matrix(hw, self.hw(hw))
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
-        """The resized images."""
         h, w = image.shape[-2:]
         new = self.hw((h, w))
         if self.method == "bicubic":
@@ -72,7 +69,6 @@ class Crop(Step):
     hw: HW
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """The shift."""
         return shift_matrix(self.left, self.top)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:

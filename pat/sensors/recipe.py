@@ -58,11 +58,11 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
     return {str(name): read_chain(steps, f"{where}.{name}") for name, steps in value.items()}
 
 
-def read_cases(value: Any, where: str = "cases") -> tuple[DegradationCase, ...]:
+def read_cases(value: Any) -> tuple[DegradationCase, ...]:
     """Cases for pairs, from a list of mappings with `name` and, if degraded, `alpha` and `beta`."""
     if not isinstance(value, list) or not value:
-        raise ValueError(f"{where}: wanted a list of cases, such as [{{name: blur beta, beta: [{{box-blur: 5}}]}}]")
-    return tuple(_case(entry, f"{where}[{i}]") for i, entry in enumerate(value))
+        raise ValueError("cases: wanted a list of cases, such as [{name: blur beta, beta: [{box-blur: 5}]}]")
+    return tuple(_case(entry, f"cases[{i}]") for i, entry in enumerate(value))
 
 
 def _case(entry: Any, where: str) -> DegradationCase:

@@ -28,7 +28,7 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """The paper's scenes: 10 to 20 shapes with patterns in a room, within the depths of the rig.
 
-    With `moving` seconds, objects move, turn and stretch along random paths for so long. The same seed and rig
+    With `moving` seconds, objects move, rotate and stretch along random paths for so long. The same seed and rig
     give the same scene. Raises ValueError if the rig has no calibrated camera.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
@@ -109,12 +109,12 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
 
 
 def _paints(rng: Generator) -> tuple[Paint, ...]:
-    """Two to four paints, by turns lighter and darker, of hues near each other or not."""
-    hue, spread, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
+    """Two to four paints, alternately lighter and darker, of similar hues or not."""
+    hue, width, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
     paints = []
     for i in range(int(rng.integers(2, 5))):
         value = rng.uniform(0.25, 0.5) if (i + dark_first) % 2 else rng.uniform(0.6, 0.95)
-        encoded = colorsys.hsv_to_rgb((hue + rng.uniform(-spread, spread)) % 1, rng.uniform(0.1, 0.9), value)
+        encoded = colorsys.hsv_to_rgb((hue + rng.uniform(-width, width)) % 1, rng.uniform(0.1, 0.9), value)
         r, g, b = linear_from_srgb(torch.tensor(encoded, dtype=torch.float64)).tolist()
         paints.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
     return tuple(paints)
@@ -140,7 +140,7 @@ def _images(folder: Path) -> tuple[str, ...]:
 
 
 def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:
-    """One of the images, and if it can be helped none that is black in large parts."""
+    """One of the images, preferably none that is black in large parts."""
     drawn = [str(rng.choice(files)) for _ in range(8)]
     return next((file for file in drawn if _blackness(file) < 0.3), drawn[0])
 
@@ -163,7 +163,7 @@ def _board_key(pose: Pose, middle: NDArray, extent: Vec3, time: float) -> Key:
 
 
 def _board_pose(setting: Setting, spec: BoardObject) -> Pose:
-    """The board faces the cameras' middle, turned and tilted; its middle is where every camera can see."""
+    """The board faces the cameras' middle, rotated and tilted; its middle is visible to every camera."""
     rng = setting.rng
     narrow = max(float((c.K[:2, :2].abs().amax(1) / torch.tensor([c.hw[1], c.hw[0]])).max()) for c in setting.cameras)
     for _ in range(200):

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ..media.colour import REC709, luminance, srgb_image
 from ..media.images import write_image
+from ..media.video import write_video
 from .rendered import Rendered, RenderedFrame
 
 Channels = Literal["bw", "rgb", "rgba", "nir"]
@@ -20,10 +21,10 @@ _SUFFIX = {"png8": ".png", "png16": ".png", "jpeg": ".jpg", "exr": ".exr"}
 
 
 def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels: Channels = "rgb") -> list[Path]:
-    """Write all frames of a rendered folder as images named like its arrays; the paths written.
+    """Write all frames of a rendered folder as images named like its arrays; returns the paths.
 
-    PNG and JPEG are sRGB and cut at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without the
-    pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
+    PNG and JPEG are sRGB and clipped at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without
+    the pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
     """
     written = []
     for name in rendered.rig.names:
@@ -32,6 +33,15 @@ def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels
             write_light(path, light(rendered.frame(name, number), channels), bits=16 if kind == "png16" else 8)
             written.append(path)
     return written
+
+
+def export_video(rendered: Rendered, camera: str, path: Path) -> None:
+    """The frames of a camera as a video (.mp4, .mkv), at its frame rate. Raises ValueError if there is only one."""
+    count = rendered.frames(camera)
+    if count < 2:
+        raise ValueError(f"camera '{camera}' has one frame: render with a duration")
+    frames = (srgb_image(rendered.frame(camera, k).rgb) for k in range(count))
+    write_video(path, frames, rate=rendered.rig[camera].sensor.frame_rate or 30.0)
 
 
 def light(frame: RenderedFrame, channels: Channels) -> Float[Tensor, "c h w"]:

@@ -1,4 +1,4 @@
-"""Textures that photographs lack: smooth shades, repeated patterns, and colour that luminance does not tell."""
+"""Textures that photographs lack: smooth shades, repeated patterns, and colour that is independent of luminance."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _LUMINANCE = np.array(REC601, np.float32)
 
 
 def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """`count` textures (256, 256, 3) uint8, in turn gradients, stripes, tiles, dots and noise."""
+    """`count` textures (256, 256, 3) uint8, alternating gradients, stripes, tiles, dots and noise."""
     makers = (_gradient, _stripes, _tiles, _dots, _cloud)
     return [to_bytes(makers[i % len(makers)](rng)) for i in range(count)]
 
@@ -20,7 +20,7 @@ def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
 def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
     """Textures with the luminance of one image and the chroma of another, or smooth, or without one of them.
 
-    What a network could learn of colour from luminance in photographs does not hold here.
+    The correlation of colour and luminance of photographs does not hold here.
     """
     return [to_bytes(_mixed(images, rng)) for _ in range(count)]
 

@@ -17,9 +17,17 @@ from torch import Generator, Tensor
 
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig
-from pat.data.windows import RenderedView, pinhole_of, read_view, scene_folders, scene_rig, undistorted, window
+from pat.data.windows import (
+    RenderedView,
+    pinhole_of,
+    read_view,
+    scene_folders,
+    scene_rig,
+    stack_cameras,
+    undistorted,
+    window,
+)
 from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
@@ -190,11 +198,17 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
-    relative = [[v.camera.cam_from_world @ one[0].camera.cam_from_world.inverse() for v in one] for one in drawn]
-    poses = [Pose(torch.stack([p.R for p in same]), torch.stack([p.t for p in same])) for same in zip(*relative)]
-    K = [torch.stack([v.camera.K for v in same]).to(device, torch.float32) for same in views]
-    R, t = ([getattr(p, part).to(device, torch.float32) for p in poses] for part in ("R", "t"))
-    return ArrayBatch(images, depth, K, R, t, [same[0].camera.hw for same in views], bounds(depth[0]))
+    alpha_from_world = [one[0].camera.cam_from_world for one in drawn]
+    cameras = [
+        stack_cameras(
+            [
+                v.camera.replace(cam_from_world=v.camera.cam_from_world @ a.inverse())
+                for v, a in zip(same, alpha_from_world)
+            ]
+        ).to(device, torch.float32)
+        for same in views
+    ]
+    return ArrayBatch(images, depth, cameras, bounds(depth[0]))
 
 
 def one_of(items: Sequence[T], g: Generator) -> T:

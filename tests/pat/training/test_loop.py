@@ -177,7 +177,7 @@ def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatc
     (file,) = config.out.glob("offending-*")
     assert file.name == "offending-step-5-group-1.safetensors"
     with safe_open(file, "pt") as kept:
-        assert kept.get_tensor("truth")[1].isnan().any()
+        assert kept.get_tensor("ground_truth")[1].isnan().any()
         assert kept.get_tensor("betas/0").isfinite().all()
         assert kept.metadata()["samples"] == "[1]"
     assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3

@@ -32,7 +32,7 @@ from pat.training.config import RecordingConfig, TrainConfig, parse_config
 from pat.training.lenses import lens_over, one_camera, through_lenses
 from pat.training.loop import new_network
 from pat.training.losses import explained, match_loss, validation
-from pat.training.samples import degraded, pair_of, plan, scenes, truth_in
+from pat.training.samples import degraded, pair_of, plan, scenes, transfer
 from pat.training.scenes import ACTIVE, GROUPS_PER_EXCHANGE, SKY, RenderedCrops, active_items, batched, finite_window
 from pat.training.stereo import PairCrops
 from pat.training.train import save_config, train
@@ -199,14 +199,14 @@ def test_any_camera_is_alpha_and_betas_are_others(rendered):
     crops = RenderedCrops([rendered], hw=(32, 48), resolutions=(0.5,))
     focal = {float(c.K[0, 0]) / times for c in make_rig().cameras.values() for times in (1, 2)}
     batches = [crops.sample(3, generator(number), number=number, betas=3) for number in range(12)]
-    drawn = torch.cat([b.K[0][:, 0, 0] for b in batches])
+    drawn = torch.cat([b.cameras[0].K[:, 0, 0] for b in batches])
     assert set(drawn.tolist()) == focal
     for batch in batches:
         assert [tuple(image.shape) for image in batch.images] == [(3, 3, 32, 48), *[(3, 3, 16, 24)] * 3]
-        assert (batch.K[1][:, 0, 0] / batch.K[0][:, 0, 0]).sub(0.5).abs().max() < 0.03
-        assert torch.equal(batch.t[1], batch.t[3])
-        assert not torch.equal(batch.t[1], batch.t[2])
-        assert (batch.t[1].norm(dim=1) > 0.05).all()
+        assert (batch.cameras[1].K[:, 0, 0] / batch.cameras[0].K[:, 0, 0]).sub(0.5).abs().max() < 0.03
+        assert torch.equal(batch.cameras[1].t, batch.cameras[3].t)
+        assert not torch.equal(batch.cameras[1].t, batch.cameras[2].t)
+        assert (batch.cameras[1].t.norm(dim=1) > 0.05).all()
 
 
 def test_samples_of_scenes_depend_on_their_number_alone(rendered):
@@ -214,7 +214,10 @@ def test_samples_of_scenes_depend_on_their_number_alone(rendered):
     for number in range(3):
         used.sample(2, generator(number), number=number)
     one, other = (crops.sample(2, generator(9), number=7) for crops in (used, fresh))
-    assert all(torch.equal(a, b) for a, b in zip(one.images + one.depth + one.K, other.images + other.depth + other.K))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(one.images + one.depth + [one.cameras[0].K], other.images + other.depth + [other.cameras[0].K])
+    )
 
 
 def test_the_sky_is_seen_by_both_at_infinity():
@@ -227,7 +230,7 @@ def test_the_sky_is_seen_by_both_at_infinity():
     views = [finite_window(RenderedView(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras]
     batch = batched([views], "cpu")
     assert batch.depth_range.max() <= SKY
-    position, visible = truth_in(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
+    position, visible = transfer(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
     x = K @ turn @ torch.linalg.inv(K) @ torch.tensor([20.0, 12.0, 1.0]).double()
     torch.testing.assert_close(position[0, 12, 20].double(), (x / x[2])[:2], atol=1e-3, rtol=0)
     assert visible[0, 12, 20]
@@ -274,11 +277,11 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         batch = crops.sample(3, generator(number), number=number)
         given = degraded(batch, generator(), recording=EXACT)
         assert (given.position, given.visible, batch.depth) == ([], [], [])
-        near, baseline = batch.depth_range[:, 0], batch.t[1][:, 0]
+        near, baseline = batch.depth_range[:, 0], batch.cameras[1].t[:, 0]
         sides |= set(baseline.sign().tolist())
         reductions |= set((120 / (48 / near)).round().int().tolist())
         depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
-        where, _ = truth_in(pair_of(batch, 1, generator()), depth, depth)
+        where, _ = transfer(pair_of(batch, 1, generator()), depth, depth)
         found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(2, (32, 48))
         assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
