@@ -47,7 +47,7 @@ from arraygeom.pixels import HW
 from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
-from ..fusion.steps import pitch_ratio
+from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance, srgb_image
 from ..media.figures import save_figure
 from ..networks.guided import GuidedPAT
@@ -152,8 +152,8 @@ def families() -> dict[str, FieldFamily]:
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
     """The largest displacement of a point from H x, pixels of beta as the network gets it."""
-    scale = pitch_ratio(pair)
-    resized = network.equal_pitch and not 0.8 < scale < 1.25
+    scale = resolution_ratio(pair)
+    resized = network.equal_resolution and not 0.8 < scale < 1.25
     return max(float(covering_displacement(pair)) / (scale if resized else 1.0), 1.0)
 
 

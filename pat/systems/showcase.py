@@ -25,7 +25,7 @@ from ..evaluation.protocols import BASELINES, rectified_fusion
 from ..evaluation.stereo import StereoRow, evaluate_sets, markdown, sets_markdown, structure_kept
 from ..evaluation.tables import markdown_table
 from ..fusion.fuse import fuse
-from ..fusion.steps import normalised, pitch_ratio
+from ..fusion.steps import normalised, resolution_ratio
 from ..media.colour import luminance_of, srgb_image
 from ..media.figures import colour_depth, save_panels
 from ..media.images import read_image
@@ -133,7 +133,7 @@ class FastSlowArray(NamedTuple):
     def displacement(self) -> float:
         """Largest displacement along the lines, in alpha's pixels, to which `fuse` resizes betas."""
         pairs = {name: self.rig.pair(FAST, name) for name in self.fits}
-        return 1.25 * max(fit.displacement / pitch_ratio(pairs[name]) for name, fit in self.fits.items())
+        return 1.25 * max(fit.displacement / resolution_ratio(pairs[name]) for name, fit in self.fits.items())
 
 
 def _fast_and_slow(network: FusionNetwork, array: FastSlowArray, out: Path) -> str:

@@ -10,7 +10,7 @@ import pat.systems.stage
 from arraygeom import Rig
 from pat.cli.main import main
 from pat.fusion.results import Frame
-from pat.fusion.steps import pitch_ratio
+from pat.fusion.steps import resolution_ratio
 from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb, srgb_from_linear
 from pat.media.images import read_image
@@ -28,7 +28,7 @@ def angle(focal: float, pixels: int) -> float:
 def test_the_arrays_are_the_papers():
     wide, nir, exposures, fast = (load_system(name).rig for name in NAMES)
     assert [c.hw for c in wide.cameras.values()] == [(3036, 4024), (3684, 4912)]
-    assert 9 < 1 / pitch_ratio(wide.pair("narrow", "wide")) ** 2 < 13
+    assert 9 < 1 / resolution_ratio(wide.pair("narrow", "wide")) ** 2 < 13
     assert angle(float(wide["wide"].K[0, 0]), 4912) > 3 * angle(float(wide["narrow"].K[0, 0]), 4024)
     assert {c.hw for c in nir.cameras.values()} == {(2048, 2048)}
     assert [round(c.sensor.exposure / 12e-6) for c in exposures.cameras.values()] == [150, 500, 300, 800]
