@@ -12,13 +12,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 from zlib import crc32
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.figure import Figure
 from rich.progress import track
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d
@@ -49,7 +48,7 @@ from arraygeom.segments import clip_to_image
 from ..fusion.fuse import fuse
 from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance, srgb_image
-from ..media.figures import save_figure
+from ..media.figures import save_panels
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from ..sensors import Clip, Noise, Quantise, record
@@ -223,15 +222,14 @@ def ablate(
 ) -> list[AblationRow]:
     """Every family on every case; ablation.md, ablation.csv and ablation.png (crops of some cases) go to `out`."""
     rows: list[AblationRow] = []
-    crops: list[Any] = []
-    for case in track(cases, "ablating", disable=not sys.stderr.isatty()):
+    panels: dict[str, Tensor] = {}
+    for i, case in enumerate(track(cases, "ablating", disable=not sys.stderr.isatty())):
         found, images = _case(network, case, chosen or families())
         rows += found
-        if len(crops) < SHOWN:
-            crops.append((case, images, {row.family: row.psnr for row in found}))
+        panels |= _crops(case, images, found) if i < SHOWN else {}
     write_text(out / "ablation.md", markdown(rows))
     write_csv(out / "ablation.csv", AblationRow._fields, rows)
-    save_figure(figure(crops), out / "ablation.png", dpi=80)
+    save_panels(panels, out / "ablation.png", columns=1 + len({row.family for row in rows}))
     return rows
 
 
@@ -319,23 +317,14 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
     return [*image, *means, *off, note]
 
 
-def figure(shown: Sequence[tuple[AblationCase, Mapping[str, Tensor], Mapping[str, float]]]) -> Figure:
-    """A row of crops for each case, where calibrated and rectified differ most; PSNR of the whole image above."""
-    names = list(dict.fromkeys(name for _, images, _ in shown for name in images))
-    columns = ["ground truth", *names]
-    drawn = Figure(figsize=(2.2 * len(columns), 2.6 * len(shown)), layout="constrained")
-    for i, (case, images, psnr) in enumerate(shown):
-        window = _most_different(images, case.ground_truth)
-        for j, name in enumerate(columns):
-            axes = drawn.add_subplot(len(shown), len(columns), i * len(columns) + j + 1)
-            axes.set_axis_off()
-            caption, image = f"{psnr.get(name, math.nan):.1f} dB", images.get(name)
-            if name == "ground truth":
-                caption, image = f"focal ratio {case.ratio:.1f}", case.ground_truth
-            axes.set_title(f"{name}\n{caption}", fontsize=9)
-            if image is not None:
-                axes.imshow(image[(slice(None), *window)].clamp(0, 1).movedim(0, -1).numpy())
-    return drawn
+def _crops(case: AblationCase, images: Mapping[str, Tensor], rows: Sequence[AblationRow]) -> dict[str, Tensor]:
+    """Crops by title, where calibrated and rectified differ most; the PSNR is that of the whole image."""
+    window = (slice(None), *_most_different(images, case.ground_truth))
+    panels = {f"{case.name}: ground truth\nfocal ratio {case.ratio:.1f}": case.ground_truth[window]}
+    for row in rows:
+        image = images.get(row.family, torch.zeros_like(case.ground_truth))
+        panels[f"{case.name}: {row.family}\n{row.psnr:.1f} dB"] = image[window]
+    return panels
 
 
 def _most_different(images: Mapping[str, Tensor], ground_truth: Tensor) -> tuple[slice, slice]:

@@ -6,7 +6,7 @@ import html
 import math
 import socket
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import panel as pn
@@ -194,7 +194,7 @@ class Controls:
 
     def _sliders_of(self, name: str) -> list[Any]:
         kind = name.rpartition(".")[2]
-        scale, parts, disparity, step, unit = UNITS[kind]
+        scale, parts, extent, step, unit = UNITS[kind]
 
         def changed(index: int, shown: float) -> None:
             self.changes[name][index] = shown / scale
@@ -203,7 +203,7 @@ class Controls:
         return [
             slider(
                 f"{name} {parts[i] if parts else i} ({unit})" if unit else f"{name} {i}",
-                (-disparity, disparity, step),
+                (-extent, extent, step),
                 0.0,
                 lambda value, i=i: changed(i, value),
             )
@@ -211,19 +211,17 @@ class Controls:
         ]
 
 
-class BetaSources(tuple):
-    """Segment, samples and match of one beta, as Bokeh's data sources."""
+class BetaSources(NamedTuple):
+    """Bokeh's data sources of one beta; the samples have depth and weight."""
 
-    @property
-    def samples(self) -> ColumnDataSource:
-        """The samples, with depth and weight."""
-        return self[1]
+    segment: ColumnDataSource
+    samples: ColumnDataSource
+    match: ColumnDataSource
 
 
 def beta_sources(name: str) -> BetaSources:
     """Empty ones, named so that a page's script can find them."""
-    kinds = ("segment", "samples", "match")
-    return BetaSources(ColumnDataSource(d, name=f"{k}:{name}") for k, d in zip(kinds, beta_data(None)))
+    return BetaSources(*(ColumnDataSource(d, name=f"{k}:{name}") for k, d in zip(BetaSources._fields, beta_data(None))))
 
 
 def beta_data(report: BetaReport | None) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
