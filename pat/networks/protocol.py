@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -37,6 +38,11 @@ class Inputs:
     betas: tuple[Beta, ...]
     multiple: int = 1
     beta_halo: int = 0
+
+    @classmethod
+    def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
+        """Alpha with each beta's image and field, in order."""
+        return cls(alpha, tuple(Beta(image, field) for image, field in zip(images, fields, strict=True)))
 
     @property
     def hw(self) -> HW:

@@ -99,7 +99,7 @@ class Material:
     emission: float = 0.0
 
 
-class Placement(NamedTuple):
+class ObjectPose(NamedTuple):
     """X_world = R diag(extent) X_object + position, for a shape that fills [-0.5, 0.5]^3."""
 
     R: Float[NDArray, "3 3"]
@@ -141,13 +141,13 @@ class Motion:
         """Whether nothing ever changes."""
         return all(replace(k, time=0.0) == replace(self.keys[0], time=0.0) for k in self.keys)
 
-    def at(self, time: float) -> Placement:
+    def at(self, time: float) -> ObjectPose:
         """Where the object is at a time in seconds."""
         a, b, fraction = self._between(time)
         start = Rotation.from_rotvec(a.rotation)
         rotation = (Rotation.from_rotvec(b.rotation) * start.inv()).as_rotvec()
         R = (Rotation.from_rotvec(fraction * rotation) * start).as_matrix()
-        return Placement(R, _mix(a.position, b.position, fraction), _mix(a.extent, b.extent, fraction))
+        return ObjectPose(R, _mix(a.position, b.position, fraction), _mix(a.extent, b.extent, fraction))
 
     def _between(self, time: float) -> tuple[Key, Key, float]:
         after = next((i for i, k in enumerate(self.keys) if k.time > time), len(self.keys))

@@ -1,4 +1,4 @@
-"""Patches of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
+"""Patches of rendered scenes: their rigs predict what they show, and errors name the folder."""
 
 import shutil
 
@@ -9,7 +9,6 @@ from torch.utils.data import DataLoader
 
 from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, lazily, rotation_from_vector
 from arraygeom.fields import look
-from pat.cli.main import main
 from pat.data import (
     PatchGrid,
     ScenePatches,
@@ -121,6 +120,10 @@ def test_segments_of_a_batch_contain_the_true_points(rendered):
     batch = next(iter(loader))
     assert batch.images["mono"].shape == (6, 1, 16, 24)
     pair = batch.rig.pair("mono", "colour")
+<<<<<<< HEAD
+=======
+    (where,) = batch.on_grid(Epipolar())
+>>>>>>> main
     X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
     found = lazily(Epipolar(), pair)(torch.tensor([[12.0, 8.0]]))
     seen = pair.cameras[1].project(X).x[:, 0].float()
@@ -160,7 +163,7 @@ def test_shuffling_takes_every_patch_once_and_few_scenes_at_a_time(rendered):
     assert order != sorted(order)
 
 
-def test_folders_without_whole_scenes_are_told(broken, tmp_path):
+def test_folders_without_whole_scenes_are_reported(broken, tmp_path):
     with pytest.raises(FileNotFoundError, match="no such folder"):
         scene_folders(tmp_path / "none")
     (tmp_path / "empty").mkdir()
@@ -171,7 +174,7 @@ def test_folders_without_whole_scenes_are_told(broken, tmp_path):
         ScenePatches(broken)
 
 
-def test_scenes_that_cannot_be_read_are_told(broken):
+def test_scenes_that_cannot_be_read_are_reported(broken):
     file = broken / "scenes/000001/colour-0000.npz"
     file.write_bytes(file.read_bytes()[:500])
     data = ScenePatches(broken, patches=SMALL)
@@ -180,7 +183,7 @@ def test_scenes_that_cannot_be_read_are_told(broken):
         data[6]
 
 
-def test_images_of_changing_size_are_told(broken):
+def test_images_of_changing_size_are_reported(broken):
     shutil.rmtree(broken / "scenes/000002")
     LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits()).render(2, broken / "scenes/000002")
     with pytest.raises(
@@ -189,7 +192,7 @@ def test_images_of_changing_size_are_told(broken):
         ScenePatches(broken, patches=SMALL)[12]
 
 
-def test_names_that_the_rig_lacks_are_told(rendered):
+def test_names_that_the_rig_lacks_are_reported(rendered):
     with pytest.raises(ValueError, match="no camera 'mno'; did you mean 'mono'"):
         ScenePatches(rendered, alpha="mno")
     with pytest.raises(ValueError, match="no camera 'color'; did you mean 'colour'"):
@@ -197,6 +200,8 @@ def test_names_that_the_rig_lacks_are_told(rendered):
 
 
 def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
+    from pat.cli.main import main
+
     sensors = tmp_path / "sensors.yaml"
     sensors.write_text("mono: [{spectral: luminance}, clip, coded]\ncolour: [{box-blur: 3}, clip, coded]\n")
     main(["data", "show", str(rendered), "--out", str(tmp_path / "x.png"), "--samples", "2", "--sensors", str(sensors)])
@@ -223,7 +228,7 @@ def test_index_files_give_back_what_was_written(tmp_path):
     assert index_files(tmp_path, "moved") == tuple(moved)
 
 
-def test_index_files_that_are_not_as_documented_are_told(tmp_path):
+def test_index_files_that_are_not_as_documented_are_reported(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"xxs_a\.npy: no such index file"):
         read_indices(tmp_path, "a", (2, 3))
     np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4), np.int16))

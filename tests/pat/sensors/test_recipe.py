@@ -12,6 +12,7 @@ from pat.sensors import (
     Defocus,
     DegradationCase,
     Demosaic,
+    EncodeSRGB,
     Noise,
     Quantise,
     Resample,
@@ -39,6 +40,10 @@ blue:
   - demosaic: {pattern: BGGR, method: edge-aware}
   - spectral: {response: {wavelength: [400, 500], response: [1, 1]}}
 """
+
+
+def test_former_names_of_the_srgb_conversions_are_read():
+    assert read_chain(["linear", "coded"]) == read_chain(["decode-srgb", "encode-srgb"]) == (DecodeSRGB(), EncodeSRGB())
 
 
 def test_a_file_says_what_each_camera_does():

@@ -71,7 +71,7 @@ def mean_shift(batch: ArrayBatch) -> torch.Tensor:
 
 @pytest.mark.parametrize("mode", ["rectified", "general"])
 @pytest.mark.parametrize("resolution", [1.0, 0.5, 0.25])
-def test_depth_and_cameras_foretell_the_other_view(smooth, mode, resolution):
+def test_depth_and_cameras_predict_the_other_view(smooth, mode, resolution):
     batch = draw(smooth, RigDistribution(mode=mode, resolutions=(resolution,), focal_ratio=(0.8, 1.25)))
     across = transferred(batch)
     assert across.visible.float().mean() > 0.3
@@ -117,7 +117,7 @@ def test_everything_is_covered_and_within_bounds(rich):
     for mode in ("rectified", "general"):
         batch = draw(rich, RigDistribution(mode=mode, betas=2), 8, 5)
         assert [len(x) for x in (batch.images, batch.depth, batch.cameras)] == [3, 3, 3]
-        for image, depth, hw in zip(batch.images, batch.depth, batch.hw):
+        for image, depth, hw in zip(batch.images, batch.depth, (c.hw for c in batch.cameras)):
             assert image.shape == (8, 3, *hw)
             assert depth.shape == (8, *hw)
             assert ((depth > 0) & depth.isfinite()).all()
@@ -144,7 +144,7 @@ def test_a_given_rig_keeps_its_cameras(rich):
     rig = RigBatch(cameras, torch.tensor([2.0]).double(), torch.tensor([10.0]).double())
     scenes = LayeredScenes(rich, RigDistribution(), hw=HW)
     batch = scenes.render(rig, torch.Generator().manual_seed(0), oversampling=2)
-    assert batch.hw == [(60, 90), (50, 80)]
+    assert [c.hw for c in batch.cameras] == [(60, 90), (50, 80)]
     torch.testing.assert_close(batch.cameras[1].R.double(), turned.R)
     assert 1.9 < batch.depth[0].min() < batch.depth[0].max() < 14
 

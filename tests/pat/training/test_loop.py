@@ -161,7 +161,7 @@ def test_groups_must_be_shared_evenly():
         Process(0, 2).share(3)
 
 
-def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatch):
+def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "nan")
     ordinary = loop.SampleSource.sample
 
@@ -176,10 +176,10 @@ def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatc
         train(config)
     (file,) = config.out.glob("offending-*")
     assert file.name == "offending-step-5-group-1.safetensors"
-    with safe_open(file, "pt") as kept:
-        assert kept.get_tensor("ground_truth")[1].isnan().any()
-        assert kept.get_tensor("betas/0").isfinite().all()
-        assert kept.metadata()["samples"] == "[1]"
+    with safe_open(file, "pt") as saved:
+        assert saved.get_tensor("ground_truth")[1].isnan().any()
+        assert saved.get_tensor("betas/0").isfinite().all()
+        assert saved.metadata()["samples"] == "[1]"
     assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
 
 

@@ -132,7 +132,7 @@ def test_all_items_have_their_turn_equally_often():
 
 
 def through(root):
-    """Put lenses in front of two cameras of every scene: their images bent, nothing known beyond the old ones."""
+    """Put lenses in front of two cameras of every scene: their images distorted, nothing known beyond the old ones."""
     for folder in (root / "scenes").iterdir():
         source = Rendered(folder)
         rig = source.rig
@@ -168,7 +168,7 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
     assert torch.stack(moved).mean() > 3 * torch.stack(seen).mean()
 
 
-def test_scenes_behind_lenses_are_straightened(rendered, broken):
+def test_scenes_behind_lenses_are_undistorted(rendered, broken):
     """Colours and depth are where the same ray was in the image without a lens."""
     folder = through(broken) / "scenes" / "000001"
     before, view = Rendered(rendered / "scenes" / "000001"), undistorted(read_view(folder, "mono"))
@@ -286,7 +286,7 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
         torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
-        held = given.looks[0].at(torch.tensor([[24.0, 16.0]]).double())
+        held = given.fields[0].at(torch.tensor([[24.0, 16.0]]).double())
         assert held.valid.all()
     assert (sides, reductions) == ({-1.0, 1.0}, {1, 2})
 
@@ -374,11 +374,11 @@ def test_a_lens_sees_all_that_the_pinhole_sees_but_for_what_is_lost(mode):
     assert max(map(abs, strengths)) <= 0.3
 
 
-def test_straightened_images_show_what_they_showed_and_say_what_they_lost(scene):
+def test_undistorted_images_show_what_they_showed_and_say_what_they_lost(scene):
     smooth = torch.nn.functional.avg_pool2d(scene.images[1], 5, 1, 2)
-    kept = through_lenses(smooth, scene.cameras[1], lambda image: image, generator(1))
-    assert kept.valid[:, 1:-1, 1:-1].all()
-    assert (kept.values - smooth)[..., 3:-3, 3:-3].abs().max() < 0.03
+    undistorted_images = through_lenses(smooth, scene.cameras[1], lambda image: image, generator(1))
+    assert undistorted_images.valid[:, 1:-1, 1:-1].all()
+    assert (undistorted_images.values - smooth)[..., 3:-3, 3:-3].abs().max() < 0.03
     distorted = []
     cut = through_lenses(smooth, scene.cameras[1], lambda b: distorted.append(b) or b, generator(1), lost=0.3)
     assert (distorted[0] - smooth).abs().max() > 0.1
