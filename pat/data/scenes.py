@@ -12,17 +12,11 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-<<<<<<< HEAD
-from arraygeom.rig import Rig
-from arraygeom.sensor import Band, Curve, Sensor
-from pat.media.colour import srgb_image
-=======
-from arraygeom.camera import Camera
 from arraygeom.fields import ReceptiveField
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
->>>>>>> main
+from pat.media.colour import srgb_image
 from pat.sensors import (
     Clip,
     DegradationCase,
@@ -58,13 +52,10 @@ class Patch:
     rig: Rig
     alpha: str
 
-<<<<<<< HEAD
-=======
     def on_grid(self, field: ReceptiveField) -> list[FieldOnGrid]:
         """The field of every beta, on alpha's pixels."""
         return [FieldOnGrid.of(field, self.rig.pair(self.alpha, beta)) for beta in self.rig.betas(self.alpha)]
 
->>>>>>> main
 
 class ScenePatches(Dataset[Patch]):
     """All patches of all scenes of a folder, degraded on the fly.

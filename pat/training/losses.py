@@ -62,25 +62,15 @@ class Objective(nn.Module):
         return loss + match_loss(seen, given) if seen else loss
 
 
-<<<<<<< HEAD
-def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[Seen]]:
-    """The network's output, and its match in each beta if it reports it."""
-=======
 def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
-    """The network's answer, and what each beta told where it says."""
->>>>>>> main
+    """The network's output, and its match in each beta if it reports it."""
     if isinstance(network, (GuidedPAT, BandwisePAT)):
         return network.explain(given.inputs)
     return network(given.inputs), []
 
 
-<<<<<<< HEAD
-def match_loss(seen: list[Seen], given: Sample) -> Tensor:
-    """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground truth."""
-=======
 def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
-    """How far off the looks were where beta sees the point, pixels, and how wrong the confidence; 0 if nobody knows."""
->>>>>>> main
+    """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground truth."""
     total = given.ground_truth.new_zeros(())
     for match, ground_truth, visible in zip(seen, given.position, given.visible):
         off = (match.attended.position - ground_truth.movedim(-1, 1)).abs().sum(1)

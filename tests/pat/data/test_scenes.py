@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, lazily, rotation_from_vector
+from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
 from arraygeom.fields import look
 from pat.data import (
     PatchGrid,
@@ -120,12 +120,9 @@ def test_segments_of_a_batch_contain_the_true_points(rendered):
     batch = next(iter(loader))
     assert batch.images["mono"].shape == (6, 1, 16, 24)
     pair = batch.rig.pair("mono", "colour")
-<<<<<<< HEAD
-=======
     (where,) = batch.on_grid(Epipolar())
->>>>>>> main
     X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
-    found = lazily(Epipolar(), pair)(torch.tensor([[12.0, 8.0]]))
+    found = where.at(torch.tensor([[12.0, 8.0]]))
     seen = pair.cameras[1].project(X).x[:, 0].float()
     inside = found.valid[:, 0] & pair.beta.contains(seen)
     along = found.fraction(seen[:, None])[:, 0]
