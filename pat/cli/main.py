@@ -69,7 +69,7 @@ class Demo:
         from ..evaluation.baseline import classical
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
-        from ..systems.demo import report_figure
+        from ..systems.demo import save_demo_figure
 
         sample = load_sample()
         console.print("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
@@ -77,7 +77,7 @@ class Demo:
         console.print(f"fusion with the weights '{self.weights}'")
         frame = fuse_frame(self.weights, sample.rig, sample.images, alpha=ALPHA)
         written = save_frame(frame, self.out)
-        report_figure(sample, baseline, frame, self.out / "demo.png")
+        save_demo_figure(sample, baseline, frame, self.out / "demo.png")
         rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
         scores = {name: score(image.clamp(0, 1), sample.ground_truth) for name, image in rows.items()}
         lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]
@@ -259,17 +259,9 @@ class Evaluate:
         """Do it."""
         from arraygeom.atomic import write_text
 
-        from ..evaluation.stereo import (
-            BASELINES,
-            DATA_SETS,
-            PROTOCOLS,
-            controls,
-            evaluate_sets,
-            falls,
-            rectified_fusion,
-            sets_markdown,
-            write_csv,
-        )
+        from ..evaluation.protocols import BASELINES, PROTOCOLS, controls, rectified_fusion
+        from ..evaluation.stereo import DATA_SETS, StereoRow, evaluate_sets, falls, sets_markdown
+        from ..evaluation.tables import write_csv
         from ..networks.weights import load_weights
 
         folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
@@ -284,7 +276,7 @@ class Evaluate:
         every = [row for found in rows.values() for row in found]
         text = sets_markdown(rows, protocol=self.protocol) + ("\n" + falls(every, names=wrong) if wrong else "")
         write_text(self.out / "scores.md", text)
-        write_csv(self.out / "scores.csv", every)
+        write_csv(self.out / "scores.csv", StereoRow._fields, every)
         print(text, end="")
         console.print(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 

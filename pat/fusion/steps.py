@@ -54,7 +54,7 @@ class Done(NamedTuple):
 
 
 @runtime_checkable
-class Step(Protocol):
+class FusionStep(Protocol):
     """One step."""
 
     def do(self, views: Views) -> Done:
@@ -62,7 +62,7 @@ class Step(Protocol):
         ...
 
 
-def steps_for(network: FusionNetwork, *, normalise: bool) -> list[Step]:
+def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """The steps that a network needs, in order."""
     resize = [EqualResolution(network)] if network.equal_resolution else []
     radiometry = [Radiometry()] if normalise else []

@@ -29,6 +29,7 @@ from torch.nn.functional import grid_sample
 from arraygeom.atomic import write_text
 from arraygeom.segments import Segments
 from pat.attention import attend
+from pat.evaluation.tables import markdown_header, markdown_row
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 REPEATS, ENOUGH = 9, 6.0
@@ -296,9 +297,8 @@ def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
     """One line of the table."""
     rate = rates[entry["method"] == ONE_THREAD]
     result, (shape, work, *_) = done[name(entry)], name(entry)
-    start = f"| {' | '.join(name(entry))} |"
     if "failed" in result:
-        return f"{start} {result['failed'][:80]} |" + " |" * (len(COLUMNS) - 5)
+        return markdown_row([*name(entry), result["failed"][:80], *[""] * (len(COLUMNS) - 5)])
     flops = (3 if entry["backward"] else 1) * 4 * entry["ha"] * entry["wa"] * entry["samples"] * entry["d"]
     least = (2 if entry["backward"] else 1) * result["unit"]
     against = [
@@ -317,7 +317,7 @@ def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
         f"{flops / result['time'] / 1e12:.2g} ({flops / result['time'] / rate:.0%})",
         f"{least / result['time'] / 1e9:.2g} ({least / result['time'] / bandwidth:.0%})",
     ]
-    return f"{start} {' | '.join(cells)} |"
+    return markdown_row([*name(entry), *cells])
 
 
 COLUMNS = (
@@ -345,7 +345,7 @@ def table(device: str, *, quick: bool) -> list[str]:
     )
     lines = [
         *("", f"## {device}", "", limits if here else "No GPU on this machine.", ""),
-        *(f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"),
+        markdown_header(COLUMNS, align="l"),
     ]
     print("\n".join(lines), flush=True)
     done: dict = {}
@@ -391,13 +391,12 @@ def bars(done: dict, rates: dict) -> list[str]:
         "",
         "512x256, 80 samples, D = 64, float32, if not said otherwise:",
         "",
-        "| asked | | measured | |",
-        "|---" * 4 + "|",
+        markdown_header(["asked", "", "measured", ""], align="l"),
     ]
     for what, value, sign, bar in asked:
         reached = value >= bar if sign == ">=" else value <= bar
         verdict = "not measured" if math.isnan(value) else "reached" if reached else "missed"
-        lines.append(f"| {what} | {sign} {bar} | {value:.2f} | {verdict} |")
+        lines.append(markdown_row([what, f"{sign} {bar}", f"{value:.2f}", verdict]))
     return lines
 
 

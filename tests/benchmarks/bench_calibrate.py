@@ -23,6 +23,7 @@ from calib.boards.bundle import adjust
 from calib.boards.collect import collect_folder
 from calib.boards.rig import Calibration, calibrate, calibrate_single, epipolar_errors
 from calib.boards.target import parse_board
+from pat.evaluation.tables import markdown_header, markdown_row
 from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import (
@@ -166,12 +167,12 @@ def main() -> None:
         "tracks": (tracks, options.data),
         "rendered": (rendered, options.boards),
     }
-    lines = ["| what | found | wanted |", "| --- | --- | --- |"]
+    lines = [markdown_header(["what", "found", "wanted"], align="l")]
     print(*lines, sep="\n")
     for name in options.only or tables:
         table, source = tables[name]
         for row in table(source) if source.is_dir() else [Figure(name, f"left out: no folder {source}", "")]:
-            lines.append("| " + " | ".join(row) + " |")
+            lines.append(markdown_row(row))
             print(lines[-1], flush=True)
     if options.out:
         write_text(options.out, "# How good calibration is\n\n" + "\n".join(lines) + "\n")

@@ -27,6 +27,7 @@ from arraygeom.atomic import write_text
 from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.remedies import ROTATIONS, TRANSPOSE, on_cameras
+from pat.evaluation.tables import markdown_header, markdown_row
 from tests.calib.real import RealPair, every_pair
 
 Images = dict[str, Tensor]
@@ -229,11 +230,11 @@ def confusions(data: Path, *, cases: int, seed: int, kinds: Sequence[str] = tupl
             totals["right or equal"] += label == kind
             totals["all"] += 1
             named[label] += 1
-        label = ", ".join(f"{label} {count}" for label, count in named.most_common())
-        lines.append(f"| {kind} | {cases} | {redrawn} | {label} |")
+        spoken = ", ".join(f"{label} {count}" for label, count in named.most_common())
+        lines.append(markdown_row([kind, cases, redrawn, spoken]))
         print(lines[-1], flush=True)
-    head = "| mistake made | cases | drawn again | named |\n| --- | ---: | ---: | --- |\n"
-    return head + "\n".join(lines) + f"\n\n{dict(totals)}\n\n" + "\n".join(misses) + "\n"
+    head = markdown_header(["mistake made", "cases", "drawn again", "named"], align="lrrl")
+    return "\n".join([head, *lines]) + f"\n\n{dict(totals)}\n\n" + "\n".join(misses) + "\n"
 
 
 def main() -> None:

@@ -38,8 +38,9 @@ from calib.images.refinement import (
 )
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
-from pat.evaluation.ablation import Case, rendered_cases
+from pat.evaluation.ablation import AblationCase, rendered_cases
 from pat.evaluation.metrics import score
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.media.images import read_image
 from pat.networks.weights import load_weights
@@ -62,10 +63,7 @@ def median(values: Tensor) -> float:
 
 
 def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
-    yield (
-        "| real pair | points | of points | as published | made worse | refined | of the rig |\n| --- | "
-        + "---: | " * 6
-    )
+    yield markdown_header(["real pair", "points", "of points", "as published", "made worse", "refined", "of the rig"])
     for pair in (*syntim(data, ("Serfaty", "BatInria", "Billet", "SmRub", "Money", "Color", "Poly")), *bumblebee(data)):
         names = tuple(pair.images)
         rig = Rig({name: pair.rig[name] for name in names})
@@ -77,7 +75,7 @@ def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
         rest = [beyond(r[1], own) for r in results]
         cells = (pair.name, len(matches[names].alpha), f"{own.median:.2f}")
         published = f"{median(line_distances(rig, held_out)):.2f}"
-        yield "| " + " | ".join(map(str, (*cells, published, *map(_span, (before, after, rest))))) + " |"
+        yield markdown_row([*cells, published, *map(_span, (before, after, rest))])
 
 
 def own_agreement(pairs: dict) -> LineStatistics:
@@ -97,12 +95,8 @@ def _span(values: list[float]) -> str:
 
 
 def fast_and_slow(data: Path) -> Iterator[str]:
-    """F as published; after `pat rig refine` and `pat rig start`, which find lenses; of the points' own."""
-    yield (
-        "| fast + slow | points held out | published F | F of all points | refined | started |\n| --- "
-        + "| ---: " * 5
-        + "|"
-    )
+    """F as published; as `pat rig refine` and `pat rig start` leave it, which find lenses; of the points' own."""
+    yield markdown_header(["fast + slow", "points held out", "published F", "F of all points", "refined", "started"])
     folder = data / "hfr_lfr"
     files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
     files |= {name: folder / SCENE / f"{name}_{SLOW_FRAME}.png" for name in SLOW}
@@ -117,20 +111,21 @@ def fast_and_slow(data: Path) -> Iterator[str]:
         points = {names: held_out[names]}
         own = own_agreement({names: matches[names]}).median
         before, *after = (median(line_distances(r, points)) for r in (rig, *rigs))
-        medians = " | ".join(f"{off:.2f}" for off in (before, own, *after))
-        yield f"| {names[1]} | {len(held_out[names].alpha)} | {medians} |"
+        medians = (f"{off:.2f}" for off in (before, own, *after))
+        yield markdown_row([names[1], len(held_out[names].alpha), *medians])
 
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
-    """The sample array and scenes rendered before: with ground-truth rigs and ground-truth colours at alpha's view."""
-    head = "| rendered | draw | true rig | made worse | by points | and by photometric error | from images alone |"
-    yield head + "\n| --- | " + "---: | " * 6
+    """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at alpha's view."""
+    yield markdown_header(
+        ["rendered", "draw", "true rig", "made worse", "by points", "and by the fusion's error", "from images alone"]
+    )
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
-    ours = Case("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))
+    ours = AblationCase("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))
     for case in chain([ours], found):
 
-        def psnr(rig: Rig, case: Case = case) -> float:
+        def psnr(rig: Rig, case: AblationCase = case) -> float:
             return score(fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.ground_truth)[
                 0
             ]
@@ -140,12 +135,12 @@ def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterat
             bad = worse(case.rig, g)
             rigs = [bad, *(refine(bad, [case.images], attend=a).rig for a in (None, attend_with_statistics))]
             cells = [f"{p:.2f} dB" for p in (true, *map(psnr, rigs), alone)]
-            yield f"| {case.name} | {draw} | {' | '.join(cells)} |"
+            yield markdown_row([case.name, draw, *cells])
 
 
 def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
-    """The photometric error without any point, from rigs that are four fifths refined."""
-    yield "| sample array | four fifths back | by photometric error alone |\n| --- | ---: | ---: |"
+    """The fusion's error without any point, from rigs that are four fifths of the way back."""
+    yield markdown_header(["sample array", "four fifths back", "by the fusion's error alone"])
     sample = load_sample()
     points = match_cameras(sample.images)
     (names,) = points
@@ -157,7 +152,7 @@ def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
             fit, near._replace(covariance=0.01 * near.covariance), [sample.images], attend_with_statistics
         )
         off = [median(line_distances(fit.after(z), {names: true})) for z in (near.z, found.z)]
-        yield f"| draw {draw} | {off[0]:.2f} px | {off[1]:.2f} px |"
+        yield markdown_row([f"draw {draw}", f"{off[0]:.2f} px", f"{off[1]:.2f} px"])
 
 
 def exact_points(rig: Rig, names: tuple[str, str]) -> Matches:
