@@ -88,7 +88,9 @@ def backward(
     points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
     gradients = kernels.Gradients(
-        *(_flat(t) for t in (query_out, points_out, bias_out)),
+        _flat(query_out),
+        _flat(points_out),
+        _flat(bias_out),
         wants_query=wanted[0],
         wants_points=wanted[3],
         wants_bias=wanted[4],
@@ -168,7 +170,9 @@ def _call(
     query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
 ) -> kernels.Call:
     return kernels.Call(
-        *(_flat(_channels_last(t)) for t in (query, key, value)),
+        _flat(_channels_last(query)),
+        _flat(_channels_last(key)),
+        _flat(_channels_last(value)),
         geometry=_geometry(positions, query, key, nearest),
         bias=_flat(_bias(bias, _accumulated(query))),
         biased=bias is not None,

@@ -23,14 +23,14 @@ STILL = 0.5
 
 
 class Flow(NamedTuple):
-    """Where each pixel of one frame is in another: (2, H, W) pixels in x and y, and the weight (H, W) of that, 0 to 1."""
+    """Motion of each pixel from one frame to another: (2, H, W) pixels in x and y, and its weight (H, W), 0 to 1."""
 
     step: Float[Tensor, "2 h w"]
     weight: Float[Tensor, "h w"]
 
 
 def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
-    """Dense inverse search (Kroeger et al. 2016) from frame a to b; its weight is high where it leads back and values agree.
+    """Dense inverse search (Kroeger et al. 2016) from frame a to b, weighted by consistency and likeness.
 
     Values of b are first brought to a's mean: light that flickers is no motion.
     """

@@ -291,7 +291,7 @@ class SequenceFusion:
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
-        """Beta's image with alpha's mean and standard deviation, both over several key frames so that they do not flicker."""
+        """Beta's image with alpha's mean and deviation over several key frames, so that it does not flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - NEIGHBOURS, 0) : nearest + NEIGHBOURS + 1]

@@ -39,9 +39,9 @@ class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
     Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
-    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
-    nothing is added to what was matched and propagated. `keep_luminance` lets
-    the network add colour to alpha, and never luminance.
+    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim`
+    (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add colour to alpha, and
+    never luminance.
     """
 
     widths: tuple[int, int, int, int] = (16, 32, 40, 48)
@@ -63,7 +63,7 @@ class BetaEstimate(NamedTuple):
     colour: (B, C, H, W), its bands minus alpha, attended and matched, mixed.
     diffused: (B, fills, C, H, W), the same diffused within alpha from pixels of high weight.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
-    choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated within alpha, or each of `diffused`.
+    choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of `diffused`.
     """
 
     attended: Attended
@@ -96,7 +96,7 @@ class GuidedPAT(nn.Module):
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
     halo = 640
-    """Encoder 85, judge 176, trust 8, propagation within alpha 148, context, propagation 180 and head 16: the sum, rounded up."""
+    """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
     beta_halo = 96
     bytes_per_pixel = 320.0
 
@@ -257,7 +257,7 @@ class Propagation(nn.Module):
 
 
 def window_around(disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
-    """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `disparity` from their end."""
+    """The parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from the match at `disparity` from their end."""
     middle, step = matches(segments, disparity), window * along(segments)
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 

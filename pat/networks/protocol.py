@@ -17,9 +17,9 @@ from arraygeom.pixels import HW
 
 @dataclass(frozen=True)
 class Beta:
-    """One beta's image (B, C, H, W), the field of alpha's pixels in it, and where its first pixel is in the whole image.
+    """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
-    `offset` is (x, y), other than (0, 0) for a part of an image.
+    `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
     """
 
     image: Float[Tensor, "b c h w"]

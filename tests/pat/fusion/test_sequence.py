@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
-from pat.fusion.optical_flow import warped, flow_between
+from pat.fusion.optical_flow import flow_between, warped
 from pat.fusion.sequence import SequenceFusion, Source, Timeline, flicker, fuse_sequence, mixed
 from pat.networks.weights import load_weights
 from tests.pat.fusion import moving
