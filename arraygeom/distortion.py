@@ -19,12 +19,16 @@ not valid; their values stay finite and bounded (the point is moved in to the tu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import pi
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from .batching import Batched
+from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
@@ -41,8 +45,8 @@ POLE = 0.9
 BEYOND = 1.1
 
 
-@dataclass(frozen=True)
-class Distortion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distortion(Batched):
     """One lens, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
@@ -52,6 +56,7 @@ class Distortion:
     Raises ValueError for an unknown model or a number of coefficients that the model does not have.
     """
 
+    item_axes: ClassVar = {"coefficients": 1}
     model: str
     coefficients: Float[Tensor, "*b n"]
 
@@ -62,10 +67,6 @@ class Distortion:
         if self.coefficients.shape[-1] not in counts:
             given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
-
-    def to(self, *args: object, **kwargs: object) -> Distortion:
-        """The same lens on another device or in another dtype; arguments as of `Tensor.to`."""
-        return replace(self, coefficients=self.coefficients.to(*args, **kwargs))  # type: ignore[call-overload]
 
     def distort(self, xy: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Normalised pinhole points to distorted ones, and which are inside the model's range."""
@@ -112,6 +113,9 @@ class Distortion:
             return ray, valid & finite
         xy, valid = self.undistort(xy_d)
         return _unit(_homogeneous(xy)), valid
+
+    def _text(self) -> str:
+        return distortion_text(self)
 
     def _lifted(self, points: Tensor) -> Tensor:
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""

@@ -43,7 +43,7 @@ def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
 def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
     """Turning the image counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
 
-    >>> (turn_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
+    >>> (rot90_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
     """
     A = torch.eye(3, dtype=torch.float64)

@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Float
-from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor
 
+from .batching import Batched
+from .text import pose_text
 
-@dataclass(frozen=True)
-class Pose:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pose(Batched):
     """A rigid transform named `to_from_from`, for instance `cam_from_world`: X_cam = R X_world + t.
 
     Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`. Metres.
     """
 
+    item_axes: ClassVar = {"R": 2, "t": 1}
     R: Float[Tensor, "*b 3 3"]
     t: Float[Tensor, "*b 3"]
 
@@ -33,6 +37,10 @@ class Pose:
 
     def __matmul__(self, other: Pose) -> Pose:
         return Pose(self.R @ other.R, matvec(self.R, other.t) + self.t)
+
+    def replace(self, **changes: Any) -> Pose:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)
 
     def inverse(self) -> Pose:
         """`from_to_to`: the transform the other way."""
@@ -59,9 +67,15 @@ class Pose:
         R = self.R if rotation is None else nearest_rotation(rotation_from_vector(rotation) @ self.R)
         return Pose(R, self.t if translation is None else self.t + translation)
 
-    def to(self, *args: Any, **kwargs: Any) -> Pose:
-        """Like `Tensor.to`."""
-        return Pose(self.R.to(*args, **kwargs), self.t.to(*args, **kwargs))
+    def _text(self) -> str:
+        return pose_text(self)
+
+
+def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """[v]x, the matrix with [v]x w = v x w."""
+    from kornia.geometry.epipolar import cross_product_matrix  # here, as kornia takes as long to import as torch's ops
+
+    return cross_product_matrix(v)
 
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
@@ -78,7 +92,7 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6)[0, 1].item()
     -1.0
     """
-    W = vector_to_skew_symmetric_matrix(w)
+    W = cross_matrix(w)
     first, second = (c[..., None, None] for c in _rodrigues(w.square().sum(-1)))
     return torch.eye(3, dtype=w.dtype, device=w.device) + first * W + second * (W @ W)
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from .camera import Camera, intrinsics
 from .pixels import HW
-from .pose import Pose, matvec, rotation_from_vector
+from .pose import Pose, cross_matrix, matvec, rotation_from_vector
 from .rig import Pair
 
 
@@ -68,7 +68,7 @@ def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], F
 def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The shortest rotation that takes unit vector a to unit vector b, less than half a turn away."""
     v = torch.linalg.cross(a, b)
-    W = torch.stack([torch.linalg.cross(v, e) for e in torch.eye(3).to(v)], -1)
+    W = cross_matrix(v)
     return torch.eye(3).to(v) + W + W @ W / (1 + a @ b)
 
 

@@ -8,34 +8,42 @@ the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be looked up, al
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .batching import Batched
 from .pixels import HW
+from .text import positions_text, segments_text
 
 
-@dataclass(frozen=True)
-class Positions:
+@dataclass(frozen=True, eq=False, repr=False)
+class Positions(Batched):
     """Explicit sample positions, L for each alpha pixel.
 
     `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count has
     nowhere to look.
     """
 
+    item_axes: ClassVar = {"xy": 2, "mask": 1}
     xy: Float[Tensor, "*n l 2"]
     mask: Bool[Tensor, "*n l"]
 
+    def _text(self) -> str:
+        return positions_text(self)
 
-@dataclass(frozen=True)
-class Segments:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Segments(Batched):
     """One straight piece of beta's image for each alpha pixel, from `start` to `end`, in beta's pixels.
 
     For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far bound.
     Where `valid` is False there is nowhere to look and the ends mean nothing (but are finite).
     """
 
+    item_axes: ClassVar = {"start": 1, "end": 1}
     start: Float[Tensor, "*n 2"]
     end: Float[Tensor, "*n 2"]
     valid: Bool[Tensor, "*n"]
@@ -69,6 +77,9 @@ class Segments:
         u = sample_fractions(samples, like=self.start)
         xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
+
+    def _text(self) -> str:
+        return segments_text(self)
 
 
 def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:

@@ -10,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .camera import Camera
-from .fields import Curved, Epipolar, look
+from .fields import Curved, Epipolar, sampling_locations
 from .pixels import pixel_grid
 from .rig import Pair, Rig
 from .segments import Segments
+from .text import angle
 
 
 class CameraSummary(NamedTuple):
@@ -89,17 +90,10 @@ def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, "
 
 def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
     pose = pair.beta_from_alpha
-    sine, cosine = _rotation_parts(pose.R)
-    rotation = math.degrees(math.atan2(sine, cosine))
+    rotation = math.degrees(float(angle(pose.R)))
     seen, length = _segments(pair) if pair.depth is not None else (None, None)
     baseline = float(pose.centre.norm())
     return PairSummary(alpha, beta, baseline, rotation, seen, length, _depth_step(pair, baseline))
-
-
-def _rotation_parts(R: Float[Tensor, "3 3"]) -> tuple[float, float]:
-    """Sine and cosine of the angle of a rotation."""
-    axis = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(axis.norm() / 2), float((R.diagonal().sum() - 1) / 2)
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
@@ -107,7 +101,7 @@ def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
     x = pixel_grid(pair.alpha.hw)[::4, ::4]
     alpha, beta = pair.cameras
     straight = alpha.distortion is None and beta.distortion is None
-    found = look(Epipolar() if straight else Curved(64), pair, x)
+    found = sampling_locations(Epipolar() if straight else Curved(64), pair, x)
     if isinstance(found, Segments):
         valid, length = found.valid, found.length
     else:

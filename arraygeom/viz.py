@@ -21,7 +21,7 @@ from torch import Tensor
 
 from .camera import Camera
 from .epipolar import epipolar_distance, epipolar_lines
-from .fields import Curved, Epipolar, HomographyDisplacement, ReceptiveField
+from .fields import ReceptiveField, recorded_field
 from .fields.widened import direction
 from .pixels import HW
 from .rig import Pair, Rig
@@ -167,8 +167,8 @@ def draw_fields(
 ) -> Figure:
     """Alpha's pixels x, and in every beta where a field looks for them, in the same colours.
 
-    `field` is one for all betas or one for each by name (Epipolar, Curved where there are lenses, or the
-    homography-based one without calibration). `images` holds (H, W), (H, W, 3) or (3, H, W) images by camera name.
+    `field` is one for all betas or one for each by name (`recorded_field` by default). `images` holds (H, W),
+    (H, W, 3) or (3, H, W) images by camera name.
     Segments are lines with a dot at their near end, positions are dots.
     """
     betas = tuple(betas or rig.betas(alpha))
@@ -183,11 +183,11 @@ def draw_fields(
             continue
         pair = rig.pair(alpha, name)
         chosen = field.get(name) if isinstance(field, Mapping) else field
-        draw_look(axes, chosen or suitable_field(pair), pair, x)
+        draw_sampling_locations(axes, chosen or recorded_field(pair), pair, x)
     return figure
 
 
-def draw_look(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
+def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
     """Where a field looks in beta for each of a few alpha pixels, each in its own colour."""
     found = field(pair, x)
     for i, colour in enumerate(_colours(len(x))):
@@ -199,14 +199,6 @@ def draw_look(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n
                 axes.plot(x0, y0, "o", color=colour, ms=4, mec="white", mew=0.6)
         else:
             axes.scatter(*numpy(found.xy[i][found.mask[i]]).T, color=colour, s=1.5, linewidths=0)
-
-
-def suitable_field(pair: Pair) -> ReceptiveField:
-    """The field that knows most about the pair: curved, depth-bounded, or about H x."""
-    if isinstance(pair.alpha, Camera) and isinstance(pair.beta, Camera) and pair.depth is not None:
-        straight = pair.alpha.distortion is None and pair.beta.distortion is None
-        return Epipolar() if straight else Curved(256)
-    return HomographyDisplacement(0.06 * pair.beta.hw[1])
 
 
 # How well it fits ---------------------------------------------------------------------------------------------

@@ -13,30 +13,34 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 
 from .approximation import approximated, placement_error
 from .curved import Curved, ThroughLenses
+from .default import FIELDS, default_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
-from .protocol import Look, ReceptiveField, lazily, look
+from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, covering_displacement, pinhole_track
 from .widened import Widened
 
 __all__ = [
+    "FIELDS",
     "Curved",
     "Dense",
     "Epipolar",
     "EpipolarLine",
     "HomographyDisplacement",
     "Local",
-    "Look",
     "Moved",
     "NearestVoxels",
     "ReceptiveField",
     "Rectified",
+    "SamplingLocations",
     "ThroughLenses",
     "Widened",
     "approximated",
     "covering_displacement",
+    "default_field",
     "lazily",
-    "look",
     "pinhole_track",
     "placement_error",
+    "recorded_field",
+    "sampling_locations",
 ]

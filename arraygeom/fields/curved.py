@@ -77,7 +77,7 @@ class ThroughLenses:
 
 
 class _Straight(NamedTuple):
-    """A view, the same without its lens, and A which takes the straightened pixels of the one to those of the other."""
+    """A view, the same without its lens, and A which takes the undistorted pixels of the one to those of the other."""
 
     view: View
     pinhole: View

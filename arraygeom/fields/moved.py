@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..rig import Pair
 from ..sampling import sample
-from .protocol import Look, ReceptiveField
+from .protocol import ReceptiveField, SamplingLocations
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,7 +25,7 @@ class Moved:
     field: ReceptiveField
     displacement: Float[Tensor, "2 h w"]
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
         """What the field answers for the points where alpha's pixels x will be."""
         return self.field(pair, self.points(x))
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from arraygeom import Camera, Pose, Rig, epipolar_distance
+from arraygeom import Camera, Pose, Rig, epipolar_distance, stack
 from arraygeom.pixels import map_homogeneous
 
 from .bundle import BoardPoses, Expected, Fit, Observations, Scene, adjust, intrinsic_numbers, noise, parameter_names
@@ -223,7 +223,7 @@ def _scene(
     cameras: Mapping[str, Camera], boards: Mapping[FrameKey, Pose], views: Mapping[str, Views], board: Board
 ) -> Scene:
     index = {key: i for i, key in enumerate(boards)}
-    poses = Pose(torch.stack([p.R for p in boards.values()]), torch.stack([p.t for p in boards.values()]))
+    poses = stack(list(boards.values()))
     seen = {name: _observations(v, index, board) for name, v in views.items()}
     return Scene(cameras, BoardPoses(poses), seen, {name: usual(camera) for name, camera in cameras.items()})
 

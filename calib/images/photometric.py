@@ -18,17 +18,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 
 from arraygeom import (
-    Curved,
-    Epipolar,
-    HomographyDisplacement,
     Pair,
     Positions,
-    ReceptiveField,
     Rig,
     Segments,
-    ThroughLenses,
     pixel_grid,
 )
+from arraygeom.fields import recorded_field
 
 from .matches import ENOUGH, Matches, seen_depths
 
@@ -63,8 +59,6 @@ WINDOW = 9
 """Values are relative to the mean and the deviation in windows this wide, so that exposure and filters do not count."""
 EVEN = 0.02
 """Deviations below this, of images in 0..1, are noise."""
-PART = 0.06
-"""A pair known by F alone is looked at within this part of beta's size around the rough map."""
 
 
 @dataclass(frozen=True)
@@ -98,21 +92,13 @@ def photometric_errors(
     for name in names:
         rig = rig.resize(name, views.hw[name])
     pair, x = rig.pair(*names).to(torch.float32), views.grid[alpha]
-    look = field_of(pair)(pair, x)
+    look = recorded_field(pair, samples=64, nodes=16)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
     query, own = (image[alpha][:, :, rows][..., columns] for image in (views.keys, views.values))
     found = attend(query, views.keys[beta], views.values[beta], look)
     seen = look.mask.any(-1) if isinstance(look, Positions) else look.valid
     sure = found.peak[0].detach().sqrt()
     return torch.where(seen, sure * (found.value - own)[0, 0], 0.0), seen
-
-
-def field_of(pair: Pair) -> ReceptiveField:
-    """Where to look: the segment of calibrated pinholes, the curve through lenses, the line of a pair known by F."""
-    if pair.link is not None or not pair.calibrated:
-        line = HomographyDisplacement(PART * max(pair.beta.hw))
-        return ThroughLenses(line, 64) if pair.has_lens else line
-    return Curved(64, nodes=16) if pair.has_lens else Epipolar()
 
 
 def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:

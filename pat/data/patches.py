@@ -7,9 +7,9 @@ the rig's range (not at its true depth, which would tell a network where to look
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from zipfile import BadZipFile
@@ -19,9 +19,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig, middle_depth
 from arraygeom.sampling import sample
 from pat.synthesis.rendered import RENDER_FILE, Rendered, RenderedFrame, is_rendered
@@ -183,7 +183,7 @@ def _cut_view(
     small = hw[0] // reduce, hw[1] // reduce
     rgb = torch.stack([frame.rgb[:, top : top + hw[0], left : left + hw[1]] for top, left in corners])
     depth = torch.stack([frame.depth[top : top + hw[0], left : left + hw[1]] for top, left in corners])
-    return reduced(rgb, small), reduced_depth(depth, small), _batch([window.resize(small) for window in windows])
+    return reduced(rgb, small), reduced_depth(depth, small), stack([window.resize(small) for window in windows])
 
 
 def reduced(rgb: Float[Tensor, "n c h w"], hw: HW) -> Float[Tensor, "n c h2 w2"]:
@@ -213,38 +213,12 @@ def _camera(rig: Rig, name: str) -> Camera:
     return camera
 
 
-def _batch(cameras: list[Camera]) -> Camera:
-    """One camera with a batch axis from several that differ in K alone."""
-    first, n = cameras[0], len(cameras)
-    lens = first.distortion
-    if lens is not None:
-        lens = replace(lens, coefficients=lens.coefficients.expand(n, -1))
-    pose = Pose(first.R.expand(n, 3, 3), first.t.expand(n, 3))
-    return first.replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose, distortion=lens)
-
-
-def select(rig: Rig, index: int | Tensor) -> Rig:
-    """One rig, or some, of a batch."""
-
-    def chosen(camera: Camera) -> Camera:
-        lens = camera.distortion
-        lens = None if lens is None else replace(lens, coefficients=lens.coefficients[index])
-        pose = Pose(camera.R[index], camera.t[index])
-        return camera.replace(K=camera.K[index], cam_from_world=pose, distortion=lens)
-
-    return rig.replace(
-        cameras={name: chosen(_camera(rig, name)) for name in rig.names}, depth=tuple(d[index] for d in rig.depth)
-    )
-
-
 def stacked(rigs: list[Rig]) -> Rig:
     """A batch of rigs of the same cameras. Raises ValueError where sizes or names differ."""
     first = rigs[0]
     for rig in rigs[1:]:
         same_cameras(first, rig)
-    cameras: Mapping[str, list[Camera]] = {name: [_camera(rig, name) for rig in rigs] for name in first.names}
-    depth = tuple(torch.stack([rig.depth[i] for rig in rigs]) for i in (0, 1))
-    return first.replace(cameras={name: _stack(same) for name, same in cameras.items()}, depth=depth)
+    return stack(rigs)
 
 
 def same_cameras(one: Rig, other: Rig) -> None:
@@ -253,13 +227,3 @@ def same_cameras(one: Rig, other: Rig) -> None:
     if sizes[0] != sizes[1]:
         said = [", ".join(f"{name} {wh}" for name, wh in s.items()) for s in sizes]
         raise ValueError(f"has images of other sizes than the first ({said[1]}; first: {said[0]}): one rig a folder")
-
-
-def _stack(cameras: list[Camera]) -> Camera:
-    first = cameras[0]
-    lens = first.distortion
-    if lens is not None:
-        lenses = [c.distortion for c in cameras if c.distortion is not None]
-        lens = replace(lens, coefficients=torch.stack([d.coefficients for d in lenses]))
-    pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
-    return first.replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose, distortion=lens)

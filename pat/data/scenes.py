@@ -32,7 +32,7 @@ from pat.sensors import (
 )
 from pat.synthesis.layered import ArrayBatch
 
-from .patches import Patches, Stack, cut, same_cameras, scene_folders, scene_rig, select, stacked
+from .patches import Patches, Stack, cut, same_cameras, scene_folders, scene_rig, stacked
 
 LOADED = 64
 """Scenes whose patches are kept in memory by each process."""
@@ -99,7 +99,7 @@ class ScenePatches(Dataset[Patch]):
     def _recorded(self, stack: Stack, number: int, seed: int) -> Patch:
         alpha = self.scenes.alpha
         one = slice(number, number + 1)
-        rig, rgb = select(stack.rig, number), {name: views[one] for name, views in stack.rgb.items()}
+        rig, rgb = stack.rig[number], {name: views[one] for name, views in stack.rgb.items()}
         depth = {name: views[one] for name, views in stack.depth.items()}
         recorded = record_array(rgb, rig, self._chains(alpha, seed), seed=seed, depth=depth)
         return Patch(
@@ -198,7 +198,7 @@ class RenderedScenes:
         count = self.scenes.patches.count
         drawn = [(self._pool[_draw(len(self._pool), generator)], _draw(count, generator)) for _ in range(batch)]
         stacks = [(self.scenes[scene], number) for scene, number in drawn]
-        rig = stacked([select(stack.rig, number) for stack, number in stacks])
+        rig = stacked([stack.rig[number] for stack, number in stacks])
         names = (self.scenes.alpha, *rig.betas(self.scenes.alpha))
         images = [coded(torch.stack([stack.rgb[n][i] for stack, i in stacks])) for n in names]
         depth = [torch.stack([stack.depth[n][i] for stack, i in stacks]) for n in names]

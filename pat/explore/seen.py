@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -21,12 +21,8 @@ from torch import Tensor
 from arraygeom import (
     Camera,
     Curved,
-    Dense,
     Epipolar,
-    EpipolarLine,
     HomographyDisplacement,
-    Local,
-    NearestVoxels,
     Pair,
     Positions,
     ReceptiveField,
@@ -39,7 +35,8 @@ from arraygeom import (
     pixel_grid,
     sample,
 )
-from arraygeom.fields import covering_displacement
+from arraygeom.fields import FIELDS, covering_displacement, recorded_field
+from arraygeom.fields.default import LINE_SHARE
 from arraygeom.pixels import HW
 
 from ..media.colour import luminance
@@ -115,50 +112,39 @@ class Scene:
             self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None]
 
 
-def auto(pair: Pair, state: State) -> ReceptiveField:
-    """The field that knows most about the pair: between depths, around H x, or along the row."""
-    if pair.link is None and pair.calibrated and pair.depth is not None:
-        return between_depths(pair, state)
-    return around_homography(pair, state) if pair.link is not None or pair.calibrated else along_row(pair, state)
+FAMILIES = ("auto", *FIELDS)
+"""Names of the fields to choose from; auto is the pair's own, as fusion takes it."""
 
 
-def between_depths(pair: Pair, state: State) -> ReceptiveField:
-    """Epipolar, through the lenses where there are any."""
-    lenses = any(isinstance(c, Camera) and c.distortion is not None for c in (pair.alpha, pair.beta))
-    return Curved(256) if lenses else Epipolar()
+def chosen_field(pair: Pair, state: State) -> ReceptiveField:
+    """The field of the state's family, through the lenses where it is depth-bounded."""
+    if state.family == "auto":
+        return with_displacement(recorded_field(pair), state.displacement)
+    if state.family == "epipolar":
+        return Curved(256) if pair.has_lens else Epipolar()
+    pixels, (h, w) = displacement(pair, state), pair.beta.hw
+    options: dict[str, dict[str, Any]] = {
+        "homography": {"displacement": pixels},
+        "rectified": {"max_disparity": pixels, "alpha_is": "either"},
+        "nearest": {"window": max(1, round(pixels))},
+        "local": {"size": 9},
+        "dense": {"stride": max(1, math.ceil(math.sqrt(h * w / DENSE)))},
+        "curved": {"samples": 256},
+    }
+    return FIELDS[state.family](**options.get(state.family, {}))
 
 
-def around_homography(pair: Pair, state: State) -> ReceptiveField:
-    """The line within the displacement of H x."""
-    return HomographyDisplacement(displacement(pair, state))
+DENSE = 2048
+"""About how many positions of beta the dense field keeps."""
 
 
-def nearest_voxels(pair: Pair, state: State) -> ReceptiveField:
-    """The paper's whole pixels beside the line."""
-    return NearestVoxels(window=max(1, round(displacement(pair, state))))
-
-
-def along_row(pair: Pair, state: State) -> ReceptiveField:
-    """The row of a rectified pair."""
-    return Rectified(displacement(pair, state), alpha_is="either")
-
-
-def everywhere(pair: Pair, state: State) -> ReceptiveField:
-    """All of beta, thinned out to some two thousand positions."""
-    h, w = pair.beta.hw
-    return Dense(stride=max(1, math.ceil(math.sqrt(h * w / 2048))))
-
-
-FAMILIES: dict[str, Callable[[Pair, State], ReceptiveField]] = {
-    "auto": auto,
-    "epipolar": between_depths,
-    "line": lambda pair, state: EpipolarLine(),
-    "homography": around_homography,
-    "rectified": along_row,
-    "nearest": nearest_voxels,
-    "local": lambda pair, state: Local(9),
-    "dense": everywhere,
-}
+def with_displacement(found: ReceptiveField, pixels: float | None) -> ReceptiveField:
+    """The field with the displacement that the control asks for, if it has one."""
+    if pixels is not None and isinstance(found, HomographyDisplacement):
+        return HomographyDisplacement(pixels)
+    if pixels is not None and isinstance(found, Rectified):
+        return dataclasses.replace(found, max_disparity=pixels)
+    return found
 
 
 def displacement(pair: Pair, state: State) -> float:
@@ -167,7 +153,7 @@ def displacement(pair: Pair, state: State) -> float:
         return state.displacement
     if pair.link is None and pair.calibrated and pair.depth is not None:
         return max(1.0, float(covering_displacement(pair, pixel_of(state))))
-    return 0.06 * max(pair.beta.hw)
+    return LINE_SHARE * max(pair.beta.hw)
 
 
 def changed_rig(rig: Rig, state: State) -> Rig:
@@ -209,7 +195,7 @@ def pixel_of(state: State) -> Float[Tensor, "1 2"]:
 def look_in_beta(scene: Scene, pair: Pair, name: str, state: State) -> SeenInBeta:
     """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not fit."""
     x = pixel_of(state)
-    chosen = FAMILIES[state.family](pair, state)
+    chosen = chosen_field(pair, state)
     found = (Widened(chosen, across=state.across) if state.across else chosen)(pair, x)
     samples = found.positions(samples_along(found)) if isinstance(found, Segments) else found
     xy, counts = samples.xy[0], samples.mask[0]

@@ -24,8 +24,7 @@ from arraygeom import (
     depth_from_track,
     pixel_grid,
 )
-from arraygeom.fields import pinhole_track
-from arraygeom.fields.default import default_field
+from arraygeom.fields import default_field, pinhole_track
 from arraygeom.pixels import HW
 
 from ..media.images import Images

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from arraygeom import ReceptiveField
-from arraygeom.fields.default import default_field
+from arraygeom.fields import default_field
 
 from .results import Frame
 

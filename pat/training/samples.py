@@ -21,23 +21,17 @@ from torch.nn.functional import interpolate
 
 from arraygeom import (
     Camera,
-    Dense,
     Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Local,
-    NearestVoxels,
     Pair,
     Pose,
     Positions,
     ReceptiveField,
-    Rectified,
     Segments,
     pixel_grid,
     rotation_from_vector,
     sample,
 )
-from arraygeom.fields import pinhole_track
+from arraygeom.fields import FIELDS, pinhole_track
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
 from pat.networks.protocol import Look
@@ -45,7 +39,7 @@ from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augme
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
-from .config import FieldName, Recording, TrainConfig
+from .config import Recording, TrainConfig
 from .lenses import LOST, through_lenses
 from .scenes import RenderedCrops
 from .spectra import MOST, Spectra
@@ -57,17 +51,6 @@ FEW = 8
 """With fewer than this many waiting, a new one is always made."""
 SCENE, RECORDING = 0, 1
 """What randomness is for, besides the seed and a number."""
-
-FIELDS: dict[FieldName, Callable[[], ReceptiveField]] = {
-    "epipolar": Epipolar,
-    "line": EpipolarLine,
-    "homography": HomographyDisplacement,
-    "rectified": lambda: Rectified(alpha_is="either"),
-    "nearest": NearestVoxels,
-    "local": Local,
-    "dense": Dense,
-}
-"""Where samples may look, by name."""
 
 
 class Sample(NamedTuple):

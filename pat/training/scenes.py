@@ -15,9 +15,9 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.undistortion import pinhole_view, resampled
 from pat.data.patches import reading, reduced, reduced_depth, scene_folders, scene_rig
@@ -242,7 +242,7 @@ def batched(drawn: Sequence[Sequence[View]], device: str) -> ArrayBatch:
     images = [coded(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
     relative = [[v.camera.cam_from_world @ one[0].camera.cam_from_world.inverse() for v in one] for one in drawn]
-    poses = [Pose(torch.stack([p.R for p in same]), torch.stack([p.t for p in same])) for same in zip(*relative)]
+    poses = [stack(same) for same in zip(*relative)]
     K = [torch.stack([v.camera.K for v in same]).to(device, torch.float32) for same in views]
     R, t = ([getattr(p, part).to(device, torch.float32) for p in poses] for part in ("R", "t"))
     return ArrayBatch(images, depth, K, R, t, [same[0].camera.hw for same in views], bounds(depth[0]))

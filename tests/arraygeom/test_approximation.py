@@ -13,7 +13,7 @@ from arraygeom import (
     approximated,
     fit_homography,
     fit_similarity,
-    look,
+    sampling_locations,
 )
 from arraygeom.fields import covering_displacement, placement_error
 from arraygeom.pixels import pixel_grid
@@ -87,7 +87,7 @@ def test_fits_place_the_middles_better_than_the_middle_plane(seed):
 def test_the_approximation_covers_near_to_far(kind):
     pair = approximated(random_rig(1).pair("alpha", "beta"), kind)
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)
-    exact, rough = Epipolar()(pair, x), look(HomographyDisplacement(), pair, x)
+    exact, rough = Epipolar()(pair, x), sampling_locations(HomographyDisplacement(), pair, x)
     assert rough.valid[exact.valid].all()
     for end in (exact.start, exact.end):
         on = rough.at(rough.fraction(end).clamp(0, 1))

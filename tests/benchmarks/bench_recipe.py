@@ -24,12 +24,13 @@ import torch
 import tyro
 
 from arraygeom.atomic import write_text
+from arraygeom.fields import FIELDS
 from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import FIELDS, Sample, Source, photographs
+from pat.training.samples import Sample, Source, photographs
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
