@@ -1,7 +1,8 @@
 """Drawings of rigs, fields and residuals. Functions give back a figure and show nothing.
 
 Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the
-figure as the last line of a notebook's cell. `interactive_rig` needs plotly.
+figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn; `interactive_rig` needs
+plotly.
 """
 
 from __future__ import annotations
@@ -10,17 +11,14 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from .camera import Camera
 from .epipolar import epipolar_distance, epipolar_lines
+from .extras import needs
 from .fields import ReceptiveField, recorded_field
 from .fields.widened import direction
 from .pixels import HW
@@ -29,6 +27,8 @@ from .segments import Segments
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#5c5c5c")
 """Okabe and Ito's, which colour-blind readers can tell apart."""
@@ -45,7 +45,7 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
     times its extent, or is infinite). Up in the figure is -y of the world.
     """
     cameras = calibrated(rig)
-    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
+    figure = new_figure(figsize=(5.2, 4.6), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d", proj_type="ortho")
     size = size or frustum_size(cameras)
     for colour, (name, camera) in zip(_colours(), cameras.items()):
@@ -65,10 +65,8 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
 
 def interactive_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None) -> go.Figure:
     """The drawing of `draw_rig` as a plotly figure to turn about. Raises ImportError without plotly."""
-    try:
+    with needs("explore", "the interactive figure"):
         import plotly.graph_objects as go
-    except ImportError as error:
-        raise ImportError("the interactive figure needs plotly: `pip install plotly`, or use draw_rig") from error
     cameras = calibrated(rig)
     figure = go.Figure()
     size = size or frustum_size(cameras)
@@ -173,7 +171,7 @@ def draw_fields(
     """
     betas = tuple(betas or rig.betas(alpha))
     images = images or {}
-    figure = Figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
+    figure = new_figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
     for index, name in enumerate((alpha, *betas)):
         axes = figure.add_subplot(1, 1 + len(betas), 1 + index)
         show_image(axes, rig[name].hw, images.get(name))
@@ -217,13 +215,15 @@ def draw_residuals(
     Left, each distance drawn across its line and `magnify` times as long (by default so that the median is 2 % of
     the width); right, their histogram, with the median. Pixels of undistorted images.
     """
+    with needs("plots", "drawing"):
+        from matplotlib.collections import LineCollection
     line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
     size = distance.abs()
     median = float(size.median())
     magnify = magnify or max(1.0, float(np.round(0.02 * pair.beta.hw[1] / max(median, 1e-9), 0)))
     ends = numpy(x_beta - magnify * distance[:, None] * direction(line[:, :2]))
-    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+    figure = new_figure(figsize=(8.4, 3.4), layout="constrained")
     axes, histogram = figure.subplots(1, 2, width_ratios=[1.5, 1])
     show_image(axes, pair.beta.hw, image)
     limit = max(float(size.quantile(0.95)), 1e-9)
@@ -241,6 +241,13 @@ def draw_residuals(
 
 
 # Shared -------------------------------------------------------------------------------------------------------
+
+
+def new_figure(**options: Any) -> Figure:
+    """A matplotlib figure outside pyplot. Raises ImportError where matplotlib is not installed."""
+    with needs("plots", "drawing"):
+        from matplotlib.figure import Figure
+    return Figure(**options)
 
 
 def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
@@ -269,7 +276,9 @@ def _sheet(sizes: list[HW], height: float = 2.6) -> tuple[float, float]:
 def _colours(n: int | None = None) -> list[Any]:
     if n is None or n <= len(COLOURS):
         return [*COLOURS * 32][:n] if n is not None else [*COLOURS * 32]
-    return list(matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, n)))
+    from matplotlib import colormaps
+
+    return list(colormaps["turbo"](np.linspace(0.05, 0.95, n)))
 
 
 def _upright(X: np.ndarray) -> np.ndarray:

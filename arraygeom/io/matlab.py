@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 import torch
 from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import Distortion
 from ..epipolar import epipolar_lines, shift_origin
+from ..extras import needs
 from ..pixels import pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
@@ -61,8 +61,10 @@ def _document(source: Source) -> dict[str, Any]:
         raise source.fail(None, "is empty")
     if data.startswith(b"MATLAB 7.3"):
         raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
+    with needs("calibration", "reading .mat files"):
+        from scipy.io import loadmat
     try:
-        loaded = scipy.io.loadmat(source.path, simplify_cells=True)
+        loaded = loadmat(source.path, simplify_cells=True)
     except Exception:
         # Whatever the parser trips over in a damaged file, the cause is the file.
         raise source.fail(None, "is not a .mat file that can be read; was it cut off?") from None

@@ -11,11 +11,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import KANNALA_BRANDT
+from ..extras import needs
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -115,6 +115,8 @@ def _named(folder: Path, part: str) -> Path | None:
 
 def _nodes(source: Source) -> dict[str, Any]:
     text = source.text()
+    with needs("calibration", "reading OpenCV's files"):
+        import cv2
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -123,7 +125,7 @@ def _nodes(source: Source) -> dict[str, Any]:
         raise source.fail(None, "is not an OpenCV FileStorage (YAML, XML or JSON); is the file whole?") from None
 
 
-def _value(node: cv2.FileNode) -> Any:
+def _value(node: Any) -> Any:
     if node.isString():
         return node.string()
     if node.isInt() or node.isReal():

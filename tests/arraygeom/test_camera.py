@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -6,6 +5,9 @@ import torch
 from arraygeom import Camera, Pose, intrinsics, rotation_from_vector
 from tests.arraygeom.rigs import random_camera, random_rig, scene_points, uniform
 from tests.arraygeom.test_pixels import blob, centroid
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 CHANGES = {
     "smaller": lambda c: c.resize((20, 31)),

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import scipy.io
 import torch
 
 from arraygeom import Camera, LensView, Link, Pose, Rig, View, intrinsics
@@ -19,6 +18,9 @@ from arraygeom.distortion import Distortion
 from arraygeom.io import READERS, RigFileError, RigFileWarning, convention, read_rig, recognise, write_rig
 from arraygeom.pose import rotation_from_vector
 from arraygeom.sensor import Sensor
+from tests.oracles import Oracle
+
+scipy_io = Oracle("scipy.io")
 
 FIXTURES = Path(__file__).parent / "fixtures"
 SIZE = {"hw": (480, 640)}
@@ -134,7 +136,7 @@ def test_matlab_mat_files(file, tmp_path):
         return np.array(value, dtype=float) if isinstance(value, list) else value
 
     path = tmp_path / "stereo.mat"
-    scipy.io.savemat(path, {"s": arrays(fields)})
+    scipy_io.savemat(path, {"s": arrays(fields)})
     assert recognise(path) == "matlab"
     assert_is_the_pair(read_rig(path), ("camera1", "camera2"))
     path.write_bytes(path.read_bytes()[:300])

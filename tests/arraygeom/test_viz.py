@@ -3,15 +3,16 @@ import io
 import numpy as np
 import pytest
 import torch
-from matplotlib.figure import Figure
 
 from arraygeom import Distortion, Epipolar, Link, Local, Rig, Segments, View, Widened, sampling_locations, viz
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
 
+pytest.importorskip("matplotlib", reason="drawings need matplotlib")
+
 X = torch.tensor([[20.0, 20.0], [40.0, 30.0], [30.0, 25.0]], dtype=torch.float64)
 
 
-def png(figure: Figure) -> bytes:
+def png(figure) -> bytes:
     target = io.BytesIO()
     figure.savefig(target, dpi=40)
     return target.getvalue()
