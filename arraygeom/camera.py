@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
@@ -49,7 +48,7 @@ class View(Batched):
         return self.transformed(shift_matrix(left, top), hw)
 
     def rot90(self: AnyView, quarter_turns: int) -> AnyView:
-        """The image turned counter-clockwise, as `torch.rot90(image, k, (-2, -1))` turns it."""
+        """The view of the image rotated counter-clockwise, as `torch.rot90(image, k, (-2, -1))`."""
         hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
         return self.transformed(rot90_matrix(self.hw, quarter_turns), hw)
 
@@ -58,7 +57,7 @@ class View(Batched):
         return self.replace(hw=hw)
 
     def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Where a camera without this one's lens would have put what pixels see, and which the lens model reaches."""
+        """Undistorted pixels, and which of them are within the lens model's range."""
         return x, torch.ones_like(x[..., 0], dtype=torch.bool)
 
     def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
@@ -70,20 +69,16 @@ class View(Batched):
         h, w = self.hw
         return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
 
-    def replace(self: AnyView, **changes: Any) -> AnyView:
-        """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)
-
     def _text(self) -> str:
         return view_text(self)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class LensView(View):
-    """A view whose lens is known; its focal length and its place need not be.
+    """A view with a lens model, whose focal length and pose need not be known.
 
     `K` maps the plane z = 1 (after the lens) to pixels. Without a calibration it is only the scale and the centre in
-    which `distortion` counts: then `rays` say how the lens bends, not at which angle. Links of such views relate
+    which `distortion` counts: then `rays` follow the lens but their angles mean nothing. Links of such views relate
     undistorted pixels.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
@@ -102,14 +97,14 @@ class LensView(View):
         return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
     def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
-        """The direction in the camera's frame of what pixels see, z = 1 for pinholes, and its validity."""
+        """The rays of pixels in the camera's frame, z = 1 for pinholes, and their validity."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
     def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Where a pinhole with the same K would have put what pixels see, and which the lens model reaches."""
+        """Pixels of a pinhole with the same K, and which are within the lens model's range."""
         return self._each_through(Distortion.undistort, x)
 
     def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
@@ -144,7 +139,7 @@ class Camera(LensView):
     """A calibrated camera. Leading batch axes everywhere; every tensor may require grad.
 
     `K` maps the plane z = 1 (after the lens) to pixels, the first pixel's centre being (0, 0). It is affine,
-    not necessarily upper triangular: that of a turned image has zeros on its diagonal.
+    not necessarily upper triangular: that of a rotated image has zeros on its diagonal.
     `cam_from_world`: X_cam = R X_world + t in metres, x right, y down, z forward.
 
     >>> K = torch.tensor([[100.0, 0, 49.5], [0, 100.0, 29.5], [0, 0, 1]], dtype=torch.float64)
@@ -177,7 +172,7 @@ class Camera(LensView):
     def unproject(self, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
         """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
 
-        Raises nothing: ask `rays` for validity.
+        Raises nothing: `rays` gives the validity.
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]

@@ -1,4 +1,4 @@
-"""Rig: named cameras of different kinds, and the depths of what they look at."""
+"""Rig: named cameras of different kinds, and the depth range of the scene."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Link(Batched):
-    """What is known of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
+    """The two-view geometry of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
 
     Of views with lenses, x are undistorted pixels (`LensView.undistort`).
     """
@@ -56,14 +56,14 @@ class Link(Batched):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Pair(Batched):
-    """Alpha and one beta, and all that relates them: two calibrated cameras, or a link, or only sizes."""
+    """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes."""
 
     alpha: View
     beta: View
     depth: Depths | None = None
     link: Link | None = None
     memo: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False, repr=False)
-    """What fields have found out about the pair once and need again for the next pixels; never copied."""
+    """Cache of what fields compute once a pair; never copied."""
 
     @property
     def calibrated(self) -> bool:
@@ -118,7 +118,7 @@ class Pair(Batched):
     def homography(self) -> Float[Tensor, "*b 3 3"]:
         """H with x_beta ~ H x_alpha, roughly: as given; or of the plane at the middle inverse depth.
 
-        A pair that is known only by sizes, or by F alone, is taken to see the same field of view.
+        A pair that is known only by sizes, or by F alone, is assumed to have the same field of view.
         """
         if self.link is not None and self.link.H is not None:
             return self.link.H
@@ -133,7 +133,7 @@ class Pair(Batched):
         return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
 
     def rot90_beta(self, quarter_turns: int) -> Pair:
-        """The pair whose beta has its image turned; see `Camera.rot90`."""
+        """The pair whose beta has its image rotated; see `Camera.rot90`."""
         h, w = self.beta.hw
         return self.transform_beta(rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
 
@@ -214,10 +214,6 @@ class Rig(Batched):
             link = self.links[beta, alpha].reversed()
         return Pair(self[alpha], self[beta], self.depth, link)
 
-    def replace(self, **changes: Any) -> Rig:
-        """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)
-
     def with_camera(self, name: str, camera: View) -> Rig:
         """A copy with one camera set, replacing that of the same name if there is one."""
         return self.replace(cameras={**self.cameras, name: camera})
@@ -231,7 +227,7 @@ class Rig(Batched):
         return self.transformed(name, shift_matrix(left, top), hw)
 
     def rot90(self, name: str, quarter_turns: int) -> Rig:
-        """The rig whose camera `name` has its image turned; see `Camera.rot90`."""
+        """The rig whose camera `name` has its image rotated; see `Camera.rot90`."""
         hw = self[name].hw
         return self.transformed(name, rot90_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0]))
 
@@ -284,7 +280,7 @@ class Rig(Batched):
         return read_rig(path)
 
     def save(self, path: str | Path) -> None:
-        """Write the native rig file; it appears whole or not at all."""
+        """Write the native rig file, atomically."""
         from .io import write_rig
 
         write_rig(self, path)
@@ -336,8 +332,8 @@ def _shown(d: Tensor) -> str:
     return ", ".join(f"{v:g}" for v in d.reshape(-1).tolist())
 
 
-def _focal_places(K: Tensor) -> Tensor:
-    """Where K has fx and fy, with their signs: the diagonal, or for a turned image the other one."""
+def _focal_positions(K: Tensor) -> Tensor:
+    """The positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other one."""
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
     return torch.where(largest, block.sign(), 0.0)
@@ -356,7 +352,7 @@ def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) ->
     if mine.keys() & {"rotation", "translation"}:
         pose = pose.perturbed(mine.get("rotation"), mine.get("translation"))
     if "focal" in mine:
-        K = K + torch.nn.functional.pad(_focal_places(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
+        K = K + torch.nn.functional.pad(_focal_positions(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
     if "centre" in mine:
         K = K + torch.nn.functional.pad(mine["centre"][..., None], (2, 0, 0, 1))
     return camera.replace(K=K, cam_from_world=pose)

@@ -1,8 +1,8 @@
-"""Where to look in beta: what geometry hands to attention.
+"""Search segments and sampling positions in beta: what geometry hands to attention.
 
 `Segments` is the compact form, two points for each alpha pixel; `Positions` is the explicit one. Both hold
 (x, y) in beta's pixels, the centre of the first pixel being (0, 0). An image of height H and width W covers
-the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be looked up, all others cannot.
+the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be sampled, all others cannot.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from .text import positions_text, segments_text
 class Positions(Batched):
     """Explicit sample positions, L for each alpha pixel.
 
-    `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count has
-    nowhere to look.
+    `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count is
+    not seen by beta.
     """
 
     item_axes: ClassVar = {"xy": 2, "mask": 1}
@@ -40,7 +40,7 @@ class Segments(Batched):
     """One straight piece of beta's image for each alpha pixel, from `start` to `end`, in beta's pixels.
 
     For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far bound.
-    Where `valid` is False there is nowhere to look and the ends mean nothing (but are finite).
+    Where `valid` is False there is nothing to sample and the ends mean nothing (but are finite).
     """
 
     item_axes: ClassVar = {"start": 1, "end": 1}
@@ -106,7 +106,7 @@ def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> T
 
 
 FLAT = 1e-6
-"""A limit of the image that moves by less than this along a whole segment, in pixels, is either kept or not."""
+"""A limit of the image that moves by less than this along a whole segment, in pixels, is either inside or not."""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:

@@ -1,4 +1,4 @@
-"""What a designer wants to know of a rig at a glance."""
+"""A rig in numbers: fields of view, baselines, segment lengths, depth resolution."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PairSummary(NamedTuple):
     """Alpha and one beta.
 
     baseline: metres between the optical centres; rotation: degrees between the orientations.
-    seen: share of alpha's pixels that look somewhere in beta.
+    seen: share of alpha's pixels that have a segment in beta.
     length: (median, largest) length of their segments, pixels of beta.
     depth_step: (near, far), the change of depth that moves the point by one pixel in beta, metres.
     """
@@ -72,7 +72,7 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
 def field_of_view(camera: Camera) -> tuple[float, float]:
     """Angles (across, down) in degrees between the rays at the middles of opposite edges, through the lens.
 
-    An edge that the lens model does not reach gives NaN.
+    An edge outside the lens model's range gives NaN.
     """
     h, w = camera.hw
     middle = ((w - 1) / 2, (h - 1) / 2)
@@ -97,7 +97,7 @@ def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels that look somewhere, and (median, largest) length of where, on every fourth pixel."""
+    """Share of alpha's pixels with a segment, and its (median, largest) length, on every fourth pixel."""
     x = pixel_grid(pair.alpha.hw)[::4, ::4]
     alpha, beta = pair.cameras
     straight = alpha.distortion is None and beta.distortion is None

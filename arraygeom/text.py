@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -22,9 +22,7 @@ if TYPE_CHECKING:
 
 def view_text(view: View) -> str:
     """Size, focal length, lens and response: "741x497 f=999 rgb"."""
-    lens = getattr(view, "distortion", None)
-    parts = [f"{view.hw[1]}x{view.hw[0]}", _focal_text(view), lens.model if lens else "", response_text(view.sensor)]
-    return " ".join(part for part in parts if part)
+    return " ".join(part for part in _facts(view) if part)
 
 
 def response_text(sensor: Sensor) -> str:
@@ -94,13 +92,11 @@ def depth_text(depth: tuple[Tensor, Tensor] | None) -> str:
 
 def rig_html(rig: Rig) -> str:
     """A table of the cameras, every value escaped."""
-    rows = [
-        (name, f"{v.hw[1]}x{v.hw[0]}", _focal_text(v)[2:], *_lens_and_response(v)) for name, v in rig.cameras.items()
-    ]
-    head = _row(("camera", "size", "f (px)", "lens", "response"), "th")
+    rows = [("camera", "size", "focal length", "lens", "response"), *((n, *_facts(v)) for n, v in rig.cameras.items())]
+    cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
     facts = (rig.name, batch_text(rig), baseline_text(rig.cameras), depth_text(rig.depth))
     caption = escape("; ".join(fact for fact in facts if fact))
-    return f"<table><caption>{caption}</caption>{head}{''.join(_row(row, 'td') for row in rows)}</table>"
+    return f"<table><caption>{caption}</caption>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
 
 def batch_text(value: Batched) -> str:
@@ -115,20 +111,12 @@ def angle(R: Tensor) -> Tensor:
     return torch.atan2(0.5 * skew.norm(dim=-1), 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1))
 
 
-def _row(cells: tuple[Any, ...], tag: str) -> str:
-    return "<tr>" + "".join(f"<{tag}>{escape(str(cell))}</{tag}>" for cell in cells) + "</tr>"
-
-
-def _lens_and_response(view: View) -> tuple[str, str]:
-    lens = getattr(view, "distortion", None)
-    return lens.model if lens else "", response_text(view.sensor)
-
-
-def _focal_text(view: View) -> str:
-    """The focal length of a calibrated camera, pixels."""
-    if not hasattr(view, "cam_from_world"):
-        return ""
-    return "f=" + _range(view.K.detach()[..., :2, :2].det().abs().sqrt(), ".4g")
+def _facts(view: View) -> tuple[str, str, str, str]:
+    """Size, focal length (pixels; if calibrated), lens model and response."""
+    lens, focal = getattr(view, "distortion", None), ""
+    if hasattr(view, "cam_from_world"):
+        focal = "f=" + _range(view.K.detach()[..., :2, :2].det().abs().sqrt(), ".4g")
+    return f"{view.hw[1]}x{view.hw[0]}", focal, lens.model if lens else "", response_text(view.sensor)
 
 
 def _range(values: Tensor, form: str) -> str:

@@ -64,7 +64,7 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
 
 
 def interactive_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None) -> go.Figure:
-    """The drawing of `draw_rig` as a plotly figure to turn about. Raises ImportError without plotly."""
+    """The drawing of `draw_rig` as an interactive plotly figure. Raises ImportError without plotly."""
     with needs("explore", "the interactive figure"):
         import plotly.graph_objects as go
     cameras = calibrated(rig)
@@ -138,7 +138,7 @@ def image_border(hw: HW, points: int = 16) -> Float[Tensor, "n 2"]:
 def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray:
     """World points of pixels at a depth; NaN where the lens has no ray.
 
-    Pixels that the lens model does not reach are moved towards the middle until it does, and rays more than 53
+    Pixels outside the lens model's range are moved towards the middle until they are inside, and rays more than 53
     degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
     """
     camera = camera.to(torch.float64)
@@ -151,7 +151,7 @@ def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray
     return numpy(torch.where(valid.any(0)[:, None], points, torch.nan))
 
 
-# Where to look ------------------------------------------------------------------------------------------------
+# Receptive fields ------------------------------------------------------------------------------------------------
 
 
 def draw_fields(
@@ -163,7 +163,7 @@ def draw_fields(
     images: Mapping[str, Any] | None = None,
     betas: Sequence[str] | None = None,
 ) -> Figure:
-    """Alpha's pixels x, and in every beta where a field looks for them, in the same colours.
+    """Alpha's pixels x, and their sampling locations in every beta, in the same colours.
 
     `field` is one for all betas or one for each by name (`recorded_field` by default). `images` holds (H, W),
     (H, W, 3) or (3, H, W) images by camera name.
@@ -186,7 +186,7 @@ def draw_fields(
 
 
 def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
-    """Where a field looks in beta for each of a few alpha pixels, each in its own colour."""
+    """The sampling locations in beta of a few alpha pixels, each in its own colour."""
     found = field(pair, x)
     for i, colour in enumerate(_colours(len(x))):
         if isinstance(found, Segments):

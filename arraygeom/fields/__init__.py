@@ -1,4 +1,4 @@
-"""Receptive fields: where in beta to look for the point that an alpha pixel sees.
+"""Receptive fields: the sampling locations in beta for the point that an alpha pixel sees.
 
 A field is anything that can be called with a `Pair` and alpha pixels x (*n, 2), and answers with `Segments` or
 `Positions` over *n. The families here are frozen dataclasses; a plain function serves as well:

@@ -19,7 +19,7 @@ SamplingLocations = Segments | Positions
 
 @runtime_checkable
 class ReceptiveField(Protocol):
-    """Where to look in beta for each alpha pixel."""
+    """The search segment or sampling locations in beta of each alpha pixel."""
 
     def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments or positions in beta's pixels, for alpha's pixels x. Differentiable in the pair's numbers."""

@@ -1,4 +1,4 @@
-"""Room for what a field does not know: calibration that is a little off, and things that move."""
+"""Tolerance of fields to calibration errors and to motion."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Widened:
 
     @classmethod
     def for_motion(cls, field: ReceptiveField, pixels: float, **options: int) -> Widened:
-        """Room for things that move by up to `pixels` between the cameras' exposures."""
+        """Tolerance to motion of up to `pixels` between the cameras' exposures."""
         return cls(field, across=pixels, along=pixels, **options)
 
     @property

@@ -7,7 +7,6 @@ import pytest
 import torch
 from kornia.geometry import calibration, epipolar
 from kornia.geometry.camera import PinholeCamera, project_points, unproject_points
-from kornia.geometry.conversions import axis_angle_to_rotation_matrix, rotation_matrix_to_axis_angle
 from kornia.geometry.liegroup import Se3, So3
 from kornia.geometry.linalg import inverse_transformation, transform_points
 from kornia.geometry.transform import remap
@@ -30,18 +29,15 @@ from arraygeom import (
     stack,
     triangulate,
 )
-from arraygeom.rectification import rotation_vector
+from arraygeom.pose import rotation_vector
 from tests.arraygeom.rigs import random_rig, scene_points
 
 F64 = torch.float64
 RIG = random_rig(3)
-X = scene_points(RIG, 40)
 ALPHA, BETA = RIG["alpha"], RIG["beta"]
-X_ALPHA, X_BETA = ALPHA.project(X).x, BETA.project(X).x
 PAIR = RIG.pair("alpha", "beta")
 H = PAIR.homography
 IMAGE = torch.rand(1, 2, 48, 64, dtype=F64, generator=torch.Generator().manual_seed(0))
-VECTORS = torch.randn(20, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
 LENS = torch.tensor([-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003], dtype=F64)
 
 
@@ -66,86 +62,92 @@ def lens_view(c: Tensor) -> LensView:
     return LensView(hw=ALPHA.hw, K=ALPHA.K, distortion=Distortion("brown-conrady", c))
 
 
-CASES = {
-    "epipolar lines": Parity(
-        lambda F: epipolar_lines(F, X_ALPHA),
-        lambda F: epipolar.compute_correspond_epilines(X_ALPHA[None], F[None])[0],
-        PAIR.fundamental,
-    ),
-    "epipolar distance": Parity(
-        lambda F: epipolar_distance(F, X_ALPHA, X_BETA + 1).abs(),
-        lambda F: epipolar.left_to_right_epipolar_distance(X_ALPHA[None], X_BETA[None] + 1, F[None])[0],
-        PAIR.fundamental,
-    ),
-    "essential matrix": Parity(
-        lambda t: essential_matrix(PAIR.beta_from_alpha.replace(t=t)),
-        lambda t: epipolar.cross_product_matrix(t) @ PAIR.beta_from_alpha.R,
-        PAIR.beta_from_alpha.t,
-    ),
-    "fundamental matrix": Parity(
-        lambda K: up_to_scale(fundamental_matrix(K, BETA.K, PAIR.beta_from_alpha)),
-        lambda K: up_to_scale(
-            epipolar.fundamental_from_projections(projection(ALPHA.replace(K=K))[None], projection(BETA)[None])[0]
+def cases(points: int) -> dict[str, Parity]:
+    """What both libraries have, for some points that both cameras of RIG see."""
+    X = scene_points(RIG, points)
+    x_alpha, x_beta = ALPHA.project(X).x, BETA.project(X).x
+    vectors = torch.randn(points, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+    return {
+        "epipolar lines": Parity(
+            lambda F: epipolar_lines(F, x_alpha),
+            lambda F: epipolar.compute_correspond_epilines(x_alpha[None], F[None])[0],
+            PAIR.fundamental,
         ),
-        ALPHA.K,
-        1e-7,
-    ),
-    "homography of points": Parity(
-        lambda H: apply_homography(H, X_ALPHA).x, lambda H: transform_points(H[None], X_ALPHA[None])[0], H
-    ),
-    "projection": Parity(
-        lambda X: ALPHA.project_local(X).x, lambda X: project_points(X, ALPHA.K), ALPHA.cam_from_world.apply(X)
-    ),
-    "unprojection": Parity(
-        lambda x: torch.cat(ALPHA.rays(x)[:1]) * 2.0,
-        lambda x: unproject_points(x, torch.full((len(x), 1), 2.0, dtype=F64), ALPHA.K.expand(len(x), 3, 3)),
-        X_ALPHA,
-    ),
-    "exp of a rotation": Parity(rotation_from_vector, axis_angle_to_rotation_matrix, VECTORS),
-    "exp, as Lie group": Parity(rotation_from_vector, lambda w: So3.exp(w).matrix(), VECTORS),
-    "log of a rotation": Parity(
-        lambda w: torch.stack([rotation_vector(R) for R in rotation_from_vector(w)]),
-        lambda w: rotation_matrix_to_axis_angle(rotation_from_vector(w)),
-        VECTORS,
-        1e-7,
-    ),
-    "inverse pose": Parity(
-        lambda w: ALPHA.cam_from_world.perturbed(w).inverse().t,
-        lambda w: Se3(So3.from_matrix(rotation_from_vector(w) @ ALPHA.R), ALPHA.t).inverse().matrix()[:3, 3],
-        0.1 * VECTORS[0],
-        1e-8,
-    ),
-    "composed poses": Parity(
-        lambda t: (BETA.cam_from_world @ ALPHA.cam_from_world.replace(t=t).inverse()).t,
-        lambda t: (matrix4(BETA.R, BETA.t) @ inverse_transformation(matrix4(ALPHA.R, t)))[:3, 3],
-        ALPHA.t,
-    ),
-    "triangulation": Parity(
-        lambda x: triangulate([ALPHA, BETA], torch.stack([X_ALPHA, x])).X,
-        lambda x: epipolar.triangulate_points(projection(ALPHA), projection(BETA), X_ALPHA, x),
-        X_BETA,
-        2e-6,
-    ),
-    "distortion": Parity(
-        lambda c: lens_view(c).distort(X_ALPHA)[0],
-        lambda c: calibration.distort_points(X_ALPHA[None], ALPHA.K[None], c[None])[0],
-        LENS,
-    ),
-    "undistortion": Parity(
-        lambda c: lens_view(c).undistort(X_ALPHA)[0],
-        lambda c: calibration.undistort_points(X_ALPHA[None], ALPHA.K[None], c[None], num_iters=60)[0],
-        LENS,
-        1e-6,
-    ),
-    "sampling": Parity(
-        lambda x: sample(IMAGE, x[None]).values[0],
-        lambda x: remap(IMAGE, x[None, None, :, 0], x[None, None, :, 1], align_corners=True)[0, :, 0],
-        X_ALPHA.clamp(1.3, 46.3),
-    ),
-    "pixel grid": Parity(
-        lambda s: s * pixel_grid((3, 5), dtype=F64), lambda s: s * created_grid(3, 5), torch.ones((), dtype=F64)
-    ),
-}
+        "epipolar distance": Parity(
+            lambda F: epipolar_distance(F, x_alpha, x_beta + 1).abs(),
+            lambda F: epipolar.left_to_right_epipolar_distance(x_alpha[None], x_beta[None] + 1, F[None])[0],
+            PAIR.fundamental,
+        ),
+        "essential matrix": Parity(
+            lambda t: essential_matrix(PAIR.beta_from_alpha.replace(t=t)),
+            lambda t: epipolar.cross_product_matrix(t) @ PAIR.beta_from_alpha.R,
+            PAIR.beta_from_alpha.t,
+        ),
+        "fundamental matrix": Parity(
+            lambda K: up_to_scale(fundamental_matrix(K, BETA.K, PAIR.beta_from_alpha)),
+            lambda K: up_to_scale(
+                epipolar.fundamental_from_projections(projection(ALPHA.replace(K=K))[None], projection(BETA)[None])[0]
+            ),
+            ALPHA.K,
+            1e-7,
+        ),
+        "homography of points": Parity(
+            lambda H: apply_homography(H, x_alpha).x, lambda H: transform_points(H[None], x_alpha[None])[0], H
+        ),
+        "projection": Parity(
+            lambda X: ALPHA.project_local(X).x, lambda X: project_points(X, ALPHA.K), ALPHA.cam_from_world.apply(X)
+        ),
+        "unprojection": Parity(
+            lambda x: torch.cat(ALPHA.rays(x)[:1]) * 2.0,
+            lambda x: unproject_points(x, torch.full((len(x), 1), 2.0, dtype=F64), ALPHA.K.expand(len(x), 3, 3)),
+            x_alpha,
+        ),
+        "exp of a rotation": Parity(rotation_from_vector, lambda w: So3.exp(w).matrix(), vectors),
+        "log of a rotation": Parity(
+            lambda w: rotation_vector(rotation_from_vector(w)), lambda w: So3.exp(w).log(), vectors, 1e-7
+        ),
+        "inverse pose": Parity(
+            lambda w: ALPHA.cam_from_world.perturbed(w).inverse().t,
+            lambda w: Se3(So3.from_matrix(rotation_from_vector(w) @ ALPHA.R), ALPHA.t).inverse().matrix()[:3, 3],
+            0.1 * vectors[0],
+            1e-8,
+        ),
+        "composed poses": Parity(
+            lambda t: (BETA.cam_from_world @ ALPHA.cam_from_world.replace(t=t).inverse()).t,
+            lambda t: (matrix4(BETA.R, BETA.t) @ inverse_transformation(matrix4(ALPHA.R, t)))[:3, 3],
+            ALPHA.t,
+        ),
+        "triangulation": Parity(
+            lambda x: triangulate([ALPHA, BETA], torch.stack([x_alpha, x])).X,
+            lambda x: epipolar.triangulate_points(projection(ALPHA), projection(BETA), x_alpha, x),
+            x_beta,
+            2e-6,
+        ),
+        "distortion": Parity(
+            lambda c: lens_view(c).distort(x_alpha)[0],
+            lambda c: calibration.distort_points(x_alpha[None], ALPHA.K[None], c[None])[0],
+            LENS,
+        ),
+        "undistortion": Parity(
+            lambda c: lens_view(c).undistort(x_alpha)[0],
+            lambda c: calibration.undistort_points(x_alpha[None], ALPHA.K[None], c[None], num_iters=60)[0],
+            LENS,
+            1e-6,
+        ),
+        "sampling": Parity(
+            lambda x: sample(IMAGE, x[None]).values[0],
+            lambda x: remap(IMAGE, x[None, None, :, 0], x[None, None, :, 1], align_corners=True)[0, :, 0],
+            x_alpha.clamp(1.3, 46.3),
+        ),
+        "pixel grid": Parity(
+            lambda s: s * pixel_grid((3, 5), dtype=F64), lambda s: s * created_grid(3, 5), torch.ones((), dtype=F64)
+        ),
+    }
+
+
+X = scene_points(RIG, 40)
+X_ALPHA, X_BETA = ALPHA.project(X).x, BETA.project(X).x
+CASES = cases(40)
 
 
 def matrix4(R: Tensor, t: Tensor) -> Tensor:
