@@ -93,7 +93,7 @@ def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 
 def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
-    """Axis times angle of a rotation, radians: the inverse of `rotation_from_vector` up to half a turn."""
+    """Axis times angle of a rotation, radians: the inverse of `rotation_from_vector` up to 180 degrees."""
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(R)

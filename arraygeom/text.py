@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -67,7 +67,7 @@ def rig_text(rig: Rig) -> str:
     return "; ".join(part for part in (cameras, baseline_text(rig.cameras), depth_text(rig.depth)) if part)
 
 
-def baseline_text(cameras: Mapping[str, View]) -> str:
+def baseline_text(cameras: Mapping[str, Any]) -> str:
     """Distances between the cameras whose poses are known, in a unit that suits them."""
     centres = [c.centre.detach() for c in cameras.values() if hasattr(c, "cam_from_world")]
     pairs = [(a - b).norm(dim=-1) for i, a in enumerate(centres) for b in centres[:i]]
@@ -111,7 +111,7 @@ def angle(R: Tensor) -> Tensor:
     return torch.atan2(0.5 * skew.norm(dim=-1), 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1))
 
 
-def _facts(view: View) -> tuple[str, str, str, str]:
+def _facts(view: Any) -> tuple[str, str, str, str]:
     """Size, focal length (pixels; if calibrated), lens model and response."""
     lens, focal = getattr(view, "distortion", None), ""
     if hasattr(view, "cam_from_world"):

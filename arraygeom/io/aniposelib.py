@@ -2,7 +2,7 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; world->camera, the rotation as a
 Rodrigues vector (or a matrix); lengths in the board's unit, taken as metres. caliscope's `rotation_count` says by how
-many quarter turns it *shows* a camera's images; the numbers are of the images as recorded, so it is not applied.
+many quarters it rotates a camera's images for display; the numbers are of the images as recorded, so it is not applied.
 """
 
 from __future__ import annotations

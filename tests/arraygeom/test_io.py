@@ -259,7 +259,7 @@ def test_what_a_format_cannot_hold_is_refused(tmp_path):
         write_rig(three, path, format="opencv")
     with pytest.raises(ValueError, match="'t' has a brown-conrady lens of 14 coefficients"):
         write_rig(Rig({"t": tilted}), path, format="colmap")
-    with pytest.raises(ValueError, match="'t' has a skewed or turned K"):
+    with pytest.raises(ValueError, match="'t' has a skewed or rotated K"):
         write_rig(Rig({"t": camera(1).rot90(1)}), path, format="nerfstudio")
     with pytest.raises(ValueError, match="'u' is not one: use the native format"):
         write_rig(Rig({"u": View(hw=(4, 5))}), path, format="kalibr")
