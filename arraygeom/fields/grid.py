@@ -87,7 +87,7 @@ class FieldOnGrid:
 
     def cut(self, box: Box, shift: tuple[int, int] = (0, 0)) -> FieldOnGrid:
         """The field of alpha's pixels in a box (of even sides), for a beta whose first pixel was at `shift` (x, y)."""
-        top, bottom, left, right = box
+        top, _, left, _ = box
 
         def at(x: Tensor) -> Segments | Positions:
             found = self.at(x + x.new_tensor([left, top]))

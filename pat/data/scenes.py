@@ -14,9 +14,9 @@ from torch.utils.data import Dataset, Sampler
 
 from arraygeom.camera import Camera
 from arraygeom.fields import ReceptiveField
+from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
-from pat.networks.protocol import Look
 from pat.sensors import (
     Case,
     Clip,
@@ -53,9 +53,9 @@ class Patch:
     rig: Rig
     alpha: str
 
-    def looks(self, field: ReceptiveField) -> list[Look]:
-        """Where to look in every beta."""
-        return [Look.along(field, self.rig.pair(self.alpha, beta)) for beta in self.rig.betas(self.alpha)]
+    def on_grid(self, field: ReceptiveField) -> list[FieldOnGrid]:
+        """The field of every beta, on alpha's pixels."""
+        return [FieldOnGrid.of(field, self.rig.pair(self.alpha, beta)) for beta in self.rig.betas(self.alpha)]
 
 
 class ScenePatches(Dataset[Patch]):

@@ -50,7 +50,7 @@ from arraygeom.segments import clip_to_image
 
 from ..fusion.fuse import fuse
 from ..fusion.results import save_figure
-from ..fusion.steps import pitch_ratio
+from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
@@ -151,8 +151,8 @@ def families() -> dict[str, Family]:
 
 def disparity(network: FusionNetwork, pair: Pair) -> float:
     """How far from H x points can be, pixels of beta as the network gets it."""
-    scale = pitch_ratio(pair)
-    resized = network.equal_pitch and not 0.8 < scale < 1.25
+    scale = resolution_ratio(pair)
+    resized = network.equal_resolution and not 0.8 < scale < 1.25
     return max(float(covering_displacement(pair)) / (scale if resized else 1.0), 1.0)
 
 

@@ -9,8 +9,10 @@ and a frame depends on nothing but images: any one can be made alone, in any ord
 
 from __future__ import annotations
 
+import dataclasses
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -24,12 +26,11 @@ from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields import default_field
 
 from ..media.colour import luminance, to_luma_chroma
-from ..media.images import check_size, read_image
-from ..media.raw import develop
 from ..networks.protocol import FusionNetwork
 from .fuse import fuse
 from .optical_flow import carried, flow_between, still
 from .results import Frame
+from .views import read_view
 
 
 @runtime_checkable
@@ -52,28 +53,46 @@ UNKNOWN_MOTION = 0.25
 REACH = 2.0
 """Colour is carried from key frames up to this many intervals of theirs away."""
 NEIGHBOURS = 4
-"""Levels are matched over this many key frames before and after."""
+"""Radiometry is normalised over this many key frames before and after."""
+CACHED = 96 * 2**20
+"""Bytes of images kept of each camera: 25 grey frames of 1280x800."""
 
 
 class ImageFiles:
     """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
 
-    `like` is the sensor of alpha, whose scale of light the images are brought to.
+    `alpha` names the camera to whose scale of light the images are brought.
     """
 
     def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
         self.paths, self.name = list(paths), name
-        self.view, self.like = rig[name], rig[alpha].sensor
+        self.rig, self.like = rig, rig[alpha].sensor
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, i: int, /) -> Tensor:
         """Raises FileNotFoundError or ValueError naming camera and file."""
-        path = self.paths[i]
-        image = read_image(path, name=self.name, bits=self.view.sensor.bits)
-        check_size(image, self.view.hw, f"{self.name}: {path}")
-        return develop(image, self.view.sensor, like=self.like)
+        return read_view(self.rig, self.name, self.paths[i], like=self.like)
+
+
+class CachedFrames:
+    """Frames, of which those asked for last are kept, up to `CACHED` bytes: neighbours in time need them again."""
+
+    def __init__(self, frames: Frames) -> None:
+        self.frames = frames
+        self.cached: OrderedDict[int, Tensor] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        if i not in self.cached:
+            self.cached[i] = self.frames[i]
+        self.cached.move_to_end(i)
+        while len(self.cached) > 1 and sum(image.nbytes for image in self.cached.values()) > CACHED:
+            self.cached.popitem(last=False)
+        return self.cached[i]
 
 
 class KeyFrame(NamedTuple):
@@ -162,7 +181,7 @@ class Timeline:
 class SequenceFusion:
     """A sequence to fuse: `colour` of its key frames, and any `frame`.
 
-    What it is made of is as `fuse_sequence` has it; `looks` is the field, `options` go to `fuse`.
+    What it is made of is as `fuse_sequence` has it; `options` go to `fuse`.
     """
 
     network: FusionNetwork
@@ -170,9 +189,13 @@ class SequenceFusion:
     frames: Mapping[str, Frames]
     alpha: str
     speed: float | None = None
-    looks: ReceptiveField | None = None
+    field: ReceptiveField | None = None
     match_levels: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
+        object.__setattr__(self, "frames", cached)
 
     @property
     def timeline(self) -> Timeline:
@@ -235,17 +258,17 @@ class SequenceFusion:
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
         """Where to look in a beta that records at `time`, and how far the motion until then can be trusted."""
-        looks = self.looks or default_field(self.rig.pair(self.alpha, name))
+        field = self.field or default_field(self.rig.pair(self.alpha, name))
         sure = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])
         if abs(steps) < SYNCHRONOUS or count < 2:
-            return looks, sure
+            return field, sure
         other = min(max(index + (round(steps) or (1 if steps > 0 else -1)), 0), count - 1)
         other = other if other != index else index - (1 if steps > 0 else -1)
         flow = flow_between(self.grey(index), self.grey(other))
         step = flow.step * (steps / (other - index))
-        return Moved(Widened(looks, along=self._room(step, time - self._time(index))), step), flow.trust
+        return Moved(Widened(field, along=self._room(step, time - self._time(index))), step), flow.trust
 
     def _room(self, step: Tensor, gap: float) -> float:
         if self.speed is not None:
@@ -256,13 +279,13 @@ class SequenceFusion:
         images = {name: self.frames[name][j] for name, j in betas.items()}
         if self.match_levels and not alone:
             images = {name: self._normalised(name, image, i) for name, image in images.items()}
-        looks = dict.fromkeys(betas, self.looks) if self.looks else {}
+        common = dict.fromkeys(betas, self.field) if self.field else {}
         return fuse(
             self.network,
             self.rig,
             {self.alpha: self.grey(i), **images},
             alpha=self.alpha,
-            field={**looks, **fields},
+            field={**common, **fields},
             match_levels=alone,
             **self.options,
         )

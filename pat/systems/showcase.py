@@ -24,7 +24,7 @@ from ..evaluation.metrics import score
 from ..evaluation.stereo import METHODS, Row, evaluate_sets, markdown, rectified_fusion, sets_markdown, structure_kept
 from ..fusion.fuse import fuse
 from ..fusion.results import colour_depth, save_panels
-from ..fusion.steps import normalised, pitch_ratio
+from ..fusion.steps import normalised, resolution_ratio
 from ..media.colour import luminance_of
 from ..media.images import read_image
 from ..networks.protocol import FusionNetwork
@@ -132,7 +132,7 @@ class Array(NamedTuple):
     def displacement(self) -> float:
         """How far to look along the lines, in alpha's pixels, which is what `fuse` brings betas to."""
         pairs = {name: self.rig.pair(FAST, name) for name in self.fits}
-        return 1.25 * max(fit.displacement / pitch_ratio(pairs[name]) for name, fit in self.fits.items())
+        return 1.25 * max(fit.displacement / resolution_ratio(pairs[name]) for name, fit in self.fits.items())
 
 
 def _fast_and_slow(network: FusionNetwork, array: Array, out: Path) -> str:

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
 from pat.networks.bandwise import BandwisePAT
-from pat.networks.guided import GuidedPAT, Seen
+from pat.networks.guided import BetaEstimate, GuidedPAT
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import Network
 
@@ -62,14 +62,14 @@ class Objective(nn.Module):
         return loss + match_loss(seen, given) if seen else loss
 
 
-def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[Seen]]:
+def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
     """The network's answer, and what each beta told where it says."""
     if isinstance(network, (GuidedPAT, BandwisePAT)):
-        return network.explain(given.alpha, given.betas, given.looks)
-    return network(given.alpha, given.betas, given.looks), []
+        return network.explain(given.inputs)
+    return network(given.inputs), []
 
 
-def match_loss(seen: list[Seen], given: Sample) -> Tensor:
+def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
     """How far off the looks were where beta sees the point, pixels, and how wrong the confidence; 0 if nobody knows."""
     total = given.ground_truth.new_zeros(())
     for told, ground_truth, visible in zip(seen, given.position, given.visible):
@@ -85,7 +85,7 @@ def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
     """Mean PSNR, and the share of visible pixels matched within a pixel and a half (NaN if nobody knows)."""
     psnr, near = [], []
     for given in samples:
-        fused = network(given.alpha, given.betas, given.looks)
+        fused = network(given.inputs)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
         for where, visible in list(zip(given.position, given.visible))[:1]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -24,17 +24,16 @@ from arraygeom import (
     Epipolar,
     Pair,
     Pose,
-    Positions,
     ReceptiveField,
-    Segments,
     pixel_grid,
     rotation_from_vector,
     sample,
 )
 from arraygeom.fields import FIELDS, pinhole_track
+from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
-from pat.networks.protocol import Look
+from pat.networks.protocol import Inputs
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
@@ -58,10 +57,15 @@ class Sample(NamedTuple):
 
     alpha: Tensor
     betas: list[Tensor]
-    looks: list[Look]
+    fields: list[FieldOnGrid]
     ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
+
+    @property
+    def inputs(self) -> Inputs:
+        """What a network is given."""
+        return Inputs.of(self.alpha, self.betas, self.fields)
 
 
 class Planned(NamedTuple):
@@ -212,7 +216,7 @@ def degraded(
     images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
-    betas, looks, position, visible = [], [], [], []
+    betas, on_grid, position, visible = [], [], [], []
     for i, image in enumerate(images[1:], 1):
         band = image if alone else image[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
@@ -220,13 +224,13 @@ def degraded(
         if alone and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
-        looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
+        on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
         if scene.depth:
             found = truth_in(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
             position.append(found[0])
             visible.append(found[1])
     ground_truth = ideal if recording.ideal else ideal + (alpha - grey)
-    return Sample(alpha, betas, looks, ground_truth, position, visible)
+    return Sample(alpha, betas, on_grid, ground_truth, position, visible)
 
 
 def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
@@ -305,15 +309,8 @@ def alone(given: Sample, i: int) -> Sample:
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
         return [part if len(part) == 1 else part[i : i + 1] for part in parts]
 
-    def look(old: Look) -> Look:
-        def at(x: Tensor) -> Segments | Positions:
-            found = old.at(x)
-            return type(found)(*one([getattr(found, entry.name) for entry in fields(found)]))
-
-        return Look(at, old.samples)
-
-    (alpha, ground_truth), looks = one([given.alpha, given.ground_truth]), [look(old) for old in given.looks]
-    return Sample(alpha, one(given.betas), looks, ground_truth, one(given.position), one(given.visible))
+    (alpha, ground_truth), on_grid = one([given.alpha, given.ground_truth]), [f.of_one(i) for f in given.fields]
+    return Sample(alpha, one(given.betas), on_grid, ground_truth, one(given.position), one(given.visible))
 
 
 def _enlarged(image: Tensor, hw: tuple[int, int]) -> Tensor:

@@ -35,7 +35,7 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     array = fast_and_slow_array(folder)
     rig, frames = clocked(array.rig), recorded_frames(folder)
     field = HomographyDisplacement(array.displacement)
-    job = SequenceFusion(load_weights(weights), rig, frames, FAST, looks=field, match_levels=True)
+    job = SequenceFusion(load_weights(weights), rig, frames, FAST, field=field, match_levels=True)
     keys = job.timeline.key_frames()
     say(f"fusing key frames {', '.join(str(FAST_FRAMES[k.alpha]) for k in keys)}, then all")
     colours = {key.alpha: job.colour(key) for key in keys}

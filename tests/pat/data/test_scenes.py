@@ -151,7 +151,7 @@ def test_a_batch_says_where_to_look(rendered):
     batch = next(iter(loader))
     assert batch.images["mono"].shape == (6, 1, 16, 24)
     pair = batch.rig.pair("mono", "colour")
-    (where,) = batch.looks(Epipolar())
+    (where,) = batch.on_grid(Epipolar())
     X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
     found = where.at(torch.tensor([[12.0, 8.0]]))
     seen = pair.cameras[1].project(X).x[:, 0].float()

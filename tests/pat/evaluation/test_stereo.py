@@ -114,20 +114,18 @@ def test_tables_hold_every_row(tmp_path):
 class Matcher:
     """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
+    halo, beta_halo, multiple, bytes_per_pixel, equal_resolution, joins_bands = 0, 2, 1, 1.0, True, "no"
 
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
 
-    def normalisation(self, alpha, beta, look):
-        return look
-
-    def survey(self, alpha, beta, look):
+    def prepare(self, inputs):
         return None
 
-    def __call__(self, alpha, betas, looks):
-        self.betas.append([(b.shape[1], float(b.mean())) for b in betas])
-        self.looks = looks
+    def __call__(self, inputs, state=None):
+        alpha, betas = inputs.alpha, inputs.betas
+        self.betas.append([(b.image.shape[1], float(b.image.mean())) for b in betas])
+        self.field = betas[0].field
         grid = (
             pixel_grid(tuple(alpha.shape[-2:])).movedim(-1, 0)[None]
             - torch.tensor([self.disparity, 0.0])[:, None, None]
@@ -168,7 +166,7 @@ def test_controls_take_the_reference_away():
     assert abs(foreign - right) > 0.02
     assert shuffled == right
     x = pixel_grid((16, 24)).reshape(-1, 2)
-    looked = network.looks[0].at(x)
+    looked = network.field.at(x)
     assert sorted(looked.end.round().tolist()) == sorted(x.tolist())
     assert (looked.end - x).norm(dim=-1).mean() > 5
 
@@ -211,18 +209,16 @@ def test_controls_fall_on_real_pairs(shared_data):
 class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
+    halo, beta_halo, multiple, bytes_per_pixel, equal_resolution, joins_bands = 0, 2, 1, 1.0, True, "no"
 
-    def normalisation(self, alpha, beta, look):
-        return look
-
-    def survey(self, alpha, beta, look):
+    def prepare(self, inputs):
         return None
 
-    def __call__(self, alpha, betas, looks):
-        found = looks[0].at(torch.tensor([[20.0, 7.0]]))
+    def __call__(self, inputs, state=None):
+        alpha, (beta,) = inputs.alpha, inputs.betas
+        found = beta.field.at(torch.tensor([[20.0, 7.0]]))
         self.start, self.end = found.start[0].tolist(), found.end[0].tolist()
-        self.beta = tuple(betas[0].shape)
+        self.beta = tuple(beta.image.shape)
         none = alpha[:, 0] * 0
         return FusionOutput(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
 

@@ -282,7 +282,7 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
         torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
-        held = given.looks[0].at(torch.tensor([[24.0, 16.0]]).double())
+        held = given.fields[0].at(torch.tensor([[24.0, 16.0]]).double())
         assert held.valid.all()
     assert (sides, reductions) == ({-1.0, 1.0}, {1, 2})
 
