@@ -91,6 +91,7 @@ def test_equality_is_of_classes_shapes_types_and_values():
     assert pose == Pose(pose.R.clone(), pose.t.clone())
     assert pose != Pose(pose.R, pose.t + 1e-9)
     assert pose != pose.to(torch.float32)
+    assert Pose.identity() != Pose.identity(dtype=torch.float32)
     assert pose != stack([pose])
     assert pose != "pose"
     assert random_rig(1) == random_rig(1) != random_rig(2)
