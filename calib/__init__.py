@@ -1,1 +1,20 @@
-"""From photographs of a target to a rig, and from a rig to a better rig."""
+"""Calibration of camera rigs.
+
+`calib.boards` calibrates a rig from images of a calibration board; `calib.images` finds mistakes in a rig, refines it,
+or makes an uncalibrated one, from ordinary images. `calib.images` may use `calib.boards`, not the reverse.
+"""
+
+from collections.abc import Callable, Mapping
+from importlib import import_module
+from typing import Any
+
+
+def _lazy(package: str, modules: Mapping[str, str]) -> Callable[[str], Any]:
+    """A package's `__getattr__` that imports functions from modules on first use: OpenCV and matplotlib load slowly."""
+
+    def get(name: str) -> Any:
+        if name not in modules:
+            raise AttributeError(f"module '{package}' has no attribute '{name}'")
+        return getattr(import_module(f"{package}.{modules[name]}"), name)
+
+    return get

@@ -51,7 +51,7 @@ class Demo:
         from ..evaluation.baseline import classical
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
-        from ..systems.demo import report_figure
+        from ..systems.demo import save_demo_figure
 
         sample = load_sample()
         console.print("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
@@ -59,7 +59,7 @@ class Demo:
         console.print(f"fusion with the weights '{self.weights}'")
         frame = fuse_frame(self.weights, sample.rig, sample.images, alpha=ALPHA)
         written = save_frame(frame, self.out)
-        report_figure(sample, baseline, frame, self.out / "demo.png")
+        save_demo_figure(sample, baseline, frame, self.out / "demo.png")
         rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
         scores = {name: score(image.clamp(0, 1), sample.ground_truth) for name, image in rows.items()}
         lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]
@@ -241,17 +241,9 @@ class Evaluate:
         """Do it."""
         from arraygeom.atomic import write_text
 
-        from ..evaluation.stereo import (
-            BASELINES,
-            DATA_SETS,
-            PROTOCOLS,
-            controls,
-            evaluate_sets,
-            falls,
-            rectified_fusion,
-            sets_markdown,
-            write_csv,
-        )
+        from ..evaluation.protocols import BASELINES, PROTOCOLS, controls, rectified_fusion
+        from ..evaluation.stereo import DATA_SETS, StereoRow, evaluate_sets, falls, sets_markdown
+        from ..evaluation.tables import write_csv
         from ..networks.weights import load_weights
 
         folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
@@ -266,7 +258,7 @@ class Evaluate:
         every = [row for found in rows.values() for row in found]
         text = sets_markdown(rows, protocol=self.protocol) + ("\n" + falls(every, names=wrong) if wrong else "")
         write_text(self.out / "scores.md", text)
-        write_csv(self.out / "scores.csv", every)
+        write_csv(self.out / "scores.csv", StereoRow._fields, every)
         print(text, end="")
         console.print(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 
@@ -347,7 +339,7 @@ class Show:
         from arraygeom import Camera
         from arraygeom.viz import draw_fields, draw_rig
 
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..media.images import read_image
 
         rig = Rig.load(self.rig)
@@ -449,7 +441,7 @@ class Calibrate:
             depth=self.depth,
             progress=bar,
         )
-        print("\n".join(said.lines))
+        print("\n".join(said.messages))
         console.print(f"written: {', '.join(map(str, said.written))}")
 
 
@@ -531,7 +523,7 @@ class DataShow:
 
         from ..data import ScenePatches
         from ..data.show import draw_patches
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..sensors import generator_for, read_chains
         from ..support.schema import read_yaml
 
@@ -690,7 +682,7 @@ class Refine:
 
     def run(self) -> None:
         """Do it."""
-        from calib.images.refine import refine
+        from calib.images.refinement import refine
 
         from ..attention import attend_with_statistics
 
@@ -726,13 +718,13 @@ class Start:
 
     def run(self) -> None:
         """Do it."""
-        from calib.images.from_images import start
+        from calib.images.from_images import rig_from_images
 
         from ..media.images import read_image
 
         files = _files_by_name(self.image)
         images = {name: read_image(path, name=name) for name, path in files.items()}
-        found = start(images, focal=_numbers_by_name("--focal", self.focal))
+        found = rig_from_images(images, focal=_numbers_by_name("--focal", self.focal))
         print(found.as_text())
         found.rig.save(self.out)
         console.print(f"written: {self.out}")

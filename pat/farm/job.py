@@ -14,7 +14,7 @@ import yaml
 from arraygeom.rig import Rig
 from pat.sensors import seed_for
 from pat.support.schema import from_document, read_yaml, to_document
-from pat.synthesis.check import Limits as CheckLimits
+from pat.synthesis.check import CheckLimits
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
 from .folders import JobFolder, write_atomic

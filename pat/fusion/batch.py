@@ -62,7 +62,7 @@ class Batch:
     bits: int = 8
     kind: ImageFormat = "png"
     alone: bool = False
-    """Of a sequence: fuse each frame by itself, without carrying colour; for comparison."""
+    """Of a sequence: fuse each frame by itself, without warping colour; for comparison."""
 
     def __post_init__(self) -> None:
         for name in self.files:

@@ -125,7 +125,7 @@ class FusionOutput(NamedTuple):
     image: (B, C, s H, s W), the fused image.
     position: one (B, 2, H, W) for each beta, where its pixels were found, in beta's pixels.
     deviation: one (B, H, W) for each beta, the standard deviation of that position, in beta's pixels.
-    confidence: one (B, H, W) for each beta, 0 to 1: whether beta sees the point and its position is certain.
+    confidence: one (B, H, W) for each beta, 0 to 1: that beta sees the point and that its position is right.
     """
 
     image: Tensor

@@ -25,6 +25,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from arraygeom import Rig
 from arraygeom.atomic import write_text
+from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.steps import steps_for
@@ -150,8 +151,7 @@ def main() -> None:
         put(f"wide-narrow, 4024x3036, under {cap}", text)
     if not given.full_runs:
         load = f"{given.threads} threads, load before: {os.getloadavg()[0]:.1f}\n"
-        rows = [f"| {name} | {value} |" for name, value in measure(given.scale).items()]
-        text = "\n".join([load, "| | |", "| --- | --- |", *rows])
+        text = f"{load}\n{markdown_table(['', ''], measure(given.scale).items(), align='l')}"
         print(text)
         put(f"A part of the frame, {given.threads} threads", text)
 

@@ -33,7 +33,7 @@ from pat.networks.weights import Network
 from pat.training.config import TrainConfig, load_config
 from pat.training.loop import convolutions, in_bfloat16, new_network
 from pat.training.losses import Objective
-from pat.training.samples import Sample, Source
+from pat.training.samples import Sample, SampleSource
 
 
 @dataclass
@@ -96,8 +96,8 @@ def stored(given: Sample, folder: Path) -> list[Path]:
     return files
 
 
-def source(config: TrainConfig) -> Source:
-    return Source(sample_photographs(), config, 0, FIELDS[config.field]())
+def source(config: TrainConfig) -> SampleSource:
+    return SampleSource(sample_photographs(), config, 0, FIELDS[config.field]())
 
 
 def step(objective: Objective, given: Sample, adam: torch.optim.Optimizer) -> None:

@@ -86,12 +86,12 @@ def test_no_valid_segment_is_no_confidence():
     assert fused.image.isfinite().all()
 
 
-def test_without_a_head_the_image_is_what_was_found_and_carried():
+def test_without_a_head_the_image_is_what_was_matched_and_propagated():
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), head_dim=0, keep_luminance=False))
     assert not [name for name in network.state_dict() if name.startswith(("head", "propagate"))]
     alpha, beta = torch.rand(1, 1, *HW), torch.rand(1, 3, *HW)
-    torch.nn.init.constant_(network.trust[2].bias, 20.0)
+    torch.nn.init.constant_(network.confidence[2].bias, 20.0)
     fused, (seen,) = network.explain(Inputs.of(alpha, [beta], [rectified()]))
     assert seen.logit.max() > 15
     assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)

@@ -87,7 +87,7 @@ def test_a_short_run_learns_and_leaves_weights(config):
     assert all(line["psnr"] > 5 for line in lines)
 
 
-def test_degradation_keeps_the_truth_in_colour(config):
+def test_degradation_keeps_the_ground_truth_in_colour(config):
     from pat.synthesis.layered import LayeredScenes
     from pat.synthesis.rigs import RigDistribution
     from pat.training.train import photographs
