@@ -84,7 +84,7 @@ wheel: $(READY)
 	@$(BIN)/python -m pip wheel -qq --no-deps --wheel-dir out/wheel .
 	@$(PYTHON) -m venv out/wheel/venv
 	@echo "== installing it and what it needs into out/wheel/venv"
-	@out/wheel/venv/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt torch out/wheel/*.whl
+	@out/wheel/venv/bin/python -m pip install -qq --disable-pip-version-check --constraint constraints.txt torch "$$(ls out/wheel/*.whl)[plots]"
 	@cd out/wheel && venv/bin/pat demo --out demo
 
 train: $(READY)

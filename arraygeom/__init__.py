@@ -3,6 +3,7 @@
 Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
 """
 
+from .batching import stack
 from .camera import Camera, LensView, Projected, View, intrinsics
 from .distortion import Distortion
 from .epipolar import (
@@ -32,8 +33,9 @@ from .fields import (
     ThroughLenses,
     Widened,
     approximated,
+    default_field,
     lazily,
-    look,
+    sampling_locations,
 )
 from .homography import apply_homography, fit_homography, fit_similarity, infinite_homography, plane_homography
 from .pixels import pixel_grid, resize_matrix
@@ -79,6 +81,7 @@ __all__ = [
     "Widened",
     "apply_homography",
     "approximated",
+    "default_field",
     "depth_from_track",
     "depth_of",
     "epipolar_distance",
@@ -91,7 +94,6 @@ __all__ = [
     "infinite_homography",
     "intrinsics",
     "lazily",
-    "look",
     "pinhole_view",
     "pixel_grid",
     "plane_homography",
@@ -100,8 +102,10 @@ __all__ = [
     "resize_matrix",
     "rotation_from_vector",
     "sample",
+    "sampling_locations",
     "segments_between",
     "shift_origin",
+    "stack",
     "to_grid",
     "track",
     "triangulate",

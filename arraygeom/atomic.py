@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Files written atomically."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from uuid import uuid4
 
 @contextmanager
 def write_atomically(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` to write to; it takes `path`'s place when the block ends without error.
+    """A temporary path beside `path` to write to; it replaces `path` when the block ends without error.
 
     After an error (a full disk, say) the temporary file is gone and a former `path` is as it was. The temporary name
     ends as `path` does, so that writers that choose the format by suffix choose the same. Missing folders are made.
@@ -30,7 +30,7 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
 
 
 def sweep(folder: Path) -> None:
-    """Remove what `write_atomically` left half-written in a folder because its process was killed."""
+    """Remove the temporary files of killed processes from a folder."""
     for path in folder.glob(".*"):
         if re.fullmatch(r"\..*-[0-9a-f]{32}(\.\w+)?", path.name):
             path.unlink(missing_ok=True)
@@ -46,6 +46,6 @@ def _flush(path: Path) -> None:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file, whole or not at all. Missing folders are made."""
+    """Write a text file atomically. Missing folders are made."""
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8")

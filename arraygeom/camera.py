@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.camera import PinholeCamera
 from torch import Tensor
 
+from .batching import Batched
 from .distortion import Distortion
 from .pixels import HW, map_homogeneous, resize_matrix, rot90_matrix, shift_matrix, to_homogeneous
-from .pose import Pose, matvec
+from .pose import Pose
 from .sensor import Sensor
+from .text import view_text
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
 
 
 class Projected(NamedTuple):
@@ -29,8 +32,8 @@ class Projected(NamedTuple):
 AnyView = TypeVar("AnyView", bound="View")
 
 
-@dataclass(frozen=True, kw_only=True)
-class View:
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
+class View(Batched):
     """What is known of every camera, calibrated or not: its image's (height, width) and what it records."""
 
     hw: HW
@@ -44,8 +47,8 @@ class View:
         """A window of the view, `hw` in size. A negative `top` or `left`, or a larger size, pads."""
         return self.transformed(shift_matrix(left, top), hw)
 
-    def turn(self: AnyView, quarter_turns: int) -> AnyView:
-        """The image turned counter-clockwise, as `torch.rot90(image, k, (-2, -1))` turns it."""
+    def rot90(self: AnyView, quarter_turns: int) -> AnyView:
+        """The view of the image rotated counter-clockwise, as `torch.rot90(image, k, (-2, -1))`."""
         hw = self.hw if quarter_turns % 2 == 0 else (self.hw[1], self.hw[0])
         return self.transformed(rot90_matrix(self.hw, quarter_turns), hw)
 
@@ -54,11 +57,11 @@ class View:
         return self.replace(hw=hw)
 
     def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Where a camera without this one's lens would have put what pixels see, and which the lens model reaches."""
+        """Undistorted pixels, and which of them are within the lens model's range."""
         return x, torch.ones_like(x[..., 0], dtype=torch.bool)
 
     def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Straightened pixels to those of the image: the inverse of `straighten`."""
+        """Undistorted pixels to those of the image: the inverse of `undistort`."""
         return x, torch.ones_like(x[..., 0], dtype=torch.bool)
 
     def contains(self, x: Float[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
@@ -66,29 +69,25 @@ class View:
         h, w = self.hw
         return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
 
-    def replace(self: AnyView, **changes: Any) -> AnyView:
-        """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)
-
-    def to(self: AnyView, *args: Any, **kwargs: Any) -> AnyView:
-        """Like `Tensor.to`; a view without numbers stays as it is."""
-        return self
+    def _text(self) -> str:
+        return view_text(self)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class LensView(View):
-    """A view whose lens is known; its focal length and its place need not be.
+    """A view with a lens model, whose focal length and pose need not be known.
 
     `K` maps the plane z = 1 (after the lens) to pixels. Without a calibration it is only the scale and the centre in
-    which `distortion` counts: then `rays` say how the lens bends, not at which angle. Links of such views relate
-    `straighten`ed pixels.
+    which `distortion` counts: then `rays` follow the lens but their angles mean nothing. Links of such views relate
+    undistorted pixels.
 
     >>> lens = Distortion("brown-conrady", torch.tensor([-0.1, 0, 0, 0], dtype=torch.float64))
     >>> view = LensView(hw=(61, 101), K=intrinsics(50.0, (61, 101)), distortion=lens)
-    >>> view.bend(torch.tensor([100.0, 30.0], dtype=torch.float64))[0].tolist()
+    >>> view.distort(torch.tensor([100.0, 30.0], dtype=torch.float64))[0].tolist()
     [95.0, 30.0]
     """
 
+    item_axes: ClassVar = {"K": 2}
     K: Float[Tensor, "*b 3 3"]
     distortion: Distortion | None = None
 
@@ -98,28 +97,23 @@ class LensView(View):
         return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
     def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
-        """The direction in the camera's frame of what pixels see, z = 1 for pinholes, and its validity."""
+        """The rays of pixels in the camera's frame, z = 1 for pinholes, and their validity."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
     def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Where a pinhole with the same K would have put what pixels see, and which the lens model reaches."""
+        """Pixels of a pinhole with the same K, and which are within the lens model's range."""
         return self._each_through(Distortion.undistort, x)
 
     def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
-        """Straightened pixels to those of the image: the inverse of `straighten`."""
+        """Undistorted pixels to those of the image: the inverse of `undistort`."""
         return self._each_through(Distortion.distort, x)
 
     def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
         """The camera of the image whose pixels are x' ~ A x, of size `hw`: K' = A K."""
         return self.replace(K=A.to(self.K) @ self.K, hw=hw)
-
-    def to(self: AnyLensView, *args: Any, **kwargs: Any) -> AnyLensView:
-        """Like `Tensor.to`, for every tensor of the view."""
-        lens = None if self.distortion is None else self.distortion.to(*args, **kwargs)
-        return self.replace(K=self.K.to(*args, **kwargs), distortion=lens)
 
     def _through_lens(self, X: Tensor) -> tuple[Tensor, Tensor]:
         if self.distortion is not None:
@@ -140,12 +134,12 @@ AnyLensView = TypeVar("AnyLensView", bound=LensView)
 ThroughLens = Callable[[Distortion, Tensor], tuple[Tensor, Tensor]]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False, repr=False)
 class Camera(LensView):
     """A calibrated camera. Leading batch axes everywhere; every tensor may require grad.
 
     `K` maps the plane z = 1 (after the lens) to pixels, the first pixel's centre being (0, 0). It is affine,
-    not necessarily upper triangular: that of a turned image has zeros on its diagonal.
+    not necessarily upper triangular: that of a rotated image has zeros on its diagonal.
     `cam_from_world`: X_cam = R X_world + t in metres, x right, y down, z forward.
 
     >>> K = torch.tensor([[100.0, 0, 49.5], [0, 100.0, 29.5], [0, 0, 1]], dtype=torch.float64)
@@ -178,7 +172,7 @@ class Camera(LensView):
     def unproject(self, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
         """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
 
-        Raises nothing: ask `rays` for validity.
+        Raises nothing: `rays` gives the validity.
         """
         rays, valid = self.rays(x)
         z = rays[..., 2]
@@ -187,27 +181,35 @@ class Camera(LensView):
         X = torch.where(valid[..., None], X, torch.nan)
         return self.cam_from_world.inverse().apply(X)
 
-    def to(self, *args: Any, **kwargs: Any) -> Camera:
-        """Like `Tensor.to`, for every tensor of the camera."""
-        return super().to(*args, **kwargs).replace(cam_from_world=self.cam_from_world.to(*args, **kwargs))
-
     def to_kornia(self) -> PinholeCamera:
-        """The same pinhole as a kornia camera, batched (B, 4, 4). Raises ValueError if there is a lens."""
+        """The same pinhole as a kornia camera, batched (B, 4, 4). Raises ValueError if there is a lens.
+
+        Pixels and axes are alike in both. `PinholeCamera.scale` moves the principal point otherwise: `resize` before.
+        """
+        from kornia.geometry.camera import PinholeCamera
+
         if self.distortion is not None:
             raise ValueError("kornia's PinholeCamera has no lens model: undistort first, or drop `distortion`")
         R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
-        eye = torch.eye(4, dtype=K.dtype, device=K.device).repeat(len(K), 1, 1)
-        intrinsics, extrinsics = eye.clone(), eye.clone()
-        intrinsics[:, :3, :3], extrinsics[:, :3, :3], extrinsics[:, :3, 3] = K, R, t
+        row = K.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(K), 1, 4)
+        intrinsics = torch.cat([torch.cat([K, K.new_zeros(len(K), 3, 1)], -1), row], -2)
+        extrinsics = torch.cat([torch.cat([R, t[..., None]], -1), row], -2)
         h, w = (K.new_full((len(K),), n) for n in self.hw)
         return PinholeCamera(intrinsics, extrinsics, h, w)
 
     @classmethod
     def from_kornia(cls, camera: PinholeCamera) -> Camera:
-        """The camera (batched as kornia's is) of a kornia pinhole."""
-        pose = Pose(camera.extrinsics[:, :3, :3], camera.extrinsics[:, :3, 3])
-        hw = (int(camera.height[0]), int(camera.width[0]))
-        return cls(K=camera.intrinsics[:, :3, :3], cam_from_world=pose, hw=hw)
+        """The camera of a kornia pinhole; a batch of one becomes a single camera.
+
+        Raises ValueError if the images of a batch differ in size.
+        """
+        sizes = sorted({(int(h), int(w)) for h, w in zip(camera.height.reshape(-1), camera.width.reshape(-1))})
+        if len(sizes) > 1:
+            found = " and ".join(f"{w}x{h}" for h, w in sizes)
+            raise ValueError(f"the cameras of a kornia batch have images of {found}: convert those of each size apart")
+        pose = Pose(camera.extrinsics[..., :3, :3], camera.extrinsics[..., :3, 3])
+        made = cls(K=camera.intrinsics[..., :3, :3], cam_from_world=pose, hw=sizes[0])
+        return made[0] if made.batch_shape == (1,) else made
 
 
 def intrinsics(
@@ -221,16 +223,3 @@ def intrinsics(
     fx, fy = focal if isinstance(focal, tuple) else (focal, focal)
     cx, cy = centre or ((hw[1] - 1) / 2, (hw[0] - 1) / 2)
     return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
-
-
-def rotation_between(a: Camera, b: Camera) -> Float[Tensor, "*b"]:
-    """The angle between two cameras' orientations, radians."""
-    R = b.R @ a.R.transpose(-1, -2)
-    skew = torch.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1)
-    return torch.atan2(0.5 * skew.norm(dim=-1), 0.5 * (R.diagonal(dim1=-2, dim2=-1).sum(-1) - 1))
-
-
-def direction_of(camera: Camera) -> Float[Tensor, "*b 3"]:
-    """The optical axis in the world, a unit vector."""
-    axis = camera.R.new_tensor([0.0, 0.0, 1.0])
-    return matvec(camera.R.transpose(-1, -2), axis)

@@ -1,4 +1,4 @@
-"""Lens models: where a lens puts the ray that a pinhole would have put at (x, y), and back.
+"""Lens models: undistorted to distorted points, and back.
 
 All points here are *normalised*: for a pinhole (x, y) = (X / Z, Y / Z) in the camera's frame (x right, y down,
 z forward), before the focal length and the principal point. Distorted points are what K multiplies to give
@@ -19,12 +19,16 @@ not valid; their values stay finite and bounded (the point is moved in to the tu
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import pi
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+
+from .batching import Batched
+from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
@@ -41,17 +45,18 @@ POLE = 0.9
 BEYOND = 1.1
 
 
-@dataclass(frozen=True)
-class Distortion:
+@dataclass(frozen=True, eq=False, repr=False)
+class Distortion(Batched):
     """One lens, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
-    (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are looked at one by one; all maps are differentiable, twice,
+    (5, 2), (5, 100, 2), (5, 20, 30, 2). Points are independent of each other; all maps are differentiable, twice,
     in the points and the coefficients.
 
     Raises ValueError for an unknown model or a number of coefficients that the model does not have.
     """
 
+    item_axes: ClassVar = {"coefficients": 1}
     model: str
     coefficients: Float[Tensor, "*b n"]
 
@@ -62,10 +67,6 @@ class Distortion:
         if self.coefficients.shape[-1] not in counts:
             given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
-
-    def to(self, *args: object, **kwargs: object) -> Distortion:
-        """The same lens on another device or in another dtype; arguments as of `Tensor.to`."""
-        return replace(self, coefficients=self.coefficients.to(*args, **kwargs))  # type: ignore[call-overload]
 
     def distort(self, xy: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Normalised pinhole points to distorted ones, and which are inside the model's range."""
@@ -113,6 +114,9 @@ class Distortion:
         xy, valid = self.undistort(xy_d)
         return _unit(_homogeneous(xy)), valid
 
+    def _text(self) -> str:
+        return distortion_text(self)
+
     def _lifted(self, points: Tensor) -> Tensor:
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""
         c = self.coefficients
@@ -153,7 +157,7 @@ def _brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
 def _brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     """Undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton.
 
-    The last two Newton steps are differentiable: from a solution that is a constant, one step carries the
+    The last two Newton steps are differentiable: from a solution that is a constant, one step propagates the
     first derivatives and the next one the second (the error of a Newton step is the square of the one before).
     """
     lens = _Brown.named(c)
@@ -268,7 +272,7 @@ def _newton_step(value: Tensor, jacobian: tuple[Tensor, Tensor, Tensor, Tensor],
 
 
 def _orients(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
-    """Whether the map keeps orientation here: past a fold it mirrors, past two it turns by half a turn."""
+    """Whether the map keeps orientation here: past a fold it mirrors, past two it rotates by 180 degrees."""
     xx, xy, yx, yy = jacobian
     return (xx * yy - xy * yx > 0) & (xx + yy > 0)
 
@@ -277,13 +281,10 @@ def _tilt_matrix(lens: _Brown) -> Tensor | None:
     """The homography (*b, 1.., 3, 3) of a sensor tilted by tx, ty about x, then y (OpenCV's)."""
     if lens.tilt is None:
         return None
+    from kornia.geometry.calibration.distort import tilt_projection
+
     tx, ty = lens.tilt
-    zero, one = torch.zeros_like(tx), torch.ones_like(tx)
-    about_x = _matrix((one, zero, zero), (zero, tx.cos(), tx.sin()), (zero, -tx.sin(), tx.cos()))
-    about_y = _matrix((ty.cos(), zero, -ty.sin()), (zero, one, zero), (ty.sin(), zero, ty.cos()))
-    R = about_y @ about_x
-    r02, r12, r22 = R[..., 0, 2], R[..., 1, 2], R[..., 2, 2]
-    return _matrix((r22, zero, -r02), (zero, r22, -r12), (zero, zero, one)) @ R
+    return tilt_projection(tx[..., None], ty[..., None])
 
 
 def _tilt(lens: _Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -430,10 +431,6 @@ def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Tensor]:
         for j, b_j in enumerate(b):
             terms[i + j] = terms[i + j] + a_i * b_j
     return terms
-
-
-def _matrix(*rows: tuple[Tensor, ...]) -> Tensor:
-    return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
 def _homogeneous(xy: Tensor) -> Tensor:

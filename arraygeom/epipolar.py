@@ -10,25 +10,25 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.geometry.epipolar import cross_product_matrix
-from kornia.geometry.epipolar import fundamental_from_essential as _fundamental_from_essential
 from torch import Tensor
 
 from .pixels import HW, map_homogeneous, to_homogeneous
-from .pose import Pose, matvec
+from .pose import Pose, cross_matrix, matvec
 from .segments import FLAT, Segments
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
     """E = [t]x R (H&Z 9.12)."""
-    return cross_product_matrix(beta_from_alpha.t) @ beta_from_alpha.R
+    return cross_matrix(beta_from_alpha.t) @ beta_from_alpha.R
 
 
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
     """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0."""
-    return _fundamental_from_essential(essential_matrix(beta_from_alpha), K_alpha, K_beta)
+    from kornia.geometry.epipolar import fundamental_from_essential
+
+    return fundamental_from_essential(essential_matrix(beta_from_alpha), K_alpha, K_beta)
 
 
 def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor, "*b 3 3"]:

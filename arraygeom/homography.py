@@ -68,15 +68,15 @@ SMALLEST_SCALE = 1e-9
 
 
 def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Tensor, "3 3"]:
-    """The similarity (turn, scale, shift) that takes x nearest to y, least squares; n >= 2.
+    """The similarity (rotation, scale, shift) that takes x nearest to y, least squares; n >= 2.
 
     Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
     """
     x_mean, y_mean = x.mean(0), y.mean(0)
     u, v = x - x_mean, y - y_mean
-    spread = u.square().sum()
-    a = (u * v).sum() / spread
-    b = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / spread
+    squared = u.square().sum()
+    a = (u * v).sum() / squared
+    b = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / squared
     linear = torch.stack([torch.stack([a, -b]), torch.stack([b, a])])
     return _affine(linear, y_mean - linear @ x_mean)
 
@@ -107,10 +107,10 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: i
 
 
 def _normalising(x: Tensor) -> Tensor:
-    """The similarity that centres points and gives them unit spread; a constant of the fit."""
+    """The similarity that centres points and scales them to unit deviation; a constant of the fit."""
     mean = x.detach().mean(0)
-    spread = (x.detach() - mean).square().mean().sqrt().clamp(min=1e-6)
-    return _affine(torch.eye(2).to(x) / spread, -mean / spread)
+    deviation = (x.detach() - mean).square().mean().sqrt().clamp(min=1e-6)
+    return _affine(torch.eye(2).to(x) / deviation, -mean / deviation)
 
 
 def _affine(linear: Tensor, shift: Tensor) -> Tensor:

@@ -1,4 +1,4 @@
-"""Pixel maps: what resizing, cropping, padding and turning an image do to its coordinates.
+"""Pixel maps: what resizing, cropping, padding and rotating an image do to its coordinates.
 
 Each is a 3x3 matrix A, `x_new ~ A x_old`, on pixels whose first centre is (0, 0). Cameras follow by
 K' = A K, fundamental matrices by F' = A_beta^-T F A_alpha^-1.
@@ -41,9 +41,9 @@ def shift_matrix(left: float, top: float) -> Float[Tensor, "3 3"]:
 
 
 def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
-    """Turning the image counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
+    """Rotating the image counter-clockwise by quarter turns, as `torch.rot90(image, k, (-2, -1))` does.
 
-    >>> (turn_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
+    >>> (rot90_matrix((2, 3), 1) @ torch.tensor([2.0, 0.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 0.0, 1.0]
     """
     A = torch.eye(3, dtype=torch.float64)

@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import ClassVar
 
 import torch
 from jaxtyping import Float
-from kornia.geometry.conversions import vector_to_skew_symmetric_matrix
 from torch import Tensor
 
+from .batching import Batched
+from .text import pose_text
 
-@dataclass(frozen=True)
-class Pose:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pose(Batched):
     """A rigid transform named `to_from_from`, for instance `cam_from_world`: X_cam = R X_world + t.
 
     Poses compose where the inner words meet: `b_from_a @ a_from_world` is `b_from_world`. Metres.
     """
 
+    item_axes: ClassVar = {"R": 2, "t": 1}
     R: Float[Tensor, "*b 3 3"]
     t: Float[Tensor, "*b 3"]
 
@@ -59,9 +62,15 @@ class Pose:
         R = self.R if rotation is None else nearest_rotation(rotation_from_vector(rotation) @ self.R)
         return Pose(R, self.t if translation is None else self.t + translation)
 
-    def to(self, *args: Any, **kwargs: Any) -> Pose:
-        """Like `Tensor.to`."""
-        return Pose(self.R.to(*args, **kwargs), self.t.to(*args, **kwargs))
+    def _text(self) -> str:
+        return pose_text(self)
+
+
+def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
+    """[v]x, the matrix with [v]x w = v x w."""
+    from kornia.geometry.epipolar import cross_product_matrix  # here, as kornia takes as long to import as torch's ops
+
+    return cross_product_matrix(v)
 
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
@@ -70,26 +79,24 @@ def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor
 
 
 def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """Rotation matrix of a rotation vector (axis times angle, radians): exp of its skew matrix W.
+    """Rotation matrix of a rotation vector (axis times angle, radians): kornia's Rodrigues formula.
 
-    Rodrigues: I + sin(a)/a W + (1 - cos(a))/a^2 W^2. Exact to rounding in float32 too, and differentiable any
-    number of times, at angle zero as elsewhere. (`torch.linalg.matrix_exp` is off by 2e-14 a step in float64.)
+    Exact to rounding in float32 too, and differentiable any number of times, at angle zero as elsewhere.
+    (`torch.linalg.matrix_exp` is off by 2e-14 a step in float64.)
 
     >>> rotation_from_vector(torch.tensor([0.0, 0.0, torch.pi / 2])).round(decimals=6)[0, 1].item()
     -1.0
     """
-    W = vector_to_skew_symmetric_matrix(w)
-    first, second = (c[..., None, None] for c in _rodrigues(w.square().sum(-1)))
-    return torch.eye(3, dtype=w.dtype, device=w.device) + first * W + second * (W @ W)
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+
+    return axis_angle_to_rotation_matrix(w)
 
 
-def _rodrigues(v: Tensor) -> tuple[Tensor, Tensor]:
-    """sin(a)/a and (1 - cos(a))/a^2 of v = a^2, by their series near 0."""
-    near = v < 1e-3
-    s, a = torch.where(near, v, 0.0), torch.where(near, 1.0, v).sqrt()
-    first = 1 - s / 6 * (1 - s / 20 * (1 - s / 42 * (1 - s / 72)))
-    second = 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56 * (1 - s / 90)))
-    return torch.where(near, first, a.sin() / a), torch.where(near, second, 2 * (a / 2).sin().square() / a.square())
+def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
+    """Axis times angle of a rotation, radians: the inverse of `rotation_from_vector` up to 180 degrees."""
+    from kornia.geometry.conversions import rotation_matrix_to_axis_angle
+
+    return rotation_matrix_to_axis_angle(R)
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from .camera import Camera, intrinsics
 from .pixels import HW
-from .pose import Pose, matvec, rotation_from_vector
+from .pose import Pose, cross_matrix, matvec, rotation_from_vector, rotation_vector
 from .rig import Pair
 
 
 class Rectification(NamedTuple):
-    """What turns a pair into a rectified one.
+    """The rectification of a pair.
 
-    `R_alpha` and `R_beta` turn the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones, `pair`
+    `R_alpha` and `R_beta` rotate the cameras' frames, `H_alpha` and `H_beta` take old pixels to new ones, `pair`
     holds the rectified cameras: same K, same orientation, the baseline along x.
     """
 
@@ -29,11 +29,11 @@ class Rectification(NamedTuple):
 
 
 def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None = None) -> Rectification:
-    """Rectifying homographies of a pinhole pair (Bouguet's: each camera is turned half way).
+    """Rectifying homographies of a pinhole pair (Bouguet's: each camera is rotated half way).
 
     The new images have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two focal
     lengths, and the centres of the old images about the middle of the new. The same R_alpha and R_beta as
-    OpenCV's `stereoRectify` for a horizontal pair; a vertical one is turned by a quarter, so that lines are rows
+    OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated by 90 degrees, so that lines are rows
     here too. Differentiable in everything. Raises ValueError for lenses, batches, and without a baseline.
     """
     alpha, beta = pair.cameras
@@ -43,7 +43,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         raise ValueError("rectification works on one pair at a time: take one of the batch")
     pose = pair.beta_from_alpha
     if not pose.t.norm() > 1e-12:
-        raise ValueError("two cameras in one place cannot be rectified: there is no baseline")
+        raise ValueError("two co-located cameras cannot be rectified: there is no baseline")
     R_alpha, R_beta = rectifying_rotations(pose)
     hw = hw or alpha.hw
     K = middle_intrinsics((alpha, beta), (R_alpha, R_beta), hw) if K is None else K
@@ -56,7 +56,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
 
 
 def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
-    """(R_alpha, R_beta): both frames turned half way to one another, then until the baseline is along x."""
+    """(R_alpha, R_beta): both frames rotated half way to one another, then until the baseline is along x."""
     half = rotation_from_vector(0.5 * rotation_vector(beta_from_alpha.R))
     t = half.T @ beta_from_alpha.t
     direction = t / t.norm()
@@ -66,20 +66,10 @@ def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], F
 
 
 def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
-    """The shortest rotation that takes unit vector a to unit vector b, less than half a turn away."""
+    """The shortest rotation that takes unit vector a to unit vector b, less than 180 degrees away."""
     v = torch.linalg.cross(a, b)
-    W = torch.stack([torch.linalg.cross(v, e) for e in torch.eye(3).to(v)], -1)
+    W = cross_matrix(v)
     return torch.eye(3).to(v) + W + W @ W / (1 + a @ b)
-
-
-def rotation_vector(R: Float[Tensor, "3 3"]) -> Float[Tensor, "3"]:
-    """Axis times angle of a rotation by less than half a turn: the inverse of `rotation_from_vector`."""
-    skew = 0.5 * torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    squared = skew.square().sum()
-    cosine = 0.5 * (R.diagonal().sum() - 1)
-    small = (squared < 1e-6) & (cosine > 0)
-    sine = torch.where(small, 1.0, squared).sqrt()
-    return skew * torch.where(small, 1 + squared / 6 + 3 * squared.square() / 40, torch.atan2(sine, cosine) / sine)
 
 
 def middle_intrinsics(

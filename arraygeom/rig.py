@@ -1,4 +1,4 @@
-"""Rig: named cameras of different kinds, and the depths of what they look at."""
+"""Rig: named cameras of different kinds, and the depth range of the scene."""
 
 from __future__ import annotations
 
@@ -8,34 +8,43 @@ import fnmatch
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from .batching import Batched
 from .camera import Camera, LensView, View
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
+from .text import baseline_text, depth_text, rig_html, rig_text, view_text
+
+if TYPE_CHECKING:
+    from kornia.geometry.camera import PinholeCamera
 
 Depths = tuple[Float[Tensor, "*b"], Float[Tensor, "*b"]]
 
 
-@dataclass(frozen=True)
-class Link:
-    """What is known of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
+@dataclass(frozen=True, eq=False, repr=False)
+class Link(Batched):
+    """The two-view geometry of an uncalibrated pair: x_beta^T F x_alpha = 0 and, roughly, x_beta ~ H x_alpha.
 
-    Of views with lenses, x are straightened pixels (`LensView.straighten`).
+    Of views with lenses, x are undistorted pixels (`LensView.undistort`).
     """
 
+    item_axes: ClassVar = {"F": 2, "H": 2}
     F: Float[Tensor, "*b 3 3"]
     H: Float[Tensor, "*b 3 3"] | None = None
 
     def reversed(self) -> Link:
         """The same link with alpha and beta exchanged."""
         return Link(self.F.transpose(-1, -2), None if self.H is None else torch.linalg.inv(self.H))
+
+    def _text(self) -> str:
+        return "F" if self.H is None else "F and H"
 
     def transformed(self, A_alpha: Float[Tensor, "3 3"], A_beta: Float[Tensor, "3 3"]) -> Link:
         """The link between images whose pixels are A x of the old ones."""
@@ -44,21 +53,17 @@ class Link:
         F = torch.linalg.inv(A_beta).T @ self.F @ back
         return Link(F, None if self.H is None else A_beta @ self.H @ back)
 
-    def to(self, *args: Any, **kwargs: Any) -> Link:
-        """Like `Tensor.to`."""
-        return Link(self.F.to(*args, **kwargs), None if self.H is None else self.H.to(*args, **kwargs))
 
-
-@dataclass(frozen=True)
-class Pair:
-    """Alpha and one beta, and all that relates them: two calibrated cameras, or a link, or only sizes."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Pair(Batched):
+    """Alpha and one beta with their relation: two calibrated cameras, or a link, or only sizes."""
 
     alpha: View
     beta: View
     depth: Depths | None = None
     link: Link | None = None
     memo: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False, repr=False)
-    """What fields have found out about the pair once and need again for the next pixels; never copied."""
+    """Cache of what fields compute once a pair; never copied."""
 
     @property
     def calibrated(self) -> bool:
@@ -98,7 +103,7 @@ class Pair:
 
     @property
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
-        """F with x_beta^T F x_alpha = 0, from the cameras or as given; between straightened pixels through lenses.
+        """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through lenses.
 
         Raises ValueError if neither is known.
         """
@@ -113,7 +118,7 @@ class Pair:
     def homography(self) -> Float[Tensor, "*b 3 3"]:
         """H with x_beta ~ H x_alpha, roughly: as given; or of the plane at the middle inverse depth.
 
-        A pair that is known only by sizes, or by F alone, is taken to see the same field of view.
+        A pair that is known only by sizes, or by F alone, is assumed to have the same field of view.
         """
         if self.link is not None and self.link.H is not None:
             return self.link.H
@@ -128,7 +133,7 @@ class Pair:
         return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
 
     def rot90_beta(self, quarter_turns: int) -> Pair:
-        """The pair whose beta has its image turned; see `Camera.turn`."""
+        """The pair whose beta has its image rotated; see `Camera.rot90`."""
         h, w = self.beta.hw
         return self.transform_beta(rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
 
@@ -145,11 +150,11 @@ class Pair:
         pose = self.beta_from_alpha
         return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
 
-    def to(self, *args: Any, **kwargs: Any) -> Pair:
-        """Like `Tensor.to`."""
-        depth = None if self.depth is None else tuple(d.to(*args, **kwargs) for d in self.depth)
-        link = None if self.link is None else self.link.to(*args, **kwargs)
-        return Pair(self.alpha.to(*args, **kwargs), self.beta.to(*args, **kwargs), depth, link)  # type: ignore[arg-type]
+    def _text(self) -> str:
+        views = {"alpha": self.alpha, "beta": self.beta}
+        named = ", ".join(f"{name} {view_text(view)}" for name, view in views.items())
+        link = "" if self.link is None else f"link by {self.link._text()}"
+        return "; ".join(part for part in (named, baseline_text(views), depth_text(self.depth), link) if part)
 
 
 def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -157,26 +162,33 @@ def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[T
     return 2 / (1 / near + 1 / far)
 
 
-@dataclass(frozen=True)
-class Rig:
+@dataclass(frozen=True, eq=False, repr=False)
+class Rig(Batched):
     """Ordered, named cameras of different sizes, lenses and spectral responses.
 
     `depth` is (near, far) in metres along the optical axis of whichever camera is alpha; far may be inf. Every
-    number may have leading batch axes, the same for all: a batch of rigs.
+    number may have leading batch axes, the same for all: a batch of rigs. Kornia's pinholes are converted.
     `links` relate cameras that are not calibrated, by (alpha, beta). A rig never changes: methods return new ones.
     """
 
-    cameras: Mapping[str, View]
+    cameras: Mapping[str, Any]  # View once made; kornia pinholes serve as well
     depth: Any = None  # Depths | None once made; numbers serve as well
     links: Mapping[tuple[str, str], Link] = field(default_factory=dict)
     name: str = ""
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()})
         if self.depth is not None:
             object.__setattr__(self, "depth", depth_range(*self.depth))
 
-    def __getitem__(self, name: str) -> View:
-        return self.cameras[self.require(name)]
+    @classmethod
+    def from_kornia(cls, cameras: Mapping[str, PinholeCamera], **fields: Any) -> Rig:
+        """The rig of kornia pinholes by name; `fields` are the rig's own, such as `depth`. As `Rig(cameras)` too."""
+        return cls(cameras, **fields)  # type: ignore[arg-type]
+
+    def __getitem__(self, name: Any) -> Any:
+        """The camera of a name; or, of a batch of rigs, those at an index."""
+        return self.cameras[self.require(name)] if isinstance(name, str) else super().__getitem__(name)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -202,10 +214,6 @@ class Rig:
             link = self.links[beta, alpha].reversed()
         return Pair(self[alpha], self[beta], self.depth, link)
 
-    def replace(self, **changes: Any) -> Rig:
-        """A copy with some fields changed."""
-        return dataclasses.replace(self, **changes)
-
     def with_camera(self, name: str, camera: View) -> Rig:
         """A copy with one camera set, replacing that of the same name if there is one."""
         return self.replace(cameras={**self.cameras, name: camera})
@@ -218,8 +226,8 @@ class Rig:
         """The rig whose camera `name` keeps a window of its image; see `Camera.crop`."""
         return self.transformed(name, shift_matrix(left, top), hw)
 
-    def turn(self, name: str, quarter_turns: int) -> Rig:
-        """The rig whose camera `name` has its image turned; see `Camera.turn`."""
+    def rot90(self, name: str, quarter_turns: int) -> Rig:
+        """The rig whose camera `name` has its image rotated; see `Camera.rot90`."""
         hw = self[name].hw
         return self.transformed(name, rot90_matrix(hw, quarter_turns), hw if quarter_turns % 2 == 0 else (hw[1], hw[0]))
 
@@ -264,14 +272,6 @@ class Rig:
             depth = near + changes.get("depth.near", 0), far + changes.get("depth.far", 0)
         return self.replace(cameras=cameras, depth=depth)
 
-    def to(self, *args: Any, **kwargs: Any) -> Rig:
-        """Like `Tensor.to`, for every tensor of the rig."""
-        return self.replace(
-            cameras={n: c.to(*args, **kwargs) for n, c in self.cameras.items()},
-            depth=None if self.depth is None else tuple(d.to(*args, **kwargs) for d in self.depth),
-            links={k: v.to(*args, **kwargs) for k, v in self.links.items()},
-        )
-
     @classmethod
     def load(cls, path: str | Path) -> Rig:
         """Read a rig file of any format that `arraygeom.io` knows. Raises `arraygeom.io.RigFileError`."""
@@ -280,10 +280,16 @@ class Rig:
         return read_rig(path)
 
     def save(self, path: str | Path) -> None:
-        """Write the native rig file; it appears whole or not at all."""
+        """Write the native rig file, atomically."""
         from .io import write_rig
 
         write_rig(self, path)
+
+    def _text(self) -> str:
+        return rig_text(self)
+
+    def _repr_html_(self) -> str:
+        return rig_html(self)
 
     def _parameter_shapes(self) -> dict[str, Tensor]:
         """One tensor of the right shape, type and device for each parameter."""
@@ -297,6 +303,18 @@ class Rig:
         if self.depth is not None:
             known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
         return known
+
+
+def _view(name: str, camera: Any) -> View:
+    """A camera as given, converted if it is kornia's."""
+    if isinstance(camera, View):
+        return camera
+    from kornia.geometry.camera import PinholeCamera
+
+    if isinstance(camera, PinholeCamera):
+        return Camera.from_kornia(camera)
+    kind = type(camera).__name__
+    raise TypeError(f"camera '{name}' is a {kind}: give a Camera, a LensView, a View or a kornia PinholeCamera")
 
 
 def depth_range(near: Any, far: Any) -> Depths:
@@ -314,8 +332,8 @@ def _shown(d: Tensor) -> str:
     return ", ".join(f"{v:g}" for v in d.reshape(-1).tolist())
 
 
-def _focal_places(K: Tensor) -> Tensor:
-    """Where K has fx and fy, with their signs: the diagonal, or for a turned image the other one."""
+def _focal_positions(K: Tensor) -> Tensor:
+    """The positions of fx and fy in K, with their signs: the diagonal, or for a rotated image the other one."""
     block = K.detach()[..., :2, :2]
     largest = block.abs() == block.abs().amax(-2, keepdim=True)
     return torch.where(largest, block.sign(), 0.0)
@@ -334,7 +352,7 @@ def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) ->
     if mine.keys() & {"rotation", "translation"}:
         pose = pose.perturbed(mine.get("rotation"), mine.get("translation"))
     if "focal" in mine:
-        K = K + torch.nn.functional.pad(_focal_places(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
+        K = K + torch.nn.functional.pad(_focal_positions(K) * mine["focal"][..., None, :], (0, 1, 0, 1))
     if "centre" in mine:
         K = K + torch.nn.functional.pad(mine["centre"][..., None], (2, 0, 0, 1))
     return camera.replace(K=K, cam_from_world=pose)

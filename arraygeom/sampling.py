@@ -1,4 +1,4 @@
-"""Looking an image up at positions, with validity."""
+"""Sampling an image at positions, with validity."""
 
 from __future__ import annotations
 

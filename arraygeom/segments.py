@@ -1,41 +1,49 @@
-"""Where to look in beta: what geometry hands to attention.
+"""Search segments and sampling positions in beta: what geometry hands to attention.
 
 `Segments` is the compact form, two points for each alpha pixel; `Positions` is the explicit one. Both hold
 (x, y) in beta's pixels, the centre of the first pixel being (0, 0). An image of height H and width W covers
-the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be looked up, all others cannot.
+the area [-0.5, W - 0.5] x [-0.5, H - 0.5]: positions on it can be sampled, all others cannot.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from .batching import Batched
 from .pixels import HW
+from .text import positions_text, segments_text
 
 
-@dataclass(frozen=True)
-class Positions:
+@dataclass(frozen=True, eq=False, repr=False)
+class Positions(Batched):
     """Explicit sample positions, L for each alpha pixel.
 
-    `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count has
-    nowhere to look.
+    `xy` is in beta's pixels; `mask` says which samples count. An alpha pixel none of whose samples count is
+    not seen by beta.
     """
 
+    item_axes: ClassVar = {"xy": 2, "mask": 1}
     xy: Float[Tensor, "*n l 2"]
     mask: Bool[Tensor, "*n l"]
 
+    def _text(self) -> str:
+        return positions_text(self)
 
-@dataclass(frozen=True)
-class Segments:
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Segments(Batched):
     """One straight piece of beta's image for each alpha pixel, from `start` to `end`, in beta's pixels.
 
     For a depth-bounded field `start` is where the point would be at the near bound and `end` at the far bound.
-    Where `valid` is False there is nowhere to look and the ends mean nothing (but are finite).
+    Where `valid` is False there is nothing to sample and the ends mean nothing (but are finite).
     """
 
+    item_axes: ClassVar = {"start": 1, "end": 1}
     start: Float[Tensor, "*n 2"]
     end: Float[Tensor, "*n 2"]
     valid: Bool[Tensor, "*n"]
@@ -70,6 +78,9 @@ class Segments:
         xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
+    def _text(self) -> str:
+        return segments_text(self)
+
 
 def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
     """The part of each segment on the image's area (Liang and Barsky 1984); invalid where there is none."""
@@ -95,7 +106,7 @@ def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> T
 
 
 FLAT = 1e-6
-"""A limit of the image that moves by less than this along a whole segment, in pixels, is either kept or not."""
+"""A limit of the image that moves by less than this along a whole segment, in pixels, is either inside or not."""
 
 
 def sample_fractions(samples: int, *, like: Tensor) -> Float[Tensor, "l"]:

@@ -1,4 +1,4 @@
-"""What a camera records, apart from where: its spectral response, timing and coding."""
+"""A camera's sensor: its spectral response, timing and coding."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PATTERNS = ("RGGB", "BGGR", "GRBG", "GBRG")
 
 @dataclass(frozen=True)
 class Sensor:
-    """Facts about a camera that geometry carries along but does not use.
+    """Facts about a camera that geometry does not use.
 
     `response` is a name ("mono", "rgb", "nir"), a band or a curve. `frame_rate` is in frames a second,
     `time_offset` in seconds after the rig's clock. `coding` says how pixel values relate to light:

@@ -1,4 +1,4 @@
-"""What a designer wants to know of a rig at a glance."""
+"""A rig in numbers: fields of view, baselines, segment lengths, depth resolution."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .camera import Camera
-from .fields import Curved, Epipolar, look
+from .fields import Curved, Epipolar, sampling_locations
 from .pixels import pixel_grid
 from .rig import Pair, Rig
 from .segments import Segments
+from .text import angle
 
 
 class CameraSummary(NamedTuple):
@@ -30,7 +31,7 @@ class PairSummary(NamedTuple):
     """Alpha and one beta.
 
     baseline: metres between the optical centres; rotation: degrees between the orientations.
-    seen: share of alpha's pixels that look somewhere in beta.
+    seen: share of alpha's pixels that have a segment in beta.
     length: (median, largest) length of their segments, pixels of beta.
     depth_step: (near, far), the change of depth that moves the point by one pixel in beta, metres.
     """
@@ -71,7 +72,7 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
 def field_of_view(camera: Camera) -> tuple[float, float]:
     """Angles (across, down) in degrees between the rays at the middles of opposite edges, through the lens.
 
-    An edge that the lens model does not reach gives NaN.
+    An edge outside the lens model's range gives NaN.
     """
     h, w = camera.hw
     middle = ((w - 1) / 2, (h - 1) / 2)
@@ -89,25 +90,18 @@ def _angles(a: Float[Tensor, "n 3"], b: Float[Tensor, "1 3"]) -> Float[Tensor, "
 
 def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
     pose = pair.beta_from_alpha
-    sine, cosine = _rotation_parts(pose.R)
-    rotation = math.degrees(math.atan2(sine, cosine))
+    rotation = math.degrees(float(angle(pose.R)))
     seen, length = _segments(pair) if pair.depth is not None else (None, None)
     baseline = float(pose.centre.norm())
     return PairSummary(alpha, beta, baseline, rotation, seen, length, _depth_step(pair, baseline))
 
 
-def _rotation_parts(R: Float[Tensor, "3 3"]) -> tuple[float, float]:
-    """Sine and cosine of the angle of a rotation."""
-    axis = torch.stack([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-    return float(axis.norm() / 2), float((R.diagonal().sum() - 1) / 2)
-
-
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels that look somewhere, and (median, largest) length of where, on every fourth pixel."""
+    """Share of alpha's pixels with a segment, and its (median, largest) length, on every fourth pixel."""
     x = pixel_grid(pair.alpha.hw)[::4, ::4]
     alpha, beta = pair.cameras
     straight = alpha.distortion is None and beta.distortion is None
-    found = look(Epipolar() if straight else Curved(64), pair, x)
+    found = sampling_locations(Epipolar() if straight else Curved(64), pair, x)
     if isinstance(found, Segments):
         valid, length = found.valid, found.length
     else:

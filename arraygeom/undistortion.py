@@ -1,4 +1,4 @@
-"""Images without their lens's bending: pinhole cameras in place of those with lenses, and images taken across."""
+"""Undistorting images: pinhole cameras in place of those with lenses, and images resampled to them."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ WIDEST = math.radians(62)
 def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
     """The camera without its lens, large enough for all that the old image shows up to `widest` radians off axis.
 
-    Same place, orientation and K but for the principal point: pixels in the middle keep their size. Links follow by
-    `rig.mapped(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of cameras, and for an image whose
-    middle is outside its lens's range.
+    Same position, orientation and K but for the principal point: pixels in the middle keep their size. Links follow by
+    `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of cameras, and for an image
+    whose middle is outside its lens's range.
     """
     if camera.K.ndim > 2:
         raise ValueError("a pinhole view is made of one camera at a time: take one of the batch")
@@ -40,7 +40,7 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
 
 
 def pixels_between(source: LensView, target: LensView) -> tuple[Float[Tensor, "h w 2"], Tensor]:
-    """For each pixel of `target` where `source`, in the same place, sees it, and whether it does. Float64."""
+    """For each pixel of `target` its position in the co-located `source`, and whether `source` sees it. Float64."""
     source, target = source.to(torch.float64), target.to(torch.float64)
     rays, valid = target.rays(pixel_grid(target.hw, dtype=torch.float64))
     if isinstance(source, Camera) and isinstance(target, Camera):
@@ -57,10 +57,10 @@ def resampled(
     interpolation: Interpolation = "bicubic",
     extended: bool = False,
 ) -> Sampled:
-    """The image that `target`, in the same place as `source`, would have taken: values (1, C, H, W) and validity.
+    """The image that `target`, co-located with `source`, would have recorded: values (1, C, H, W) and validity.
 
     Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid. The
-    distance of the two places is not looked at; views that are not calibrated count as turned alike.
+    baseline between the two is ignored; uncalibrated views count as having the same orientation.
     """
     x, seen = pixels_between(source, target)
     h, w = source.hw

@@ -1,7 +1,8 @@
 """Drawings of rigs, fields and residuals. Functions give back a figure and show nothing.
 
 Matplotlib figures are made without pyplot, so there is no global state: `figure.savefig("rig.png")`, or leave the
-figure as the last line of a notebook's cell. `interactive_rig` needs plotly.
+figure as the last line of a notebook's cell. Matplotlib is imported when something is drawn; `interactive_rig` needs
+plotly.
 """
 
 from __future__ import annotations
@@ -10,18 +11,15 @@ from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from .camera import Camera
 from .epipolar import epipolar_distance, epipolar_lines
-from .fields import Curved, Epipolar, HomographyDisplacement, ReceptiveField
+from .extras import needs
+from .fields import ReceptiveField, recorded_field
 from .fields.widened import direction
 from .pixels import HW
 from .rig import Pair, Rig
@@ -29,6 +27,8 @@ from .segments import Segments
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c564b", "#5c5c5c")
 """Okabe and Ito's, which colour-blind readers can tell apart."""
@@ -45,7 +45,7 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
     times its extent, or is infinite). Up in the figure is -y of the world.
     """
     cameras = calibrated(rig)
-    figure = Figure(figsize=(5.2, 4.6), layout="constrained")
+    figure = new_figure(figsize=(5.2, 4.6), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d", proj_type="ortho")
     size = size or frustum_size(cameras)
     for colour, (name, camera) in zip(_colours(), cameras.items()):
@@ -64,11 +64,9 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
 
 
 def interactive_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None) -> go.Figure:
-    """The drawing of `draw_rig` as a plotly figure to turn about. Raises ImportError without plotly."""
-    try:
+    """The drawing of `draw_rig` as an interactive plotly figure. Raises ImportError without plotly."""
+    with needs("explore", "the interactive figure"):
         import plotly.graph_objects as go
-    except ImportError as error:
-        raise ImportError("the interactive figure needs plotly: `pip install plotly`, or use draw_rig") from error
     cameras = calibrated(rig)
     figure = go.Figure()
     size = size or frustum_size(cameras)
@@ -140,7 +138,7 @@ def image_border(hw: HW, points: int = 16) -> Float[Tensor, "n 2"]:
 def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray:
     """World points of pixels at a depth; NaN where the lens has no ray.
 
-    Pixels that the lens model does not reach are moved towards the middle until it does, and rays more than 53
+    Pixels outside the lens model's range are moved towards the middle until they are inside, and rays more than 53
     degrees off axis are cut at 1 / 0.6 of the depth: a fisheye's border would be at infinity.
     """
     camera = camera.to(torch.float64)
@@ -153,7 +151,7 @@ def seen_at(camera: Camera, x: Float[Tensor, "n 2"], depth: float) -> np.ndarray
     return numpy(torch.where(valid.any(0)[:, None], points, torch.nan))
 
 
-# Where to look ------------------------------------------------------------------------------------------------
+# Receptive fields ------------------------------------------------------------------------------------------------
 
 
 def draw_fields(
@@ -165,15 +163,15 @@ def draw_fields(
     images: Mapping[str, Any] | None = None,
     betas: Sequence[str] | None = None,
 ) -> Figure:
-    """Alpha's pixels x, and in every beta where a field looks for them, in the same colours.
+    """Alpha's pixels x, and their sampling locations in every beta, in the same colours.
 
-    `field` is one for all betas or one for each by name (Epipolar, Curved where there are lenses, or the
-    homography-based one without calibration). `images` holds (H, W), (H, W, 3) or (3, H, W) images by camera name.
+    `field` is one for all betas or one for each by name (`recorded_field` by default). `images` holds (H, W),
+    (H, W, 3) or (3, H, W) images by camera name.
     Segments are lines with a dot at their near end, positions are dots.
     """
     betas = tuple(betas or rig.betas(alpha))
     images = images or {}
-    figure = Figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
+    figure = new_figure(figsize=_sheet([rig[n].hw for n in (alpha, *betas)]), layout="constrained")
     for index, name in enumerate((alpha, *betas)):
         axes = figure.add_subplot(1, 1 + len(betas), 1 + index)
         show_image(axes, rig[name].hw, images.get(name))
@@ -183,12 +181,12 @@ def draw_fields(
             continue
         pair = rig.pair(alpha, name)
         chosen = field.get(name) if isinstance(field, Mapping) else field
-        draw_look(axes, chosen or suitable_field(pair), pair, x)
+        draw_sampling_locations(axes, chosen or recorded_field(pair), pair, x)
     return figure
 
 
-def draw_look(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
-    """Where a field looks in beta for each of a few alpha pixels, each in its own colour."""
+def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n 2"]) -> None:
+    """The sampling locations in beta of a few alpha pixels, each in its own colour."""
     found = field(pair, x)
     for i, colour in enumerate(_colours(len(x))):
         if isinstance(found, Segments):
@@ -199,14 +197,6 @@ def draw_look(axes: Axes, field: ReceptiveField, pair: Pair, x: Float[Tensor, "n
                 axes.plot(x0, y0, "o", color=colour, ms=4, mec="white", mew=0.6)
         else:
             axes.scatter(*numpy(found.xy[i][found.mask[i]]).T, color=colour, s=1.5, linewidths=0)
-
-
-def suitable_field(pair: Pair) -> ReceptiveField:
-    """The field that knows most about the pair: curved, depth-bounded, or about H x."""
-    if isinstance(pair.alpha, Camera) and isinstance(pair.beta, Camera) and pair.depth is not None:
-        straight = pair.alpha.distortion is None and pair.beta.distortion is None
-        return Epipolar() if straight else Curved(256)
-    return HomographyDisplacement(0.06 * pair.beta.hw[1])
 
 
 # How well it fits ---------------------------------------------------------------------------------------------
@@ -225,13 +215,15 @@ def draw_residuals(
     Left, each distance drawn across its line and `magnify` times as long (by default so that the median is 2 % of
     the width); right, their histogram, with the median. Pixels of undistorted images.
     """
+    with needs("plots", "drawing"):
+        from matplotlib.collections import LineCollection
     line = epipolar_lines(pair.fundamental.to(x_alpha.dtype), x_alpha)
     distance = epipolar_distance(pair.fundamental.to(x_alpha.dtype), x_alpha, x_beta)
     size = distance.abs()
     median = float(size.median())
     magnify = magnify or max(1.0, float(np.round(0.02 * pair.beta.hw[1] / max(median, 1e-9), 0)))
     ends = numpy(x_beta - magnify * distance[:, None] * direction(line[:, :2]))
-    figure = Figure(figsize=(8.4, 3.4), layout="constrained")
+    figure = new_figure(figsize=(8.4, 3.4), layout="constrained")
     axes, histogram = figure.subplots(1, 2, width_ratios=[1.5, 1])
     show_image(axes, pair.beta.hw, image)
     limit = max(float(size.quantile(0.95)), 1e-9)
@@ -249,6 +241,13 @@ def draw_residuals(
 
 
 # Shared -------------------------------------------------------------------------------------------------------
+
+
+def new_figure(**options: Any) -> Figure:
+    """A matplotlib figure outside pyplot. Raises ImportError where matplotlib is not installed."""
+    with needs("plots", "drawing"):
+        from matplotlib.figure import Figure
+    return Figure(**options)
 
 
 def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
@@ -277,7 +276,9 @@ def _sheet(sizes: list[HW], height: float = 2.6) -> tuple[float, float]:
 def _colours(n: int | None = None) -> list[Any]:
     if n is None or n <= len(COLOURS):
         return [*COLOURS * 32][:n] if n is not None else [*COLOURS * 32]
-    return list(matplotlib.colormaps["turbo"](np.linspace(0.05, 0.95, n)))
+    from matplotlib import colormaps
+
+    return list(colormaps["turbo"](np.linspace(0.05, 0.95, n)))
 
 
 def _upright(X: np.ndarray) -> np.ndarray:

@@ -8,7 +8,7 @@ import torch
 from matplotlib.figure import Figure
 
 from arraygeom import Dense, Epipolar, EpipolarLine, HomographyDisplacement, Local, NearestVoxels, Rectified
-from arraygeom.viz import draw_fields, draw_look, draw_rig, show_image
+from arraygeom.viz import draw_fields, draw_rig, draw_sampling_locations, show_image
 from pat.data.sample_array import ALPHA, BETA, SampleArray, load_sample
 from pat.media.figures import save_figure
 
@@ -35,7 +35,7 @@ def families(array: SampleArray, x: torch.Tensor) -> Figure:
                 axes.plot(*pixel.tolist(), "o", ms=6)
         else:
             show_image(axes, pair.beta.hw, array.images[BETA] * 0.4 + 0.6)
-            draw_look(axes, field, pair, x)
+            draw_sampling_locations(axes, field, pair, x)
         axes.set_title(name, fontsize=9)
     return figure
 

@@ -7,6 +7,8 @@ import importlib.metadata
 import inspect
 import os
 import re
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -15,6 +17,7 @@ import torch
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from arraygeom.extras import needs
 from pat.media.images import write_image
 
 ROOT = Path(__file__).parents[1]
@@ -104,11 +107,62 @@ def test_one_module_uses_grid_sample():
     assert [module_name(p) for p in sources(*PACKAGES) if "grid_sample" in names(p)] == ["arraygeom.sampling"]
 
 
+def imported_at_once(path: Path) -> set[str]:
+    """The outermost names of what importing a file imports: not in functions, nor for type checkers."""
+    found: set[str] = set()
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Import):
+            found |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            found.add(node.module.partition(".")[0])
+    return found
+
+
+GEOMETRY_NEEDS = {"torch", "kornia", "numpy", "yaml", "jaxtyping", *sys.stdlib_module_names}
+GEOMETRY_MAY_USE = {"opencv.py": {"cv2"}, "matlab.py": {"scipy"}, "viz.py": {"matplotlib", "plotly"}}
+"""What single files of arraygeom import when it is needed, and say so in one line where it is not there."""
+
+
+@each(sources("arraygeom"))
+def test_arraygeom_needs_few_packages(path):
+    assert imported_at_once(path) <= GEOMETRY_NEEDS - {"kornia"}, "kornia takes 0.4 s to import: import it where used"
+    assert imports(path) <= GEOMETRY_NEEDS | GEOMETRY_MAY_USE.get(path.name, set())
+
+
+def test_importing_arraygeom_and_fusion_is_light():
+    code = "import sys, {}; print(*sorted(sys.modules))"
+
+    def loaded(module: str) -> set[str]:
+        done = subprocess.run([sys.executable, "-c", code.format(module)], cwd=ROOT, capture_output=True, text=True)
+        return set(done.stdout.split())
+
+    assert not loaded("arraygeom") & {"kornia", "cv2", "scipy", "matplotlib"}
+    assert "pat.fusion.fuse" in loaded("pat.fusion.batch")
+    assert not loaded("pat.fusion.batch") & {"matplotlib", "av", "plotly", "panel", "bpy"}
+
+
+def test_an_optional_package_that_is_missing_is_named_with_its_extra():
+    with (
+        pytest.raises(ImportError, match=r"writing video needs av_: pip install 'arraygeom-pat\[video\]'"),
+        needs("video", "writing video"),
+    ):
+        importlib.import_module("av_.video")
+
+
+def test_extras_exist_that_messages_name():
+    extras = PROJECT["optional-dependencies"]
+    named = {n for p in sources(*PACKAGES) for n in re.findall(r'needs\("(\w+)", "', p.read_text())}
+    named |= {
+        extra for texts in extras.values() for text in texts for extra in Requirement(text).extras if "pat" in text
+    }
+    assert {"video", "plots", "calibration"} <= named <= set(extras)
+
+
 def test_arraygeom_touches_files_only_in_io():
     assert {
         p.name: names(p) & READING_FILES
         for p in sources("arraygeom")
-        if names(p) & READING_FILES and "io" not in p.relative_to(ROOT).parts
+        if names(p) & READING_FILES and "io" not in p.relative_to(ROOT).parts and p.name != "atomic.py"
     } == {}
 
 
@@ -154,7 +208,8 @@ def test_one_version():
 
 def test_what_is_asked_for_is_pinned_exactly_and_in_range():
     pinned = pins()
-    for text in PROJECT["dependencies"] + PROJECT["optional-dependencies"]["dev"]:
+    optional = PROJECT["optional-dependencies"]
+    for text in PROJECT["dependencies"] + optional["dev"] + optional["video"] + optional["plots"]:
         asked = Requirement(text)
         for pin in pinned[canonicalize_name(asked.name)]:
             (only,) = pin.specifier

@@ -1,4 +1,4 @@
-"""Receptive fields: where in beta to look for the point that an alpha pixel sees.
+"""Receptive fields: the sampling locations in beta for the point that an alpha pixel sees.
 
 A field is anything that can be called with a `Pair` and alpha pixels x (*n, 2), and answers with `Segments` or
 `Positions` over *n. The families here are frozen dataclasses; a plain function serves as well:
@@ -13,30 +13,34 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 
 from .approximation import approximated, placement_error
 from .curved import Curved, ThroughLenses
+from .default import FIELDS, default_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
-from .protocol import Look, ReceptiveField, lazily, look
+from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, covering_displacement, pinhole_track
 from .widened import Widened
 
 __all__ = [
+    "FIELDS",
     "Curved",
     "Dense",
     "Epipolar",
     "EpipolarLine",
     "HomographyDisplacement",
     "Local",
-    "Look",
     "Moved",
     "NearestVoxels",
     "ReceptiveField",
     "Rectified",
+    "SamplingLocations",
     "ThroughLenses",
     "Widened",
     "approximated",
     "covering_displacement",
+    "default_field",
     "lazily",
-    "look",
     "pinhole_track",
     "placement_error",
+    "recorded_field",
+    "sampling_locations",
 ]

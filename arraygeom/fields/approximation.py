@@ -15,7 +15,7 @@ from .straight import Epipolar
 
 
 def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homography") -> Pair:
-    """The pair with its exact F and the H that best places the middles of its depth-bounded segments.
+    """The pair with its exact F and the H that fits best to the middles of its depth-bounded segments.
 
     Least squares in pixels of beta, over the segments that beta's image holds of every 16th alpha pixel:
     what the paper calls the homography-based approximation. `HomographyDisplacement()` on the result takes the

@@ -1,4 +1,4 @@
-"""Fields that lenses bend: explicit positions along the image of each ray."""
+"""Fields through lenses: explicit positions along the distorted image of each ray."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Curved:
     between the bounds (metres; the pair's own unless given), even in inverse depth, and the part of it on
     beta's image is divided evenly. Positions are exact for their depths; the spacing, and where an edge of
     the image cuts the curve, are to the accuracy of straight pieces between nodes. What a fisheye alpha sees
-    at 90 degrees or more off axis has no depth along the axis and nowhere to look.
+    at 90 degrees or more off axis has no depth along the axis and no samples.
     """
 
     samples: int = 96
@@ -56,8 +56,8 @@ class Curved:
 class ThroughLenses:
     """A straight field seen through lenses: for pairs known by F, or any field other than `Epipolar`.
 
-    The field is asked about the pair without its lenses (`pinhole_view`), and what it answers is bent as beta's lens
-    bends it. Segments are sampled at `samples` positions, evenly spaced before they are bent.
+    The field is evaluated for the pair without its lenses (`pinhole_view`) and the result is distorted by beta's lens.
+    Segments are sampled at `samples` positions, evenly spaced before distortion.
     """
 
     field: ReceptiveField
@@ -77,7 +77,7 @@ class ThroughLenses:
 
 
 class _Straight(NamedTuple):
-    """A view, the same without its lens, and A which takes the straightened pixels of the one to those of the other."""
+    """A view, the same without its lens, and A which takes the undistorted pixels of the one to those of the other."""
 
     view: View
     pinhole: View

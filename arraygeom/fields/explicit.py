@@ -42,7 +42,7 @@ class NearestVoxels:
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
     def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:
-        """Beside the line first; the whole window where that cannot be known to hold the nearest `count`."""
+        """Beside the line first; the whole window where that may not hold the nearest `count`."""
         beside = 2 + self.count // (2 * self.window + 1)
         xy, mask, distance = self._choose(self._candidates(line, centre, beside), line, centre, pair)
         disparity = (beside + 0.5) * line[:, :2].abs().amax(-1)

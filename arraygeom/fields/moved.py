@@ -1,4 +1,4 @@
-"""The field of points that move: beta looks at another time than alpha."""
+"""The field of moving points, for a beta that records at another time than alpha."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from torch import Tensor
 
 from ..rig import Pair
 from ..sampling import sample
-from .protocol import Look, ReceptiveField
+from .protocol import ReceptiveField, SamplingLocations
 
 
 @dataclass(frozen=True, eq=False)
 class Moved:
-    """Any field, for cameras that are not synchronised: it looks where alpha's pixels are when beta records.
+    """Any field, for cameras that are not synchronised, evaluated where alpha's pixels are when beta records.
 
     `displacement` (2, H, W) says by how many pixels of alpha each of its pixels moves from alpha's exposure to
-    beta's, in x and y; optical flow between alpha's own frames tells it. It is looked up bilinearly, and counts as at
-    the nearest pixel outside alpha's image. What is not known of it, `Widened` gives room for.
+    beta's, in x and y, for instance by optical flow between alpha's own frames. It is interpolated bilinearly, and
+    extended by the nearest pixel outside alpha's image. `Widened` allows for its error.
     """
 
     field: ReceptiveField
     displacement: Float[Tensor, "2 h w"]
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
-        """What the field answers for the points where alpha's pixels x will be."""
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
+        """The field's sampling locations for the points where alpha's pixels x will be."""
         return self.field(pair, self.points(x))
 
     def points(self, x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:

@@ -14,24 +14,24 @@ from ..pixels import pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
 
-Look = Segments | Positions
+SamplingLocations = Segments | Positions
 
 
 @runtime_checkable
 class ReceptiveField(Protocol):
-    """Where to look in beta for each alpha pixel."""
+    """The search segment or sampling locations in beta of each alpha pixel."""
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments or positions in beta's pixels, for alpha's pixels x. Differentiable in the pair's numbers."""
         ...
 
 
-def look(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Look:
+def sampling_locations(field: ReceptiveField, pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> SamplingLocations:
     """The field over given pixels, or over alpha's whole image (H, W); a batch of rigs gives (*b, H, W)."""
     return field(pair, all_pixels(pair) if x is None else x)
 
 
-def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], Look]:
+def lazily(field: ReceptiveField, pair: Pair) -> Callable[[Tensor], SamplingLocations]:
     """The field as a function of alpha pixels (n, 2) alone, which attention calls chunk by chunk.
 
     For a batch of rigs it answers for each of them, (*b, n).

@@ -124,7 +124,7 @@ def _squared_reach(pair: Pair, x: Tensor) -> Tensor:
 
 
 def _widest(pair: Pair) -> Tensor:
-    """The alpha pixel (*b, 1, 2) that needs the largest displacement: looked for once a pair."""
+    """The alpha pixel (*b, 1, 2) that needs the largest displacement: searched once a pair."""
     if "widest" not in pair.memo:
         grid = all_pixels(pair)
         with torch.no_grad():
@@ -197,7 +197,7 @@ def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) ->
 def line_piece(
     line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], disparity: Float[Tensor, ""], hw: HW
 ) -> Segments:
-    """The piece of each line within `reach` of the foot of `point`, clipped to the image.
+    """The piece of each line within `disparity` of the foot of `point`, clipped to the image.
 
     It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
     """

@@ -1,4 +1,4 @@
-"""Room for what a field does not know: calibration that is a little off, and things that move."""
+"""Tolerance of fields to calibration errors and to motion."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 from ..pixels import HW
 from ..rig import Pair
 from ..segments import Positions, Segments, clip_to_image
-from .protocol import Look, ReceptiveField
+from .protocol import ReceptiveField, SamplingLocations
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class Widened:
         if min(self.across, self.along) < 0:
             raise ValueError(f"across and along are pixels, 0 or more; got {self.across} and {self.along}")
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Look:
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
         found = self.field(pair, x)
         if isinstance(found, Segments):
@@ -52,7 +52,7 @@ class Widened:
 
     @classmethod
     def for_motion(cls, field: ReceptiveField, pixels: float, **options: int) -> Widened:
-        """Room for things that move by up to `pixels` between the cameras' exposures."""
+        """Tolerance to motion of up to `pixels` between the cameras' exposures."""
         return cls(field, across=pixels, along=pixels, **options)
 
     @property

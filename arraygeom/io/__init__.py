@@ -33,7 +33,7 @@ from . import (
     syntim,
 )
 from .errors import RigFileError
-from .source import RigFileWarning, Source, unit_doubt
+from .source import RigFileWarning, RigSource, unit_doubt
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -69,7 +69,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
     """The rig of a file (or folder, for formats of several files); its format is recognised unless named.
 
     `scale` multiplies all lengths, for files in another unit than their format's. `hw` is the images' (height,
-    width), for formats that do not state it. What looks odd but can be read gives a RigFileWarning.
+    width), for formats that do not state it. Suspicious but readable values give a RigFileWarning.
     Raises RigFileError, which names the file and the entry; FileNotFoundError; ValueError for an unknown format.
     """
     path = Path(path)
@@ -80,7 +80,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")
     reader = READERS[format]
     try:
-        rig = reader.read(path) if reader is native else reader.read(Source(path, hw=hw))
+        rig = reader.read(path) if reader is native else reader.read(RigSource(path, hw=hw))
     except (RigFileError, FileNotFoundError):
         raise
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
@@ -88,12 +88,12 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
     rig = rig if scale == 1.0 else _scaled(rig, scale)
     if doubt := unit_doubt(rig):
-        Source(path).warn(doubt)
+        RigSource(path).warn(doubt)
     return rig
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig; each file appears whole or not at all. Formats of several files make a folder.
+    """Write a rig, each file atomically. Formats of several files make a folder.
 
     Raises ValueError for an unknown format, and for a rig that the format cannot hold.
     """

@@ -2,7 +2,7 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; world->camera, the rotation as a
 Rodrigues vector (or a matrix); lengths in the board's unit, taken as metres. caliscope's `rotation_count` says by how
-many quarter turns it *shows* a camera's images; the numbers are of the images as recorded, so it is not applied.
+many quarters it rotates a camera's images for display; the numbers are of the images as recorded, so it is not applied.
 """
 
 from __future__ import annotations
@@ -12,17 +12,16 @@ from typing import Any
 
 from ..camera import Camera
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); world->camera, Rodrigues vectors; metres"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its name and its first kilobytes."""
     return path.suffix == ".toml" or ("[cam" in head and "matrix =" in head)
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """Every camera that is not marked `ignore`, under its name, or else that of its table."""
     document = source.toml()
     tables = document.get("cameras") if isinstance(document.get("cameras"), dict) else document
@@ -37,7 +36,7 @@ def _name(key: str, fields: dict[str, Any]) -> str:
     return str(fields.get("name", f"cam{key}" if key.isdigit() else key))
 
 
-def _camera(source: Source, key: str, fields: dict[str, Any]) -> Camera:
+def _camera(source: RigSource, key: str, fields: dict[str, Any]) -> Camera:
     width, height = source.numbers(source.get(fields, "size", key), (2,), f"{key}.size").tolist()
     c, entry = fields.get("distortions"), f"{key}.distortions"
     fisheye = bool(fields.get("fisheye", False))

@@ -16,18 +16,17 @@ from torch import Tensor
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); rightToLeft inverted, world = left camera; the board's unit"
 MODELS = ("pinhole_radial_tangential", "pinhole")
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return "pinhole_radial_tangential" in head or "rightToLeft" in head
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The pair "left", "right", or a single "camera"."""
     document = source.yaml()
     if "pinhole" in document:
@@ -42,7 +41,7 @@ def read(source: Source) -> Rig:
     )
 
 
-def _camera(source: Source, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
     model = fields.get("model", MODELS[0])
     if model not in MODELS:
         raise source.fail(f"{entry}.model", f"is '{model}'; supported: {', '.join(MODELS)}")
@@ -57,7 +56,7 @@ def _camera(source: Source, fields: dict[str, Any], entry: str, pose: Pose) -> C
     return Camera(K=K, cam_from_world=pose, hw=hw, distortion=source.brown_conrady(c, entry))
 
 
-def _coefficients(source: Source, lens: dict[str, Any], entry: str) -> Tensor:
+def _coefficients(source: RigSource, lens: dict[str, Any], entry: str) -> Tensor:
     """k1 k2 p1 p2 k3 of `radial` (up to three numbers), t1 and t2."""
     radial = source.numbers(lens.get("radial") or [], None, entry)
     if len(radial) > 3:

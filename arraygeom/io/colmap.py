@@ -15,7 +15,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from torch import Tensor
 
 from ..camera import Camera
@@ -24,7 +23,7 @@ from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
 
@@ -69,11 +68,10 @@ class _Sensor(NamedTuple):
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file or folder looks like this format, from its name."""
     return _folder(path) is not None
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The cameras of a model's rig, or one for each image. Name the folder or any file in it."""
     folder = _folder(source.path)
     if folder is None:
@@ -82,9 +80,9 @@ def read(source: Source) -> Rig:
     cameras = reader.cameras(_file(folder, "cameras", reader.suffix))
     images = reader.images(_file(folder, "images", reader.suffix))
     rigs = folder / f"rigs{reader.suffix}"
-    sensors = [s for s in (reader.rigs(Source(rigs)) if rigs.exists() else []) if len(s) > 1]
+    sensors = [s for s in (reader.rigs(RigSource(rigs)) if rigs.exists() else []) if len(s) > 1]
     if len(sensors) > 1:
-        raise Source(rigs).fail(None, f"has {len(sensors)} rigs of several cameras; keep one")
+        raise RigSource(rigs).fail(None, f"has {len(sensors)} rigs of several cameras; keep one")
     if sensors:
         named = ((_sensor_name(s.camera, images), s.camera, s.pose) for s in sensors[0])
     else:
@@ -118,14 +116,14 @@ def _folder(path: Path) -> Path | None:
     return None
 
 
-def _file(folder: Path, stem: str, suffix: str) -> Source:
-    source = Source(folder / f"{stem}{suffix}")
+def _file(folder: Path, stem: str, suffix: str) -> RigSource:
+    source = RigSource(folder / f"{stem}{suffix}")
     if not source.path.exists():
         raise source.fail(None, "is missing; a COLMAP model has cameras and images, both .txt or both .bin")
     return source
 
 
-def _camera(source: Source, cameras: dict[int, _Intrinsics], i: int, pose: Pose) -> Camera:
+def _camera(source: RigSource, cameras: dict[int, _Intrinsics], i: int, pose: Pose) -> Camera:
     if i not in cameras:
         raise source.fail(f"camera {i}", "is used by an image or a rig and not defined; do the files belong together?")
     K, hw, lens = cameras[i]
@@ -138,7 +136,7 @@ def _sensor_name(camera: int, images: list[_Image]) -> str:
     return folders.pop() if len(folders) == 1 and "." not in folders else f"camera{camera}"
 
 
-def _intrinsics(source: Source, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> _Intrinsics:
+def _intrinsics(source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> _Intrinsics:
     if model not in MODELS:
         raise source.fail(entry, f"has model {model}, which is not supported (known: {', '.join(MODELS)})")
     kind = MODELS[model]
@@ -151,7 +149,7 @@ def _intrinsics(source: Source, entry: str, model: str, wh: tuple[Any, Any], par
     return _Intrinsics(K, hw, lens)
 
 
-def _pose(source: Source, entry: str, numbers: list[Any]) -> Pose:
+def _pose(source: RigSource, entry: str, numbers: list[Any]) -> Pose:
     return source.pose(source.quaternion(numbers[:4], f"{entry} QW QX QY QZ"), numbers[4:7], entry)
 
 
@@ -161,7 +159,7 @@ class _Text:
     suffix = ".txt"
 
     @staticmethod
-    def cameras(source: Source) -> dict[int, _Intrinsics]:
+    def cameras(source: RigSource) -> dict[int, _Intrinsics]:
         found: dict[int, _Intrinsics] = {}
         for number, line in _lines(source):
             fields, entry = line.split(), f"line {number}"
@@ -177,7 +175,7 @@ class _Text:
         return found
 
     @staticmethod
-    def images(source: Source) -> list[_Image]:
+    def images(source: RigSource) -> list[_Image]:
         """Every other line; those between hold the points, and may be blank."""
         lines = [(n, line) for n, line in enumerate(source.text().split("\n"), 1) if not line.startswith("#")]
         while lines and not lines[0][1].strip():
@@ -187,7 +185,7 @@ class _Text:
         return found
 
     @staticmethod
-    def _image(source: Source, number: int, line: str) -> _Image:
+    def _image(source: RigSource, number: int, line: str) -> _Image:
         fields, entry = line.split(maxsplit=9), f"line {number}"
         if len(fields) != 10:
             raise source.fail(entry, "wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
@@ -195,7 +193,7 @@ class _Text:
         return _Image(fields[9].strip(), _id(source, fields[8], entry), pose)
 
     @staticmethod
-    def rigs(source: Source) -> list[list[_Sensor]]:
+    def rigs(source: RigSource) -> list[list[_Sensor]]:
         found = [list(_Text._sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
         if not found:
             raise source.fail(None, "holds no rig; was it cut off?")
@@ -203,7 +201,7 @@ class _Text:
         return found
 
     @staticmethod
-    def _sensors(source: Source, entry: str, fields: list[str]) -> Iterator[_Sensor]:
+    def _sensors(source: RigSource, entry: str, fields: list[str]) -> Iterator[_Sensor]:
         """RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for the others."""
         tokens = iter(fields[1:])
         try:
@@ -226,7 +224,7 @@ class _Binary:
     suffix = ".bin"
 
     @staticmethod
-    def cameras(source: Source) -> dict[int, _Intrinsics]:
+    def cameras(source: RigSource) -> dict[int, _Intrinsics]:
         names = {model.id: name for name, model in MODELS.items()}
         data, found = _Bytes(source), dict[int, _Intrinsics]()
         for _ in range(data.count()):
@@ -242,7 +240,7 @@ class _Binary:
         return found
 
     @staticmethod
-    def images(source: Source) -> list[_Image]:
+    def images(source: RigSource) -> list[_Image]:
         data, found = _Bytes(source), []
         for _ in range(data.count()):
             i, *numbers, camera = data.take("<I7dI")
@@ -252,7 +250,7 @@ class _Binary:
         return found
 
     @staticmethod
-    def rigs(source: Source) -> list[list[_Sensor]]:
+    def rigs(source: RigSource) -> list[list[_Sensor]]:
         data, rigs = _Bytes(source), []
         for _ in range(data.count()):
             rig, count = data.take("<II")
@@ -270,7 +268,7 @@ class _Binary:
 class _Bytes:
     """A binary file read from front to back."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: RigSource) -> None:
         self.source, self.data, self.at = source, source.path.read_bytes(), 0
 
     def take(self, layout: str) -> tuple[Any, ...]:
@@ -304,20 +302,20 @@ class _Bytes:
         self.at += n
 
 
-def _sensor(source: Source, entry: str, camera: int, numbers: list[Any] | None) -> _Sensor:
+def _sensor(source: RigSource, entry: str, camera: int, numbers: list[Any] | None) -> _Sensor:
     if numbers is None:
         raise source.fail(entry, f"camera {camera} has no pose in its rig; calibrate the rig first")
     return _Sensor(camera, _pose(source, entry, numbers))
 
 
-def _lines(source: Source) -> Iterator[tuple[int, str]]:
+def _lines(source: RigSource) -> Iterator[tuple[int, str]]:
     """The numbered lines that are neither blank nor comments."""
     for number, line in enumerate(source.text().splitlines(), 1):
         if line.strip() and not line.startswith("#"):
             yield number, line
 
 
-def _check_count(source: Source, what: str, found: int) -> None:
+def _check_count(source: RigSource, what: str, found: int) -> None:
     """COLMAP's comment says how many entries follow."""
     for line in source.text().splitlines()[:8]:
         head, _, rest = line.partition(f"Number of {what}:")
@@ -326,7 +324,7 @@ def _check_count(source: Source, what: str, found: int) -> None:
             raise source.fail(None, f"announces {stated} {what} and holds {found}; was it cut off?")
 
 
-def _id(source: Source, text: str, entry: str) -> int:
+def _id(source: RigSource, text: str, entry: str) -> int:
     if not text.isdigit():
         raise source.fail(entry, f"wanted a number as id, got '{text[:40]}'")
     return int(text)
@@ -354,19 +352,10 @@ def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:
 
 
 def _wxyz(R: Tensor) -> list[float]:
-    """The quaternion of a rotation, scalar first and not negative: from the largest of its entries (Shepperd)."""
-    d = R.diagonal()
-    squares = torch.stack([1 + d.sum(), *(1 + 2 * d - d.sum())])
-    i = int(squares.argmax())
-    (a, b, c), (e, f, g), (h, k, m) = R.tolist()
-    rows = [
-        [1 + a + f + m, k - g, c - h, e - b],
-        [k - g, 1 + a - f - m, e + b, c + h],
-        [c - h, e + b, 1 - a + f - m, g + k],
-        [e - b, c + h, g + k, 1 - a - f + m],
-    ]
-    q = R.new_tensor(rows[i])
-    q = q / q.norm()
+    """The quaternion of a rotation, scalar first and not negative."""
+    from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+    q = rotation_matrix_to_quaternion(R)
     return (q if q[0] >= 0 else -q).tolist()
 
 

@@ -28,7 +28,7 @@ def focal_and_centre(name: str, camera: Camera, *, first_pixel: float = 0.0) -> 
     (fx, skew, cx), (other, fy, cy) = camera.K[:2].tolist()
     if skew != 0 or other != 0:
         raise ValueError(
-            f"camera '{name}' has a skewed or turned K, which this format cannot hold: use the native format"
+            f"camera '{name}' has a skewed or rotated K, which this format cannot hold: use the native format"
         )
     return fx, fy, cx + first_pixel, cy + first_pixel
 

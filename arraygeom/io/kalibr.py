@@ -20,17 +20,16 @@ from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor
 from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return "cam0:" in head and "camera_model" in head
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """Cameras cam0, cam1, ..."""
     chain = {name: fields for name, fields in source.yaml().items() if re.fullmatch(r"cam\d+", str(name))}
     if not chain:
@@ -43,7 +42,7 @@ def read(source: Source) -> Rig:
 
 
 def write(rig: Rig) -> str:
-    """Cameras cam0, cam1, ... in the rig's order, the names kept in `rostopic`.
+    """Cameras cam0, cam1, ... in the rig's order, the names stored in `rostopic`.
 
     Kalibr's chain has no world: if cam0 is not at the origin, the world is written as the IMU.
     Raises ValueError for what the format cannot hold.
@@ -66,7 +65,7 @@ def write(rig: Rig) -> str:
     return yaml.safe_dump(document, default_flow_style=None, sort_keys=False)
 
 
-def _poses(source: Source, chain: dict[str, dict[str, Any]]) -> dict[str, Pose]:
+def _poses(source: RigSource, chain: dict[str, dict[str, Any]]) -> dict[str, Pose]:
     if all("T_cam_imu" in fields for fields in chain.values()):
         return {n: source.pose_matrix(fields["T_cam_imu"], f"{n}.T_cam_imu") for n, fields in chain.items()}
     poses, pose = {}, Pose.identity()
@@ -77,7 +76,7 @@ def _poses(source: Source, chain: dict[str, dict[str, Any]]) -> dict[str, Pose]:
     return poses
 
 
-def _camera(source: Source, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
+def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
     model = source.get(fields, "camera_model", name)
     if model != "pinhole":
         raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: pinhole")
@@ -93,7 +92,7 @@ def _camera(source: Source, name: str, fields: dict[str, Any], pose: Pose) -> Ca
     )
 
 
-def _lens(source: Source, name: str, fields: dict[str, Any]) -> Distortion | None:
+def _lens(source: RigSource, name: str, fields: dict[str, Any]) -> Distortion | None:
     model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
     if model == "none":
         return None

@@ -16,17 +16,16 @@ from torch import Tensor
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); P = K [I | t] on rectified camera 0, raw X_i = R X_0 + T; metres"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return re.search(r"^(P0|P_rect_0\d):", head, re.MULTILINE) is not None
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The rectified cameras: P0..P3 of `calib.txt`, P_rect and S_rect of `calib_cam_to_cam.txt`."""
     entries = _entries(source)
     names = [name for name in entries if re.fullmatch(r"P\d|P_rect_\d\d", name)]
@@ -35,7 +34,7 @@ def read(source: Source) -> Rig:
     return source.rig((f"cam{int(name[-1])}", _rectified(source, entries, name)) for name in names)
 
 
-def _rectified(source: Source, entries: dict[str, Tensor], name: str) -> Camera:
+def _rectified(source: RigSource, entries: dict[str, Tensor], name: str) -> Camera:
     P = source.numbers(entries[name], (3, 4), name)
     K = source.intrinsics(P[:, :3], name)
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.linalg.solve(K, P[:, 3]))
@@ -44,12 +43,12 @@ def _rectified(source: Source, entries: dict[str, Tensor], name: str) -> Camera:
     return Camera(K=K, cam_from_world=pose, hw=hw)
 
 
-def _size(source: Source, numbers: Tensor, entry: str) -> tuple[int, int]:
+def _size(source: RigSource, numbers: Tensor, entry: str) -> tuple[int, int]:
     width, height = source.numbers(numbers, (2,), f"size of {entry}").tolist()
     return source.size(width, height, f"size of {entry}")
 
 
-def _entries(source: Source) -> dict[str, Tensor]:
+def _entries(source: RigSource) -> dict[str, Tensor]:
     """The lines `name: numbers`; lines of other things (dates) are passed over."""
     entries: dict[str, Tensor] = {}
     for line in source.text().splitlines():
@@ -73,11 +72,10 @@ class Raw:
 
     @staticmethod
     def recognises(path: Path, head: str) -> bool:
-        """Whether a file looks like this format, from its first kilobytes."""
         return re.search(r"^K_0\d:", head, re.MULTILINE) is not None
 
     @staticmethod
-    def read(source: Source) -> Rig:
+    def read(source: RigSource) -> Rig:
         """The unrectified cameras: S, K, D, R and T."""
         entries = _entries(source)
         numbers = sorted(name[-2:] for name in entries if re.fullmatch(r"K_\d\d", name))
@@ -86,7 +84,7 @@ class Raw:
         return source.rig((f"cam{int(n)}", Raw._camera(source, entries, n)) for n in numbers)
 
     @staticmethod
-    def _camera(source: Source, entries: dict[str, Tensor], n: str) -> Camera:
+    def _camera(source: RigSource, entries: dict[str, Tensor], n: str) -> Camera:
         S, K, D, R, T = (source.get(entries, f"{letter}_{n}", "") for letter in "SKDRT")
         return Camera(
             K=source.intrinsics(K, f"K_{n}"),

@@ -12,17 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 import torch
 from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import Distortion
 from ..epipolar import epipolar_lines, shift_origin
+from ..extras import needs
 from ..pixels import pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
 UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254}
@@ -30,12 +30,11 @@ UNITS |= {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0, "inches": 0.0
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its name and its first kilobytes."""
     names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion")
     return path.suffix == ".mat" or head.startswith("MATLAB ") or any(f'"{name}"' in head for name in names)
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The pair, named "camera1" and "camera2", or a single camera "camera1"."""
     fields = _outermost(source, _document(source))
     if "CameraParameters1" not in fields:
@@ -50,7 +49,7 @@ def read(source: Source) -> Rig:
     return source.rig(zip(("camera1", "camera2"), cameras))
 
 
-def _document(source: Source) -> dict[str, Any]:
+def _document(source: RigSource) -> dict[str, Any]:
     try:
         data = source.path.read_bytes()
     except OSError as error:
@@ -61,15 +60,17 @@ def _document(source: Source) -> dict[str, Any]:
         raise source.fail(None, "is empty")
     if data.startswith(b"MATLAB 7.3"):
         raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
+    with needs("calibration", "reading .mat files"):
+        from scipy.io import loadmat
     try:
-        loaded = scipy.io.loadmat(source.path, simplify_cells=True)
+        loaded = loadmat(source.path, simplify_cells=True)
     except Exception:
         # Whatever the parser trips over in a damaged file, the cause is the file.
         raise source.fail(None, "is not a .mat file that can be read; was it cut off?") from None
     return {name: value for name, value in loaded.items() if not name.startswith("__")}
 
 
-def _outermost(source: Source, fields: dict[str, Any]) -> dict[str, Any]:
+def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
     """The struct itself, or the first variable of the file that holds one."""
     for value in (fields, *fields.values()):
         if isinstance(value, dict) and ("CameraParameters1" in value or _is_camera(value)):
@@ -86,7 +87,7 @@ def _is_camera(fields: dict[str, Any]) -> bool:
     return "IntrinsicMatrix" in fields or "K" in fields
 
 
-def _camera(source: Source, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
     if "K" in fields:
         K = source.intrinsics(fields["K"], f"{entry}.K", first_pixel=1.0)
     else:
@@ -102,7 +103,7 @@ def _camera(source: Source, fields: dict[str, Any], entry: str, pose: Pose) -> C
     return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens)
 
 
-def _lens(source: Source, fields: dict[str, Any], entry: str) -> Distortion | None:
+def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
     radial = source.numbers(fields.get("RadialDistortion", []), None, f"{entry}.RadialDistortion").tolist()
     tangential = source.numbers(fields.get("TangentialDistortion", []), None, f"{entry}.TangentialDistortion").tolist()
     if not radial and not tangential:
@@ -112,7 +113,7 @@ def _lens(source: Source, fields: dict[str, Any], entry: str) -> Distortion | No
     return source.brown_conrady([*radial[:2], *(tangential or [0.0, 0.0]), *radial[2:]], entry)
 
 
-def _pose(source: Source, fields: dict[str, Any]) -> Pose:
+def _pose(source: RigSource, fields: dict[str, Any]) -> Pose:
     """X_2 = R X_1 + t, in metres."""
     unit = str(fields.get("WorldUnits") or "mm").strip().lower()
     if unit not in UNITS:
@@ -127,7 +128,7 @@ def _pose(source: Source, fields: dict[str, Any]) -> Pose:
     return source.pose(R, t, "PoseCamera2", metres=UNITS[unit])
 
 
-def _check_fundamental(source: Source, F: Tensor, one: Camera, two: Camera) -> None:
+def _check_fundamental(source: RigSource, F: Tensor, one: Camera, two: Camera) -> None:
     """Points that both pinholes see have to be on the lines of F as stated, which is of pixels counted from 1."""
     h, w = one.hw
     x = pixel_grid((4, 4), dtype=torch.float64).reshape(-1, 2) * torch.tensor([w / 4, h / 4])

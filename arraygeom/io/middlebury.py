@@ -16,17 +16,16 @@ from torch import Tensor
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); rectified, cam1 at +baseline along x; millimetres"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return re.search(r"^cam0\s*=\s*\[", head, re.MULTILINE) is not None
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The pair cam0, cam1."""
     entries = _entries(source)
     Ks = [source.intrinsics(source.get(entries, name, ""), name) for name in ("cam0", "cam1")]
@@ -46,7 +45,7 @@ def _along_x(metres: float) -> Pose:
 
 
 def _depth(
-    source: Source, entries: dict[str, Tensor], K: Tensor, baseline: float, doffs: float
+    source: RigSource, entries: dict[str, Tensor], K: Tensor, baseline: float, doffs: float
 ) -> tuple[float, float] | None:
     """(near, far) in metres, of the disparities vmax and vmin."""
     if not {"vmin", "vmax"} <= entries.keys():
@@ -57,7 +56,7 @@ def _depth(
     return baseline * float(K[0, 0]) / high, baseline * float(K[0, 0]) / low
 
 
-def _entries(source: Source) -> dict[str, Tensor]:
+def _entries(source: RigSource) -> dict[str, Tensor]:
     entries: dict[str, Tensor] = {}
     for line in source.text().splitlines():
         name, equals, value = (part.strip() for part in line.partition("="))

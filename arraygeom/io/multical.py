@@ -14,17 +14,16 @@ from ..camera import Camera
 from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); camera<-rig, 'B_to_A' takes A into B; metres"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return '"cameras"' in head and '"image_size"' in head
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The cameras that have a pose, under their names."""
     document = source.json()
     cameras = source.mapping(source.get(document, "cameras", ""), "cameras")
@@ -35,7 +34,7 @@ def read(source: Source) -> Rig:
     return source.rig((name, _camera(source, name, cameras[name], poses[name])) for name in cameras)
 
 
-def _poses(source: Source, entries: dict[str, Any], cameras: dict[str, Any]) -> dict[str, Pose]:
+def _poses(source: RigSource, entries: dict[str, Any], cameras: dict[str, Any]) -> dict[str, Pose]:
     """Poses by camera: those that are stated, then those that follow from others."""
     links = []
     poses: dict[str, Pose] = {}
@@ -57,7 +56,7 @@ def _poses(source: Source, entries: dict[str, Any], cameras: dict[str, Any]) -> 
     return poses
 
 
-def _camera(source: Source, name: str, fields: Any, pose: Pose) -> Camera:
+def _camera(source: RigSource, name: str, fields: Any, pose: Pose) -> Camera:
     entry = f"cameras.{name}"
     fields = source.mapping(fields, entry)
     width, height = source.numbers(source.get(fields, "image_size", entry), (2,), f"{entry}.image_size").tolist()
@@ -69,7 +68,7 @@ def _camera(source: Source, name: str, fields: Any, pose: Pose) -> Camera:
     )
 
 
-def _lens(source: Source, fields: dict[str, Any], entry: str) -> Distortion | None:
+def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
     if "fisheye" in str(fields.get("model", "")).lower():
         return source.kannala_brandt(source.get(fields, "dist", entry), entry)
     return source.brown_conrady(fields.get("dist"), entry)

@@ -30,7 +30,7 @@ Units and the pixel convention stand in the file. Example:
 
 A camera that is not calibrated may have a lens all the same, which says itself how many pixels count as 1 and where its
 centre is: `distortion: {model: ..., coefficients: [...], scale: 320, centre: [319.5, 199.5]}`. F and H of its links are
-between pixels without that lens's bending.
+between undistorted pixels.
 
 Numbers in pixels are converted to ours (first centre at 0) when read; files are written in our convention.
 """
@@ -52,10 +52,11 @@ from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import Distortion
 from ..epipolar import shift_origin
 from ..pixels import shift_matrix
-from ..pose import Pose, rotation_error, rotation_from_vector
+from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
 from ..sensor import PATTERNS, Band, Curve, Sensor
 from .errors import RigFileError
+from .source import RigSource
 
 FORMAT = "arraygeom-rig 1"
 UNITS = {"metres": 1.0, "millimetres": 1e-3}
@@ -69,7 +70,6 @@ CALIBRATION = ("focal", "centre", "K", "rotation", "translation", "position", "d
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its name and its first kilobytes."""
     return "arraygeom-rig" in head or (path.suffix in {".yaml", ".yml"} and "\ncameras:" in "\n" + head)
 
 
@@ -78,8 +78,8 @@ def read(path: Path) -> Rig:
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        place = getattr(error, "problem_mark", None)
-        line = f" at line {place.line + 1}" if place else ""
+        mark = getattr(error, "problem_mark", None)
+        line = f" at line {mark.line + 1}" if mark else ""
         raise RigFileError(
             path, None, f"not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}"
         ) from None
@@ -187,17 +187,7 @@ class _Reader:
     def rotation(self, entry: str, value: Any) -> Tensor:
         if not (isinstance(value, list) and value and isinstance(value[0], list)):
             return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
-        R = self.numbers(value, (3, 3), entry)
-        error = float(rotation_error(R))
-        if error > 1e-3:
-            kind = (
-                "a reflection (determinant -1)"
-                if torch.linalg.det(R) < 0
-                else f"not a rotation: R R^T is off by {error:.2g}"
-            )
-            raise self.fail(entry, f"is {kind}; check signs and that rows were copied whole")
-        U, _, Vh = torch.linalg.svd(R)
-        return R if error < 1e-12 else U @ Vh
+        return RigSource(self.path).rotation(self.numbers(value, (3, 3), entry), entry)
 
     def distortion(self, entry: str, value: Any) -> Distortion | None:
         if value is None:
@@ -232,7 +222,7 @@ class _Reader:
         if fields.get("black_level") is not None:
             known["black_level"] = black = self.number(fields["black_level"], f"{entry}.black_level")
             if black and "bits" not in known:
-                raise self.fail(f"{entry}.black_level", "needs 'bits', which says how far counts reach: add it")
+                raise self.fail(f"{entry}.black_level", "needs 'bits', the number of bits of a count: add it")
             if black < 0 or (black and black >= 2 ** known["bits"] - 1):
                 raise self.fail(f"{entry}.black_level", f"is {black:g}, which is not between 0 and white")
         if fields.get("gain") is not None:

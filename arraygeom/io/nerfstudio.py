@@ -1,6 +1,6 @@
 """transforms.json of nerfstudio and instant-ngp.
 
-Source convention: pixels with the first centre at 0.5 (shift -0.5); OpenGL axes (y up, looking along -z), turned
+Source convention: pixels with the first centre at 0.5 (shift -0.5); OpenGL axes (y up, optical axis -z), rotated
 into ours; `transform_matrix` is camera->world, inverted; the scale is the file's own, taken as metres.
 Intrinsics may stand at the top or in each frame.
 """
@@ -19,9 +19,11 @@ from ..distortion import KANNALA_BRANDT, Distortion
 from ..pose import Pose
 from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre, pose_rows
-from .source import Source
+from .source import RigSource
 
-CONVENTION = "first pixel's centre at 0.5 (shift -0.5); OpenGL camera->world, turned and inverted; scale as in the file"
+CONVENTION = (
+    "first pixel's centre at 0.5 (shift -0.5); OpenGL camera->world, rotated and inverted; scale as in the file"
+)
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 PERSPECTIVES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 # Ours (y down, z forward) from OpenGL's (y up, z back).
@@ -29,11 +31,10 @@ FLIP = Pose(torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)), to
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return any(f'"{key}"' in head for key in ("transform_matrix", "fl_x", "camera_angle_x"))
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """One camera for each frame, named by its `file_path`."""
     document = source.json()
     frames = source.get(document, "frames", "")
@@ -53,7 +54,7 @@ def write(rig: Rig) -> str:
     return json.dumps({"frames": frames}, indent=1) + "\n"
 
 
-def _camera(source: Source, fields: dict[str, Any], entry: str) -> Camera:
+def _camera(source: RigSource, fields: dict[str, Any], entry: str) -> Camera:
     h, w = source.size(source.get(fields, "w", entry), source.get(fields, "h", entry), f"{entry} w, h")
     fx = _focal(source, fields, "x", w, entry)
     fy = _focal(source, fields, "y", h, entry) if fields.keys() & {"fl_y", "camera_angle_y"} else fx
@@ -65,7 +66,7 @@ def _camera(source: Source, fields: dict[str, Any], entry: str) -> Camera:
     return Camera(K=K, cam_from_world=pose, hw=(h, w), distortion=_lens(source, fields, entry))
 
 
-def _focal(source: Source, fields: dict[str, Any], axis: str, size: int, entry: str) -> float:
+def _focal(source: RigSource, fields: dict[str, Any], axis: str, size: int, entry: str) -> float:
     """Stated, or from the field of view in radians."""
     if fields.get(f"fl_{axis}") is not None:
         return source.number(fields[f"fl_{axis}"], f"{entry} fl_{axis}")
@@ -75,7 +76,7 @@ def _focal(source: Source, fields: dict[str, Any], axis: str, size: int, entry: 
     return size / 2 / math.tan(angle / 2)
 
 
-def _lens(source: Source, fields: dict[str, Any], entry: str) -> Distortion | None:
+def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
     model = str(fields.get("camera_model", "OPENCV")).upper()
     if model not in FISHEYES + PERSPECTIVES:
         raise source.fail(f"{entry} camera_model", f"is {model}; supported: {', '.join(PERSPECTIVES + FISHEYES)}")

@@ -11,16 +11,16 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 from torch import Tensor
 
 from ..camera import Camera
 from ..distortion import KANNALA_BRANDT
+from ..extras import needs
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); X_2 = R X_1 + T, world = camera 1; metres"
 K_NAMES = ("M{}", "cameraMatrix{}", "camera_matrix{}", "Camera_Matrix{}", "K{}", "CM{}", "intrinsicMatrix{}")
@@ -32,17 +32,16 @@ PARTS = ("intrinsic", "extrinsic")
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its name and its first kilobytes."""
     if path.is_dir():
         return any(_named(path, part) for part in PARTS)
     return "opencv-matrix" in head or "<opencv_storage>" in head
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """One camera at the origin, named "camera"; or a pair, named "left" and "right" unless the file says."""
     nodes: dict[str, Any] = {}
     for path in _files(source.path):
-        nodes |= _nodes(Source(path))
+        nodes |= _nodes(RigSource(path))
     if not any(name.format(1) in nodes for name in K_NAMES):
         if "R" in nodes and "T" in nodes:
             raise source.fail("M1", "is missing: a pair's R and T are here without its intrinsics.yml beside them")
@@ -78,7 +77,7 @@ def write(rig: Rig) -> str | dict[str, str]:
 _HEADER = "%YAML:1.0\n---\n"
 
 
-def _camera(source: Source, nodes: dict[str, Any], i: str, pose: Pose) -> Camera:
+def _camera(source: RigSource, nodes: dict[str, Any], i: str, pose: Pose) -> Camera:
     K = source.intrinsics(source.get(nodes, [n.format(i) for n in K_NAMES], ""), f"camera matrix {i}".strip())
     c = next((nodes[n.format(i)] for n in D_NAMES if n.format(i) in nodes), None)
     entry = f"distortion coefficients {i}".strip()
@@ -87,7 +86,7 @@ def _camera(source: Source, nodes: dict[str, Any], i: str, pose: Pose) -> Camera
     return Camera(K=K, cam_from_world=pose, hw=_size(source, nodes, i, K), distortion=lens)
 
 
-def _size(source: Source, nodes: dict[str, Any], i: str, K: Tensor) -> HW:
+def _size(source: RigSource, nodes: dict[str, Any], i: str, K: Tensor) -> HW:
     for suffix in (i, ""):
         if f"image_width{suffix}" in nodes and f"image_height{suffix}" in nodes:
             return source.size(nodes[f"image_width{suffix}"], nodes[f"image_height{suffix}"], "image_width")
@@ -113,8 +112,10 @@ def _named(folder: Path, part: str) -> Path | None:
     return next((path for path in found if path.exists()), None)
 
 
-def _nodes(source: Source) -> dict[str, Any]:
+def _nodes(source: RigSource) -> dict[str, Any]:
     text = source.text()
+    with needs("calibration", "reading OpenCV's files"):
+        import cv2
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
@@ -123,7 +124,7 @@ def _nodes(source: Source) -> dict[str, Any]:
         raise source.fail(None, "is not an OpenCV FileStorage (YAML, XML or JSON); is the file whole?") from None
 
 
-def _value(node: cv2.FileNode) -> Any:
+def _value(node: Any) -> Any:
     if node.isString():
         return node.string()
     if node.isInt() or node.isReal():

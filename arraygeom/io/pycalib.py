@@ -11,17 +11,16 @@ from typing import Any
 
 from ..camera import Camera
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); world->camera; scale as in the file"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return head.lstrip().startswith("{") and '"K"' in head
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """All cameras of the lists K, d, R, t; or the one camera."""
     document = source.json()
     K, R, t = (source.get(document, key, "") for key in ("K", "R", "t"))
@@ -34,7 +33,7 @@ def read(source: Source) -> Rig:
     return source.rig((f"cam{i}", _camera(source, i, *numbers)) for i, numbers in enumerate(zip(Ks, Rs, ts, ds)))
 
 
-def _camera(source: Source, i: int, K: Any, R: Any, t: Any, d: Any) -> Camera:
+def _camera(source: RigSource, i: int, K: Any, R: Any, t: Any, d: Any) -> Camera:
     matrix = source.intrinsics(K, f"K[{i}]")
     pose, lens = source.pose(R, t, f"[{i}]"), source.brown_conrady(d, f"d[{i}]")
     return Camera(K=matrix, cam_from_world=pose, hw=source.size_unstated(matrix), distortion=lens)

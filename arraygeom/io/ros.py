@@ -16,23 +16,22 @@ from ..camera import Camera
 from ..distortion import Distortion
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); P on rectified points, world = the rectified frame; metres"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file or folder looks like this format."""
     if path.is_dir():
         return any(_is_camera_info(file.read_text(errors="replace")[:4096]) for file in _yaml_files(path))
     return _is_camera_info(head)
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The cameras, under their `camera_name` (else the file's name)."""
     files = _yaml_files(source.path) if source.path.is_dir() else [source.path]
     infos = [file for file in files if len(files) == 1 or _is_camera_info(file.read_text(errors="replace"))]
-    return source.rig(_camera(Source(file, hw=source.hw)) for file in infos)
+    return source.rig(_camera(RigSource(file, hw=source.hw)) for file in infos)
 
 
 def _yaml_files(folder: Path) -> list[Path]:
@@ -43,7 +42,7 @@ def _is_camera_info(text: str) -> bool:
     return "camera_matrix:" in text and "distortion_model:" in text and "opencv-matrix" not in text
 
 
-def _camera(source: Source) -> tuple[str, Camera]:
+def _camera(source: RigSource) -> tuple[str, Camera]:
     info = source.yaml()
     K = source.intrinsics(_data(source, info, "camera_matrix"), "camera_matrix")
     width, height = (source.get(info, f"image_{k}", "") for k in ("width", "height"))
@@ -56,7 +55,7 @@ def _camera(source: Source) -> tuple[str, Camera]:
     return str(info.get("camera_name") or source.path.stem), camera
 
 
-def _pose(source: Source, info: dict[str, Any]) -> Pose:
+def _pose(source: RigSource, info: dict[str, Any]) -> Pose:
     R = torch.eye(3, dtype=torch.float64)
     if "rectification_matrix" in info:
         R = source.rotation(_data(source, info, "rectification_matrix"), "rectification_matrix")
@@ -67,7 +66,7 @@ def _pose(source: Source, info: dict[str, Any]) -> Pose:
     return rect_from_cam.inverse() @ Pose(torch.eye(3, dtype=torch.float64), t)
 
 
-def _lens(source: Source, info: dict[str, Any]) -> Distortion | None:
+def _lens(source: RigSource, info: dict[str, Any]) -> Distortion | None:
     model, entry = source.get(info, "distortion_model", ""), "distortion_coefficients"
     if model in ("plumb_bob", "rational_polynomial"):
         return source.brown_conrady(_data(source, info, entry), entry)
@@ -78,5 +77,5 @@ def _lens(source: Source, info: dict[str, Any]) -> Distortion | None:
     raise source.fail("distortion_model", f"is '{model}'; supported: plumb_bob, rational_polynomial, equidistant")
 
 
-def _data(source: Source, info: dict[str, Any], name: str) -> Any:
+def _data(source: RigSource, info: dict[str, Any], name: str) -> Any:
     return source.get(source.mapping(source.get(info, name, ""), name), "data", name)

@@ -27,11 +27,11 @@ ROUNDED = 1e-3
 
 
 class RigFileWarning(UserWarning):
-    """A rig file that was read, but holds something its user should look at."""
+    """A rig file that was read but has suspicious values."""
 
 
-class Source:
-    """One rig file being read. Every method that looks at it raises RigFileError with the entry's name.
+class RigSource:
+    """One rig file being read. Its methods raise RigFileError with the entry's name.
 
     `hw` is the images' size for files that do not state it.
     """
@@ -82,8 +82,8 @@ class Source:
             return self.mapping(yaml.load(text, _UniqueKeys), None)
         except yaml.YAMLError as error:
             mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-            place = f"line {mark.line + 1}" if mark else None
-            raise self.fail(place, f"is not YAML ({problem or 'unreadable'}); is the file whole?") from None
+            line = f"line {mark.line + 1}" if mark else None
+            raise self.fail(line, f"is not YAML ({problem or 'unreadable'}); is the file whole?") from None
 
     def mapping(self, value: Any, entry: str | None) -> dict[str, Any]:
         """A value that has to be a mapping with something in it."""
@@ -181,15 +181,9 @@ class Source:
         q = self.numbers(wxyz, (4,), entry)
         if not (q.norm() - 1).abs() < ROUNDED:
             raise self.fail(entry, f"is a quaternion of length {q.norm():.4g}, not 1; is the order w x y z?")
-        w, x, y, z = (q / q.norm()).tolist()
-        return torch.tensor(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ],
-            dtype=torch.float64,
-        )
+        from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+        return quaternion_to_rotation_matrix(q / q.norm())
 
     def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
         """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if empty."""

@@ -12,7 +12,7 @@ from pathlib import Path
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
-from .source import Source
+from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); X_cam = R^T (X - t); millimetres"
 SIDES = {"_g": "left", "_d": "right"}
@@ -20,20 +20,19 @@ NUMBER = r"([-+]?(?:nan|inf|[\d.]+(?:[eE][-+]?\d+)?))"
 
 
 def recognises(path: Path, head: str) -> bool:
-    """Whether a file looks like this format, from its first kilobytes."""
     return "Intrinsic parameters:" in head and "Scale factor" in head
 
 
-def read(source: Source) -> Rig:
+def read(source: RigSource) -> Rig:
     """The pair "left", "right", or the one camera that is there."""
     side = source.path.name[-2:]
     if side not in SIDES:
         return source.rig([(source.path.name, _camera(source))])
     files = {name: source.path.with_name(source.path.name[:-2] + end) for end, name in SIDES.items()}
-    return source.rig((name, _camera(Source(file))) for name, file in files.items() if file.exists())
+    return source.rig((name, _camera(RigSource(file))) for name, file in files.items() if file.exists())
 
 
-def _camera(source: Source) -> Camera:
+def _camera(source: RigSource) -> Camera:
     text = source.text()
     values = {k: _value(source, text, k) for k in ("u0", "v0", "au", "av", "dimx", "dimy")}
     K = source.focal_and_centre([values[k] for k in ("au", "av", "u0", "v0")], "au, av, u0, v0")
@@ -48,7 +47,7 @@ def _camera(source: Source) -> Camera:
     )
 
 
-def _value(source: Source, text: str, name: str) -> float:
+def _value(source: RigSource, text: str, name: str) -> float:
     found = re.search(rf"\b{name}\s*=\s*{NUMBER}", text, re.IGNORECASE)
     if not found:
         raise source.fail(name, "is missing; is the file whole?")

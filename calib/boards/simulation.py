@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float, UInt8
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig, pixel_grid, rotation_from_vector
+from arraygeom import Camera, Pose, Rig, pixel_grid, rotation_from_vector, stack
 from arraygeom.atomic import write_atomically
 from arraygeom.viz import calibrated
 
@@ -73,7 +73,7 @@ def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
             R = camera.R.T.double() @ rotation_from_vector(torch.from_numpy(rotation))
             found.append(Pose(R, centre - R @ middle))
         if len(found) == count:
-            return Pose(torch.stack([p.R for p in found]), torch.stack([p.t for p in found]))
+            return stack(found)
     raise ValueError(f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one")
 
 

@@ -19,17 +19,12 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 
 from arraygeom import (
-    Curved,
-    Epipolar,
-    HomographyDisplacement,
-    Pair,
     Positions,
-    ReceptiveField,
     Rig,
     Segments,
-    ThroughLenses,
     pixel_grid,
 )
+from arraygeom.fields import recorded_field
 
 from .matches import Matches, seen_depths
 
@@ -60,8 +55,6 @@ WINDOW = 9
 """Values are relative to the mean and the deviation in windows this wide, for invariance to exposure and filters."""
 EVEN = 0.02
 """Deviations below this, of images in 0..1, are noise."""
-PART = 0.06
-"""Search range of a pair known by F alone around the rough map, as a share of beta's size."""
 
 
 @dataclass(frozen=True)
@@ -95,21 +88,13 @@ def photometric_errors(
     for name in names:
         rig = rig.resize(name, views.hw[name])
     pair, x = rig.pair(*names).to(torch.float32), views.grid[alpha]
-    locations = field_of(pair)(pair, x)
+    locations = recorded_field(pair, samples=64, nodes=16)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
     query, own = (image[alpha][:, :, rows][..., columns] for image in (views.keys, views.values))
     found = attend(query, views.keys[beta], views.values[beta], locations)
     valid = locations.mask.any(-1) if isinstance(locations, Positions) else locations.valid
     confidence = found.peak[0].detach().sqrt()
     return torch.where(valid, confidence * (found.value - own)[0, 0], 0.0), valid
-
-
-def field_of(pair: Pair) -> ReceptiveField:
-    """The field of a pair: segments of calibrated pinholes, curves through lenses, lines of a pair known by F."""
-    if pair.link is not None or not pair.calibrated:
-        line = HomographyDisplacement(PART * max(pair.beta.hw))
-        return ThroughLenses(line, 64) if pair.has_lens else line
-    return Curved(64, nodes=16) if pair.has_lens else Epipolar()
 
 
 def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, LensView, Link, Pair, Pose, Rig, View, essential_matrix
+from arraygeom import Camera, LensView, Link, Pair, Rig, View, essential_matrix, stack
 from arraygeom.pixels import to_homogeneous
 
 from .matches import Matches
@@ -115,7 +115,7 @@ def stacked(pairs: Sequence[Pair]) -> Pair:
     """A batch of pairs of one `stack_key`; image sizes are those of the first."""
     link = None
     if pairs[0].link is not None:
-        link = Link(torch.stack([pair.fundamental for pair in pairs]))
+        link = stack([Link(pair.fundamental) for pair in pairs])
     alpha, beta = (_stacked([getattr(pair, side) for pair in pairs]) for side in ("alpha", "beta"))
     return Pair(alpha, beta, None, link)
 
@@ -124,13 +124,9 @@ def _stacked(views: Sequence[View]) -> View:
     with_K = [view for view in views if isinstance(view, LensView)]
     if len(with_K) < len(views):
         return views[0]
-    lenses = [view.distortion for view in with_K if view.distortion is not None]
-    lens = Distortion(lenses[0].model, torch.stack([lens.coefficients for lens in lenses])) if lenses else None
-    batch = with_K[0].replace(K=torch.stack([view.K for view in with_K]), distortion=lens)
-    cameras = [view for view in with_K if isinstance(view, Camera)]
-    if len(cameras) < len(with_K):
-        return LensView(hw=batch.hw, sensor=batch.sensor, K=batch.K, distortion=lens)
-    return batch.replace(cam_from_world=Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras])))
+    if not all(isinstance(view, Camera) for view in with_K):
+        with_K = [LensView(hw=v.hw, sensor=v.sensor, K=v.K, distortion=v.distortion) for v in with_K]
+    return stack([view.replace(hw=views[0].hw) for view in with_K])
 
 
 def _for_each(pair: Pair, matches: Matches) -> tuple[Tensor, Tensor]:

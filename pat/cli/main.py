@@ -6,7 +6,7 @@ import math
 import shutil
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from json import dumps
 from pathlib import Path
@@ -18,17 +18,8 @@ from rich.progress import track
 from rich.table import Table
 from tyro.conf import OmitSubcommandPrefixes, Positional, UseAppendAction
 
-from arraygeom import (
-    Dense,
-    Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Local,
-    NearestVoxels,
-    ReceptiveField,
-    Rectified,
-    Rig,
-)
+from arraygeom import Rig
+from arraygeom.fields import FIELDS
 
 from ..training.train import TrainConfig
 
@@ -38,16 +29,7 @@ if TYPE_CHECKING:
     from ..fusion.fuse import Plan, Tile
     from ..fusion.results import Frame
 
-FIELDS: dict[str, Callable[[], ReceptiveField]] = {
-    "epipolar": Epipolar,
-    "line": EpipolarLine,
-    "homography": HomographyDisplacement,
-    "rectified": Rectified,
-    "nearest": NearestVoxels,
-    "local": Local,
-    "dense": Dense,
-}
-FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
+FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved"]
 
 console = Console(stderr=True, highlight=False)
 

@@ -15,11 +15,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.rig import Rig, middle_depth
 
-from .windows import read_view, scene_rig, stack_cameras, window
+from .windows import read_view, scene_rig, window
 
 PAPER_WIDTH = 2048
 
@@ -96,7 +97,7 @@ def cut(folder: Path, patches: PatchGrid, *, alpha: str) -> PatchStack:
         rgb={name: torch.stack([view.rgb for view in found[name]]) for name in rig.names},
         depth={name: torch.stack([view.depth for view in found[name]]) for name in rig.names},
         rig=rig.replace(
-            cameras={name: stack_cameras([view.camera for view in found[name]]) for name in rig.names},
+            cameras={name: stack([view.camera for view in found[name]]) for name in rig.names},
             depth=(near, far),
         ),
     )

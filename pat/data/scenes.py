@@ -31,7 +31,7 @@ from pat.sensors import (
 )
 
 from .patches import PatchGrid, PatchStack, cut
-from .windows import same_cameras, scene_folders, scene_rig, select, stacked
+from .windows import same_cameras, scene_folders, scene_rig, stacked
 
 LOADED = 64
 """Scenes whose patches each process caches in memory."""
@@ -98,7 +98,7 @@ class ScenePatches(Dataset[Patch]):
     def _recorded(self, stack: PatchStack, number: int, seed: int) -> Patch:
         alpha = self.scenes.alpha
         one = slice(number, number + 1)
-        rig, rgb = select(stack.rig, number), {name: views[one] for name, views in stack.rgb.items()}
+        rig, rgb = stack.rig[number], {name: views[one] for name, views in stack.rgb.items()}
         depth = {name: views[one] for name, views in stack.depth.items()}
         recorded = record_array(rgb, rig, self._chains(alpha, seed), seed=seed, depth=depth)
         return Patch(

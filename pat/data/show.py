@@ -9,8 +9,8 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from arraygeom.fields import ReceptiveField
-from arraygeom.viz import COLOURS, draw_look, numpy, show_image, suitable_field
+from arraygeom.fields import ReceptiveField, recorded_field
+from arraygeom.viz import COLOURS, draw_sampling_locations, numpy, show_image
 from pat.media.figures import colour_depth
 
 from .scenes import Patch
@@ -34,7 +34,7 @@ def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = Non
                 axes.scatter(*numpy(x).T, c=COLOURS[: len(x)], s=18, edgecolors="white", linewidths=0.6)
             else:
                 pair = patch.rig.pair(patch.alpha, name)
-                draw_look(axes, field or suitable_field(pair), pair, x)
+                draw_sampling_locations(axes, field or recorded_field(pair), pair, x)
         for column, (title, image) in enumerate(
             {"ground truth": patch.ground_truth, "depth": colour_depth(patch.depth)}.items()
         ):

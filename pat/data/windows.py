@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 from zipfile import BadZipFile
@@ -14,9 +13,9 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 from arraygeom.undistortion import pinhole_view, resampled
@@ -128,37 +127,12 @@ def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 
     return torch.where(even, between, nearest)
 
 
-def select(rig: Rig, index: int) -> Rig:
-    """One rig of a batch."""
-
-    def chosen(camera: Camera) -> Camera:
-        lens = camera.distortion
-        lens = None if lens is None else replace(lens, coefficients=lens.coefficients[index])
-        pose = Pose(camera.R[index], camera.t[index])
-        return camera.replace(K=camera.K[index], cam_from_world=pose, distortion=lens)
-
-    cameras = {name: chosen(c) for name, c in rig.cameras.items() if isinstance(c, Camera)}
-    return rig.replace(cameras=cameras, depth=tuple(d[index] for d in rig.depth))
-
-
 def stacked(rigs: list[Rig]) -> Rig:
     """A batch of rigs of the same cameras. Raises ValueError where sizes or names differ."""
     first = rigs[0]
     for rig in rigs[1:]:
         same_cameras(first, rig)
-    depth = tuple(torch.stack([rig.depth[i] for rig in rigs]) for i in (0, 1))
-    return first.replace(cameras={name: stack_cameras([r[name] for r in rigs]) for name in first.names}, depth=depth)
-
-
-def stack_cameras(cameras: list[Camera]) -> Camera:
-    """One camera with a batch axis."""
-    first = cameras[0]
-    lens = first.distortion
-    if lens is not None:
-        lenses = [c.distortion for c in cameras if c.distortion is not None]
-        lens = replace(lens, coefficients=torch.stack([d.coefficients for d in lenses]))
-    pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
-    return first.replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose, distortion=lens)
+    return stack(rigs)
 
 
 def same_cameras(one: Rig, other: Rig) -> None:

@@ -11,8 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom import Moved, Pair, depth_from_track, pixel_grid
-from arraygeom.fields import pinhole_track
-from arraygeom.fields.default import default_field
+from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
 

@@ -23,7 +23,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Moved, ReceptiveField, Rig, Widened
-from arraygeom.fields.default import default_field
+from arraygeom.fields import default_field
 
 from ..media.colour import luminance, to_luma_chroma
 from ..networks.protocol import FusionNetwork

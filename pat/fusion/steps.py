@@ -117,7 +117,7 @@ class Upright:
             k = quarter_turns(views.pair(name))
             if k:
                 rotated = views.images[name].rot90(k, (-2, -1))
-                views = views.replace({name: rotated}, rig=views.rig.turn(name, k))
+                views = views.replace({name: rotated}, rig=views.rig.rot90(name, k))
         return Done(views, _as_it_is)
 
 

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
-from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from arraygeom.atomic import write_atomically
+from arraygeom.viz import new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
@@ -22,14 +25,18 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
     low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
     colours = torch.zeros(3, *depth.shape)
+    table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
+    turbo = torch.from_numpy(table.T / np.float32(255))
     for rows, found, seen in zip(colours.split(256, 1), inverse.split(256), known.split(256)):
-        scaled = ((found - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
-        rows[:, seen] = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)[:, seen]
+        scaled = ((found - low) / max(high - low, 1e-12)).clamp(0, 1)
+        rows[:, seen] = turbo[:, (256 * scaled).long().clamp(max=255)][:, seen]
     return colours
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
     """Write a figure atomically; returns the path."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     FigureCanvasAgg(figure)
     with write_atomically(path) as temporary:
         figure.savefig(temporary, dpi=dpi)
@@ -40,7 +47,7 @@ def draw_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, w
     """One figure, `width` inches wide, of images by title, row by row."""
     rows = -(-len(panels) // columns)
     h, w = next(iter(panels.values())).shape[-2:]
-    figure = Figure(figsize=(width, (width / columns * h / w + 0.3) * rows), layout="constrained")
+    figure = new_figure(figsize=(width, (width / columns * h / w + 0.3) * rows), layout="constrained")
     for i, (title, image) in enumerate(panels.items()):
         axes = figure.add_subplot(rows, columns, i + 1, title=title)
         axes.imshow(image.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())

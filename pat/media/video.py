@@ -6,12 +6,12 @@ from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
 
-import av
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom.atomic import write_atomically
+from arraygeom.extras import needs
 
 from .colour import to_bytes
 
@@ -25,6 +25,8 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):
         raise ValueError(f"{path}: a video's name ends in .mp4 or .mkv")
+    with needs("video", "writing video"):
+        import av
     with write_atomically(path) as temporary, av.open(str(temporary), "w") as file:
         stream = None
         for frame in frames:

@@ -21,21 +21,15 @@ from torch.nn.functional import interpolate
 
 from arraygeom import (
     Camera,
-    Dense,
     Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Local,
-    NearestVoxels,
     Pair,
     Pose,
     ReceptiveField,
-    Rectified,
     pixel_grid,
     rotation_from_vector,
     sample,
 )
-from arraygeom.fields import pinhole_track
+from arraygeom.fields import FIELDS, pinhole_track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
@@ -44,7 +38,7 @@ from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augme
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
-from .config import FieldName, RecordingConfig, TrainConfig
+from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
 from .scenes import RenderedCrops
 from .spectra import MOST, Spectra
@@ -56,17 +50,6 @@ FEW = 8
 """With fewer cached than this, a new one is always made."""
 SCENE, RECORDING = 0, 1
 """Purpose of a random generator, beside the seed and a number."""
-
-FIELDS: dict[FieldName, Callable[[], ReceptiveField]] = {
-    "epipolar": Epipolar,
-    "line": EpipolarLine,
-    "homography": HomographyDisplacement,
-    "rectified": lambda: Rectified(alpha_is="either"),
-    "nearest": NearestVoxels,
-    "local": Local,
-    "dense": Dense,
-}
-"""Receptive fields by name."""
 
 
 class Sample(NamedTuple):

@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
+from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.rig import Rig
@@ -24,7 +25,6 @@ from pat.data.windows import (
     read_view,
     scene_folders,
     scene_rig,
-    stack_cameras,
     undistorted,
     window,
 )
@@ -200,7 +200,7 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
     alpha_from_world = [one[0].camera.cam_from_world for one in drawn]
     cameras = [
-        stack_cameras(
+        stack(
             [
                 v.camera.replace(cam_from_world=v.camera.cam_from_world @ a.inverse())
                 for v, a in zip(same, alpha_from_world)

@@ -1,8 +1,6 @@
-import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import least_squares
 
 from arraygeom import (
     Epipolar,
@@ -13,11 +11,15 @@ from arraygeom import (
     approximated,
     fit_homography,
     fit_similarity,
-    look,
+    sampling_locations,
 )
 from arraygeom.fields import covering_displacement, placement_error
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import random_rig, two_cameras, uniform
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
+optimize = Oracle("scipy.optimize")
 
 
 def noisy_points(seed: int = 0, n: int = 40) -> tuple[torch.Tensor, torch.Tensor]:
@@ -36,7 +38,7 @@ def test_fitted_homography_is_scipys_least_squares():
     x, y = noisy_points()
     H = fit_homography(x, y)
     ours = (H / H[2, 2]).numpy().ravel()[:8]
-    best = least_squares(residual, ours, args=(x, y), x_scale=np.abs(ours), xtol=1e-15, ftol=1e-15, gtol=1e-15)
+    best = optimize.least_squares(residual, ours, args=(x, y), x_scale=np.abs(ours), xtol=1e-15, ftol=1e-15, gtol=1e-15)
     cost = 0.5 * np.square(residual(ours, x, y)).sum()
     assert cost == pytest.approx(best.cost, rel=1e-9)
 
@@ -87,7 +89,7 @@ def test_fits_place_the_middles_better_than_the_middle_plane(seed):
 def test_the_approximation_covers_near_to_far(kind):
     pair = approximated(random_rig(1).pair("alpha", "beta"), kind)
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)
-    exact, rough = Epipolar()(pair, x), look(HomographyDisplacement(), pair, x)
+    exact, rough = Epipolar()(pair, x), sampling_locations(HomographyDisplacement(), pair, x)
     assert rough.valid[exact.valid].all()
     for end in (exact.start, exact.end):
         on = rough.at(rough.fraction(end).clamp(0, 1))

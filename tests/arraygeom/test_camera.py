@@ -1,22 +1,22 @@
-import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.spatial.transform import Rotation
 
 from arraygeom import Camera, Pose, intrinsics, rotation_from_vector
-from arraygeom.camera import direction_of, rotation_between
 from tests.arraygeom.rigs import random_camera, random_rig, scene_points, uniform
 from tests.arraygeom.test_pixels import blob, centroid
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 CHANGES = {
     "smaller": lambda c: c.resize((20, 31)),
     "larger": lambda c: c.resize((100, 130)),
     "cropped": lambda c: c.crop(6, 18, (32, 32)),
     "padded": lambda c: c.crop(-4, -7, (60, 80)),
-    "turned": lambda c: c.turn(1),
-    "turned back": lambda c: c.turn(-1),
-    "upside down": lambda c: c.turn(2),
+    "turned": lambda c: c.rot90(1),
+    "turned back": lambda c: c.rot90(-1),
+    "upside down": lambda c: c.rot90(2),
 }
 
 
@@ -99,16 +99,13 @@ def test_batched_cameras_agree_with_single_ones():
     for i, c in enumerate(cameras):
         torch.testing.assert_close(x[i], c.project(X[i]).x)
     torch.testing.assert_close(batch.unproject(x, depth), X)
-    torch.testing.assert_close(batch.turn(1).unproject(batch.turn(1).project(X).x, depth), X)
+    torch.testing.assert_close(batch.rot90(1).unproject(batch.rot90(1).project(X).x, depth), X)
 
 
 def test_there_and_back_through_kornia():
     c = camera()
     back = Camera.from_kornia(c.to_kornia())
-    torch.testing.assert_close(back.K[0], c.K)
-    torch.testing.assert_close(back.R[0], c.R)
-    torch.testing.assert_close(back.t[0], c.t)
-    assert back.hw == c.hw
+    assert back == c.replace(sensor=back.sensor)
     X = points_ahead(c)
     torch.testing.assert_close(c.to_kornia().project(X), c.project(X).x)
 
@@ -124,16 +121,6 @@ def test_gradients_of_projection_and_its_inverse():
 
     inputs = [v.detach().clone().requires_grad_() for v in (c.K, torch.zeros(3, dtype=torch.float64), c.t, X)]
     assert torch.autograd.gradcheck(there_and_back, inputs)
-
-
-def test_angles_between_cameras():
-    a = camera()
-    w = torch.tensor([0.2, -0.5, 0.4], dtype=torch.float64)
-    b = a.replace(cam_from_world=Pose(rotation_from_vector(w) @ a.R, a.t))
-    assert rotation_between(a, b).item() == pytest.approx(w.norm().item())
-    assert rotation_between(a, a).item() == pytest.approx(0, abs=1e-7)
-    expected = Rotation.from_matrix(b.R.numpy()).inv().apply([0, 0, 1])
-    np.testing.assert_allclose(direction_of(b).numpy(), expected, atol=1e-12)
 
 
 def test_contains_is_the_images_area():

@@ -20,8 +20,8 @@ from arraygeom import (
     ThroughLenses,
     View,
     intrinsics,
-    look,
     rotation_from_vector,
+    sampling_locations,
 )
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
@@ -145,7 +145,9 @@ def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
     rig = with_lenses(rig, lens, lens)
     changes = rig.parameters(free=["*.rotation", "*.translation", "*.focal", "*.centre", "depth.near"])
     for dtype in (torch.float32, torch.float64):
-        p = look(Curved(16), rig.perturbed(changes).pair("alpha", "beta"), pixel_grid((48, 64), dtype=dtype)[::4, 1::4])
+        p = sampling_locations(
+            Curved(16), rig.perturbed(changes).pair("alpha", "beta"), pixel_grid((48, 64), dtype=dtype)[::4, 1::4]
+        )
         assert p.xy.isfinite().all()
         slopes = torch.autograd.grad(p.xy.sum(), list(changes.values()), allow_unused=True)
         assert all(s is None or s.isfinite().all() for s in slopes)
@@ -154,7 +156,7 @@ def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
 def test_identical_cameras_look_at_the_same_pixel():
     rig = with_lenses(two_cameras(), FISHEYE, FISHEYE)
     x = pixel_grid((48, 64))
-    p = look(Curved(8), rig.pair("alpha", "beta"))
+    p = sampling_locations(Curved(8), rig.pair("alpha", "beta"))
     assert p.mask.all()
     torch.testing.assert_close(p.xy, x[..., None, :].expand(48, 64, 8, 2), atol=1e-3, rtol=0)
 
@@ -180,7 +182,7 @@ def test_batched_rigs_agree_with_single_ones():
 
 def test_straight_fields_refuse_lenses():
     with pytest.raises(ValueError, match="use Curved"):
-        look(Epipolar(), fisheye_rig().pair("alpha", "beta"))
+        sampling_locations(Epipolar(), fisheye_rig().pair("alpha", "beta"))
 
 
 def known_by_F(rig: Rig) -> Rig:
@@ -221,7 +223,7 @@ def test_links_through_lenses_survive_what_is_done_to_images():
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
     before = ThroughLenses(HomographyDisplacement(20.0), 21)(rig.pair("alpha", "beta"), x)
     h, w = rig["beta"].hw
-    changed = rig.resize("beta", (2 * h, 2 * w)).turn("beta", 1).pair("alpha", "beta")
+    changed = rig.resize("beta", (2 * h, 2 * w)).rot90("beta", 1).pair("alpha", "beta")
     after = ThroughLenses(HomographyDisplacement(40.0), 200)(changed, x)
     doubled = (before.xy + 0.5) * 2 - 0.5
     turned = torch.stack([doubled[..., 1], 2 * w - 1 - doubled[..., 0]], -1)[before.mask]

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -7,6 +6,9 @@ from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.distortion import Distortion
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 FOCAL = 1000.0
 BROWN = [-0.3, 0.12, 1e-3, -2e-3, -0.02, 0.01, 0.02, -3e-3, 1e-3, -2e-3, 1.5e-3, 7e-4, 0.03, -0.05]

@@ -1,4 +1,3 @@
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,6 +17,9 @@ from arraygeom import (
 )
 from arraygeom.pixels import pixel_grid, to_homogeneous
 from tests.arraygeom.rigs import random_rig, scene_points, two_cameras
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 seeds = st.integers(0, 10**9)
 

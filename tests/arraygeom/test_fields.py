@@ -23,8 +23,8 @@ from arraygeom import (
     View,
     epipolar_lines,
     lazily,
-    look,
     rotation_from_vector,
+    sampling_locations,
 )
 from arraygeom.fields import covering_displacement
 from arraygeom.homography import apply_homography
@@ -73,7 +73,7 @@ def test_points_between_the_bounds_lie_on_their_segments(field, seed):
 @pytest.mark.parametrize("field", STRAIGHT, ids=ids)
 def test_segments_lie_on_the_lines_and_inside_the_image(field):
     pair = pair_of(random_rig(1))
-    segments = look(field, pair, pixel_grid(pair.alpha.hw, dtype=torch.float64))
+    segments = sampling_locations(field, pair, pixel_grid(pair.alpha.hw, dtype=torch.float64))
     lines = epipolar_lines(pair.fundamental, pixel_grid(pair.alpha.hw, dtype=torch.float64))
     assert segments.valid.any()
     for end in (segments.start, segments.end):
@@ -150,7 +150,7 @@ def test_rectified_scales_to_another_size():
 def test_epipolar_is_rectified_on_a_rectified_pair():
     rig = two_cameras(centre=(0.5, 0, 0), depth=(1.0, float("inf")))
     x = pixel_grid((48, 64))
-    a, b = look(Epipolar(), pair_of(rig)), Rectified(16.0)(pair_of(rig), x)
+    a, b = sampling_locations(Epipolar(), pair_of(rig)), Rectified(16.0)(pair_of(rig), x)
     assert torch.equal(a.valid, b.valid)
     torch.testing.assert_close(a.start, b.start, atol=1e-4, rtol=0)
     torch.testing.assert_close(a.end, b.end, atol=1e-4, rtol=0)
@@ -183,7 +183,7 @@ def pixel_by_pixel(line: np.ndarray, centre: np.ndarray, hw: tuple[int, int], co
 def test_nearest_voxels_are_those_found_pixel_by_pixel(field, seed):
     pair = pair_of(random_rig(seed, turn=0.4))
     x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[3::14, 5::16].reshape(-1, 2)
-    positions = look(field, pair, x)
+    positions = sampling_locations(field, pair, x)
     lines = epipolar_lines(pair.fundamental, x)
     centre, placed = apply_homography(pair.homography, x)
     for i in range(len(x)):
@@ -238,9 +238,9 @@ def batch_of(rigs: list[Rig]) -> Rig:
 @pytest.mark.parametrize("field", [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), Local(3)], ids=ids)
 def test_batched_rigs_agree_with_single_ones(field):
     rigs = [random_rig(i, near=1.0 + i) for i in range(3)]
-    together = look(field, pair_of(batch_of(rigs)))
+    together = sampling_locations(field, pair_of(batch_of(rigs)))
     for i, rig in enumerate(rigs):
-        alone = look(field, pair_of(rig))
+        alone = sampling_locations(field, pair_of(rig))
         for f in dataclasses.fields(alone):
             torch.testing.assert_close(getattr(together, f.name)[i], getattr(alone, f.name))
 
@@ -254,7 +254,7 @@ def test_whole_images_in_chunks_are_what_single_rows_are():
     rig = random_rig(1).resize("alpha", (300, 400))
     pair = pair_of(rig)
     for field in STRAIGHT:
-        whole = look(field, pair)
+        whole = sampling_locations(field, pair)
         row = field(pair, pixel_grid((300, 400))[123])
         torch.testing.assert_close(whole.start[123], row.start, atol=0, rtol=0)
         assert whole.start.shape == (300, 400, 2)
@@ -264,9 +264,9 @@ def test_whole_images_in_chunks_are_what_single_rows_are():
 def test_lenses_and_missing_calibration_are_refused():
     pair = by_link(pair_of(random_rig(1)))
     with pytest.raises(ValueError, match="HomographyDisplacement or Rectified"):
-        look(Epipolar(), pair)
+        sampling_locations(Epipolar(), pair)
     with pytest.raises(ValueError, match="depth range"):
-        look(Epipolar(), pair_of(random_rig(1).replace(depth=None)))
+        sampling_locations(Epipolar(), pair_of(random_rig(1).replace(depth=None)))
 
 
 # ----------------------------------------------------------------------------------------------------- gradients
@@ -351,7 +351,7 @@ def test_degenerate_rigs_give_finite_values_and_gradients(case, field, dtype):
     rig = DEGENERATE[case].to(dtype)
     names = ["*.rotation", "*.translation", "*.focal", "*.centre", "depth.near"]
     changes = rig.parameters(free=names)
-    found = look(field, pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=dtype)[::2, 1::2])
+    found = sampling_locations(field, pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=dtype)[::2, 1::2])
     values = [v for v in vars(found).values() if v.dtype.is_floating_point]
     assert all(v.isfinite().all() for v in values)
     total = sum(v.sum() for v in values)
@@ -361,7 +361,7 @@ def test_degenerate_rigs_give_finite_values_and_gradients(case, field, dtype):
 
 
 def segments_of(case: str) -> Segments:
-    return look(Epipolar(), pair_of(DEGENERATE[case]))
+    return sampling_locations(Epipolar(), pair_of(DEGENERATE[case]))
 
 
 def test_identical_cameras_look_at_the_same_pixel():
@@ -406,7 +406,7 @@ def test_forward_motion_looks_outward_from_the_epipole():
 
 def test_opposing_cameras_see_only_what_is_between_them():
     rig = DEGENERATE["opposing"]
-    s = look(Epipolar(), pair_of(rig))
+    s = sampling_locations(Epipolar(), pair_of(rig))
     assert s.valid.any()
     x = pixel_grid((48, 64), dtype=torch.float64)
     for depth, visible in ((1.0, True), (4.0, True), (6.0, False)):
@@ -482,6 +482,8 @@ def test_the_epipole_itself_looks_at_one_point(dtype):
 def test_gradients_are_finite_where_only_some_rigs_of_a_batch_are_degenerate():
     rig = batch_of([DEGENERATE["identical cameras"], DEGENERATE["near is far"], DEGENERATE["opposing"]])
     changes = rig.parameters(free=["beta.*"])
-    s = look(Epipolar(), pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=torch.float64)[None, ::8, ::8])
+    s = sampling_locations(
+        Epipolar(), pair_of(rig.perturbed(changes)), pixel_grid((48, 64), dtype=torch.float64)[None, ::8, ::8]
+    )
     slopes = torch.autograd.grad(s.start.sum() + s.end.sum(), list(changes.values()), allow_unused=True)
     assert all(v is None or v.isfinite().all() for v in slopes)

@@ -1,9 +1,11 @@
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from arraygeom.homography import apply_homography, infinite_homography, plane_homography
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 
 @pytest.fixture

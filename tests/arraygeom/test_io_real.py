@@ -7,13 +7,15 @@ from collections import defaultdict
 from itertools import pairwise
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import Camera, Rig
 from arraygeom.io import RigFileWarning, read_rig
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 
 def tensor(values) -> torch.Tensor:

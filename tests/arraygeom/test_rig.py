@@ -21,8 +21,8 @@ def uncalibrated() -> Rig:
     [
         lambda r, n: r.resize(n, (30, 31)),
         lambda r, n: r.crop(n, 2, -5, (20, 90)),
-        lambda r, n: r.turn(n, 1),
-        lambda r, n: r.turn(n, 2),
+        lambda r, n: r.rot90(n, 1),
+        lambda r, n: r.rot90(n, 2),
     ],
 )
 @pytest.mark.parametrize("name", ["alpha", "beta"])
@@ -65,7 +65,7 @@ def test_focal_lengths_of_turned_images(turns):
     """Changing the focal length and turning commute."""
     rig = random_rig(0)
     change = {"beta.focal": torch.tensor([1.0, 2.0], dtype=torch.float64)}
-    a, b = rig.perturbed(change).turn("beta", turns), rig.turn("beta", turns).perturbed(change)
+    a, b = rig.perturbed(change).rot90("beta", turns), rig.rot90("beta", turns).perturbed(change)
     torch.testing.assert_close(a["beta"].K, b["beta"].K)
 
 

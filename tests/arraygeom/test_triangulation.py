@@ -1,11 +1,13 @@
-import cv2
 import numpy as np
 import pytest
 import torch
-from scipy.optimize import least_squares
 
 from arraygeom import Camera, Distortion, depth_of, triangulate
 from tests.arraygeom.rigs import random_camera, uniform
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
+optimize = Oracle("scipy.optimize")
 
 
 def array_of(n: int, *, lens: Distortion | None = None) -> list[Camera]:
@@ -55,7 +57,7 @@ def test_with_noise_it_is_nearly_the_least_reprojection_error():
         return torch.cat([c.project(X).x - x[v, i] for v, c in enumerate(cameras)]).numpy()
 
     for i in range(10):
-        best = least_squares(residual, X[i].numpy(), args=(i,)).x
+        best = optimize.least_squares(residual, X[i].numpy(), args=(i,)).x
         sigma = 0.5 * found.covariance[i].diagonal().sum().sqrt()
         assert np.linalg.norm(found.X[i].numpy() - best) < 0.6 * sigma
 

@@ -2,13 +2,15 @@
 
 import math
 
-import cv2
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import Camera, Distortion, LensView, Pose, intrinsics, pinhole_view, resampled, rotation_from_vector
 from arraygeom.undistortion import pixels_between
+from tests.oracles import Oracle
+
+cv2 = Oracle("cv2")
 
 HW = (120, 160)
 LENSES = {

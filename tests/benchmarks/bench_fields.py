@@ -29,9 +29,9 @@ from arraygeom import (
     Rectified,
     Widened,
     intrinsics,
-    look,
     pixel_grid,
     rotation_from_vector,
+    sampling_locations,
 )
 
 HW = (800, 1280)
@@ -101,7 +101,7 @@ def main() -> None:
 
     def field(name: str, f: ReceptiveField, chosen: list[Pair], x: torch.Tensor) -> None:
         with torch.no_grad():
-            report(name, timed(lambda: [look(f, pair, x) for pair in chosen]), x.numel() // 2)
+            report(name, timed(lambda: [sampling_locations(f, pair, x) for pair in chosen]), x.numel() // 2)
 
     field("Epipolar", Epipolar(), straight, whole)
     field("EpipolarLine", EpipolarLine(), straight, whole)

@@ -23,13 +23,14 @@ import torch
 import tyro
 
 from arraygeom.atomic import write_text
+from arraygeom.fields import FIELDS
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import FIELDS, Sample, SampleSource, photographs
+from pat.training.samples import Sample, SampleSource, photographs
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 

@@ -25,6 +25,7 @@ import tyro
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
+from arraygeom.fields import FIELDS
 from pat.attention import attend
 from pat.attention.reference import Attended
 from pat.evaluation.ablation import sample_photographs
@@ -32,7 +33,7 @@ from pat.networks.weights import Network
 from pat.training.config import TrainConfig, load_config
 from pat.training.loop import convolutions, in_bfloat16, new_network
 from pat.training.losses import Objective
-from pat.training.samples import FIELDS, Sample, SampleSource
+from pat.training.samples import Sample, SampleSource
 
 
 @dataclass

@@ -44,7 +44,7 @@ MISTAKES = {
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
     "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
     "resized": one(lambda c: c.resize((c.hw[0] // 2, c.hw[1] // 2)).replace(hw=c.hw)),
-    "rotated or mirrored": lambda rig: rig.turn("second", 2),
+    "rotated or mirrored": lambda rig: rig.rot90("second", 2),
 }
 
 
@@ -136,7 +136,7 @@ def test_an_f_of_which_one_side_counts_from_one():
 @pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "rotated or mirrored")])
 def test_images_of_another_size(hw, kind):
     rig = unlike_pair()
-    true = rig.resize("first", hw) if kind == "resized" else rig.turn("first", 1)
+    true = rig.resize("first", hw) if kind == "resized" else rig.rot90("first", 1)
     found = diagnose_matches(rig, sizes(true), seen_points(true))
     assert found.named.kind == kind
     assert found.repaired["first"].hw == hw

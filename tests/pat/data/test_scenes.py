@@ -7,8 +7,17 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
-from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
-from arraygeom.fields import look
+from arraygeom import (
+    Camera,
+    Epipolar,
+    NearestVoxels,
+    Pose,
+    Rig,
+    Sensor,
+    intrinsics,
+    rotation_from_vector,
+    sampling_locations,
+)
 from pat.data import (
     PatchGrid,
     ScenePatches,
@@ -21,7 +30,7 @@ from pat.data import (
     write_indices,
 )
 from pat.data.patches import cut
-from pat.data.windows import reduced_depth, select
+from pat.data.windows import reduced_depth
 from pat.farm.backends import LayeredSettings
 from pat.media.images import read_image
 from pat.sensors import BoxBlur, Clip, DegradationCase, Resample
@@ -81,7 +90,7 @@ def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(re
     whole = make_rig()["mono"].project(X).x
     for i, (top, left) in enumerate(SMALL.corners((96, 128))):
         wanted = (whole - torch.tensor([left, top]).double() + 0.5) / 2 - 0.5
-        torch.testing.assert_close(select(stack.rig, i)["mono"].project(X).x, wanted)
+        torch.testing.assert_close(stack.rig[i]["mono"].project(X).x, wanted)
     assert stack.rgb["mono"].shape == (6, 3, 16, 24)
     assert stack.rgb["colour"].shape[0] == 6
 
@@ -214,7 +223,7 @@ def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
 
 def test_index_files_give_back_what_was_written(tmp_path):
     pair = make_rig().crop("mono", 0, 0, (10, 12)).pair("mono", "colour")
-    field = look(NearestVoxels(count=12, window=8), pair)
+    field = sampling_locations(NearestVoxels(count=12, window=8), pair)
     written = write_indices(tmp_path, "rig", field, beta=2)
     assert [f.name for f in written] == ["xxs_rig_2.npy", "yys_rig_2.npy"]
     back = read_indices(tmp_path, "rig", (10, 12), beta=2)

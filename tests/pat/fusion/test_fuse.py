@@ -257,7 +257,7 @@ def test_colour_comes_from_where_the_field_says():
     upright = fuse(network, rig, {"mono": ground_truth, "colour": ground_truth}, alpha="mono", depth=(5, 20)).image
     turned = fuse(
         network,
-        rig.turn("colour", 1),
+        rig.rot90("colour", 1),
         {"mono": ground_truth, "colour": ground_truth.rot90(1, (-2, -1))},
         alpha="mono",
         depth=(5, 20),
@@ -382,11 +382,11 @@ def test_lenses_of_cameras_known_by_f_are_seen_through():
 def test_a_turned_beta_is_turned_upright():
     rig = rig_of((60, 80), (60, 80))
     for turns in range(4):
-        assert quarter_turns(rig.turn("colour", turns).pair("mono", "colour")) == -turns % 4
+        assert quarter_turns(rig.rot90("colour", turns).pair("mono", "colour")) == -turns % 4
     images = {"mono": texture(1, (60, 80)), "colour": texture(3, (60, 80))}
     network = network_of("GuidedPAT")
     upright = fuse(network, rig, images, alpha="mono")
-    turned = fuse(network, rig.turn("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono")
+    turned = fuse(network, rig.rot90("colour", 3), images | {"colour": images["colour"].rot90(3, (1, 2))}, alpha="mono")
     assert (upright.image - turned.image).abs().max() < 1e-4
 
 

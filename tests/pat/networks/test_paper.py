@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from arraygeom import Pair, Rectified, Rig, View, look
+from arraygeom import Pair, Rectified, Rig, View, sampling_locations
 from arraygeom.fields.grid import FieldOnGrid
 from pat.attention import attend
 from pat.networks.paper import PAT, PATConfig
@@ -21,7 +21,7 @@ def test_the_rectified_field_is_parallax_attention():
     query, key, value = (torch.randn(2, 6, 5, 9, generator=g, dtype=torch.float64) for _ in range(3))
     weights = torch.einsum("bdhw,bdhv->bhwv", query, key).softmax(-1)
     textbook = torch.einsum("bhwv,bdhv->bdhw", weights, value)
-    field = look(Rectified(), Pair(View(hw=(5, 9)), View(hw=(5, 9))))
+    field = sampling_locations(Rectified(), Pair(View(hw=(5, 9)), View(hw=(5, 9))))
     for interpolation in ("bilinear", "nearest"):
         ours = attend(query, key, value, field, interpolation=interpolation)
         assert (ours - textbook).abs().max() < 1e-6

@@ -1,0 +1,158 @@
+"""Batches of cameras, rigs, poses and the like: one generic piece for every frozen dataclass of tensors."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, TypeVar
+
+import torch
+from torch import Tensor
+
+from .text import batch_text
+
+T = TypeVar("T", bound="Batched")
+LABELS = ("name", "sensor")
+"""Fields that may differ between what is stacked; the batch has those of the first."""
+
+
+class Batched:
+    """Base of frozen dataclasses whose tensors have leading batch axes: `[i]`, `len`, `to` and `==`.
+
+    `item_axes` holds, by field, the number of a tensor's last axes that belong to one item. A tensor without batch axes
+    is shared by all items of a batch. Instances are not hashable: they are equal if their tensors are.
+    """
+
+    item_axes: ClassVar[Mapping[str, int]] = {}
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch axes, empty for one item."""
+        return torch.broadcast_shapes(*(t.shape[: t.ndim - axes] for t, axes in tensors_of(self)))
+
+    def __len__(self) -> int:
+        return self._batched()[0]
+
+    def __bool__(self) -> bool:
+        return True
+
+    def __getitem__(self: T, index: Any) -> T:
+        """Items of the batch; `index` is as for the first axes of a tensor."""
+        shape = self._batched()
+
+        def chosen(t: Tensor, axes: int) -> Tensor:
+            own = t.shape[t.ndim - axes :]
+            return t if t.ndim == axes else t.expand(*shape, *own)[index]
+
+        return map_tensors(self, chosen)
+
+    def to(self: T, *args: Any, **kwargs: Any) -> T:
+        """Like `Tensor.to`, for every tensor; a change of dtype leaves masks alone."""
+
+        def moved(t: Tensor, axes: int) -> Tensor:
+            there = t.to(*args, **kwargs)
+            return there if t.is_floating_point() else there.to(t.dtype)
+
+        return map_tensors(self, moved)
+
+    def replace(self: T, **changes: Any) -> T:
+        """A copy with some fields changed."""
+        return dataclasses.replace(self, **changes)  # type: ignore[type-var]
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        return all(_equal(getattr(self, f.name), getattr(other, f.name)) for f in _fields(self) if f.compare)
+
+    __hash__ = None  # type: ignore[assignment]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}: {', '.join(p for p in (batch_text(self), self._text()) if p)}"
+
+    def _text(self) -> str:
+        raise NotImplementedError
+
+    def _batched(self) -> torch.Size:
+        shape = self.batch_shape
+        if not shape:
+            raise TypeError(f"this {type(self).__name__} is one item, not a batch: make a batch with arraygeom.stack")
+        return shape
+
+
+def stack(items: Sequence[T]) -> T:
+    """One batch of items alike, along a new first axis.
+
+    What is not a tensor has to be the same in all (sizes, lens models, the cameras of rigs), but for names and
+    sensors, which are the first's. Raises ValueError where it is not.
+    """
+    if not items:
+        raise ValueError("nothing to stack: give one item or more")
+    return _stacked(list(items), type(items[0]).__name__)
+
+
+def map_tensors(value: Any, f: Callable[[Tensor, int], Tensor], axes: int = 0) -> Any:
+    """The value with f(tensor, item axes) in place of each of its tensors."""
+    if isinstance(value, Tensor):
+        return f(value, axes)
+    if isinstance(value, Batched):
+        held = {g.name: map_tensors(getattr(value, g.name), f, value.item_axes.get(g.name, 0)) for g in _fields(value)}
+        return dataclasses.replace(value, **held)  # type: ignore[type-var]
+    if isinstance(value, Mapping):
+        return {key: map_tensors(v, f, axes) for key, v in value.items()}
+    return tuple(map_tensors(v, f, axes) for v in value) if isinstance(value, tuple) else value
+
+
+def tensors_of(value: Any, axes: int = 0) -> Iterator[tuple[Tensor, int]]:
+    """Every tensor of a value and the number of its item axes."""
+    if isinstance(value, Tensor):
+        yield value, axes
+    elif isinstance(value, Batched):
+        for f in _fields(value):
+            yield from tensors_of(getattr(value, f.name), value.item_axes.get(f.name, 0))
+    elif isinstance(value, Mapping | tuple):
+        for v in value.values() if isinstance(value, Mapping) else value:
+            yield from tensors_of(v, axes)
+
+
+def _fields(value: Any) -> list[dataclasses.Field[Any]]:
+    return [f for f in dataclasses.fields(value) if f.init]
+
+
+def _stacked(values: list[Any], where: str) -> Any:
+    """Values of one kind as a batch; `where` names them in errors."""
+    first = values[0]
+    if any(type(v) is not type(first) for v in values):
+        kinds = " and ".join(sorted({type(v).__name__ for v in values}))
+        raise ValueError(f"cannot stack {where}: some are {kinds}")
+    if isinstance(first, Tensor):
+        if len({v.shape for v in values}) > 1:
+            raise ValueError(f"cannot stack {where}: shapes {' and '.join(map(str, {tuple(v.shape) for v in values}))}")
+        return torch.stack(values)
+    if isinstance(first, Batched):
+        held = {f.name: [getattr(v, f.name) for v in values] for f in _fields(first)}
+        return dataclasses.replace(
+            first,
+            **{n: same[0] if n in LABELS else _stacked(same, f"{where}.{n}") for n, same in held.items()},  # type: ignore[type-var]
+        )
+    if isinstance(first, Mapping) and all(v.keys() == first.keys() for v in values):
+        return {key: _stacked([v[key] for v in values], f"{where}[{key!r}]") for key in first}
+    if isinstance(first, tuple) and any(isinstance(v, Tensor) for v in first):
+        return tuple(_stacked(list(same), where) for same in zip(*values))
+    differing = [v for v in values if v != first]
+    if differing:
+        raise ValueError(f"cannot stack {where}: {_named(first)} and {_named(differing[0])} differ")
+    return first
+
+
+def _named(value: Any) -> str:
+    return f"{', '.join(map(str, value))}" if isinstance(value, Mapping) else str(value)
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if isinstance(a, Tensor) and isinstance(b, Tensor):
+        return (a.dtype, a.device, a.shape) == (b.dtype, b.device, b.shape) and torch.equal(a, b)
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return list(a) == list(b) and all(_equal(a[key], b[key]) for key in a)
+    if isinstance(a, tuple) and isinstance(b, tuple):
+        return len(a) == len(b) and all(_equal(x, y) for x, y in zip(a, b))
+    return not isinstance(a, Tensor) and not isinstance(b, Tensor) and bool(a == b)

@@ -1,0 +1,221 @@
+"""What arraygeom and kornia both have agrees, in values and in gradients; and both sides' cameras convert."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import pytest
+import torch
+from kornia.geometry import calibration, epipolar
+from kornia.geometry.camera import PinholeCamera, project_points, unproject_points
+from kornia.geometry.liegroup import Se3, So3
+from kornia.geometry.linalg import inverse_transformation, transform_points
+from kornia.geometry.transform import remap
+from torch import Tensor
+
+from arraygeom import (
+    Camera,
+    Distortion,
+    LensView,
+    Rig,
+    apply_homography,
+    epipolar_distance,
+    epipolar_lines,
+    essential_matrix,
+    fundamental_matrix,
+    intrinsics,
+    pixel_grid,
+    rotation_from_vector,
+    sample,
+    stack,
+    triangulate,
+)
+from arraygeom.pose import rotation_vector
+from tests.arraygeom.rigs import random_rig, scene_points
+
+F64 = torch.float64
+RIG = random_rig(3)
+ALPHA, BETA = RIG["alpha"], RIG["beta"]
+PAIR = RIG.pair("alpha", "beta")
+H = PAIR.homography
+IMAGE = torch.rand(1, 2, 48, 64, dtype=F64, generator=torch.Generator().manual_seed(0))
+LENS = torch.tensor([-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003], dtype=F64)
+
+
+def projection(camera: Camera) -> Tensor:
+    return camera.K @ torch.cat([camera.R, camera.t[:, None]], -1)
+
+
+class Parity(NamedTuple):
+    """The same map in both libraries, at a value, and what they may differ by."""
+
+    ours: Callable[[Tensor], Tensor]
+    theirs: Callable[[Tensor], Tensor]
+    at: Tensor
+    tolerance: float = 1e-9
+
+
+def up_to_scale(F: Tensor) -> Tensor:
+    return F / F.norm() * F[2, 2].sign()
+
+
+def lens_view(c: Tensor) -> LensView:
+    return LensView(hw=ALPHA.hw, K=ALPHA.K, distortion=Distortion("brown-conrady", c))
+
+
+def cases(points: int) -> dict[str, Parity]:
+    """What both libraries have, for some points that both cameras of RIG see."""
+    X = scene_points(RIG, points)
+    x_alpha, x_beta = ALPHA.project(X).x, BETA.project(X).x
+    vectors = torch.randn(points, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+    return {
+        "epipolar lines": Parity(
+            lambda F: epipolar_lines(F, x_alpha),
+            lambda F: epipolar.compute_correspond_epilines(x_alpha[None], F[None])[0],
+            PAIR.fundamental,
+        ),
+        "epipolar distance": Parity(
+            lambda F: epipolar_distance(F, x_alpha, x_beta + 1).abs(),
+            lambda F: epipolar.left_to_right_epipolar_distance(x_alpha[None], x_beta[None] + 1, F[None])[0],
+            PAIR.fundamental,
+        ),
+        "essential matrix": Parity(
+            lambda t: essential_matrix(PAIR.beta_from_alpha.replace(t=t)),
+            lambda t: epipolar.cross_product_matrix(t) @ PAIR.beta_from_alpha.R,
+            PAIR.beta_from_alpha.t,
+        ),
+        "fundamental matrix": Parity(
+            lambda K: up_to_scale(fundamental_matrix(K, BETA.K, PAIR.beta_from_alpha)),
+            lambda K: up_to_scale(
+                epipolar.fundamental_from_projections(projection(ALPHA.replace(K=K))[None], projection(BETA)[None])[0]
+            ),
+            ALPHA.K,
+            1e-7,
+        ),
+        "homography of points": Parity(
+            lambda H: apply_homography(H, x_alpha).x, lambda H: transform_points(H[None], x_alpha[None])[0], H
+        ),
+        "projection": Parity(
+            lambda X: ALPHA.project_local(X).x, lambda X: project_points(X, ALPHA.K), ALPHA.cam_from_world.apply(X)
+        ),
+        "unprojection": Parity(
+            lambda x: torch.cat(ALPHA.rays(x)[:1]) * 2.0,
+            lambda x: unproject_points(x, torch.full((len(x), 1), 2.0, dtype=F64), ALPHA.K.expand(len(x), 3, 3)),
+            x_alpha,
+        ),
+        "exp of a rotation": Parity(rotation_from_vector, lambda w: So3.exp(w).matrix(), vectors),
+        "log of a rotation": Parity(
+            lambda w: rotation_vector(rotation_from_vector(w)), lambda w: So3.exp(w).log(), vectors, 1e-7
+        ),
+        "inverse pose": Parity(
+            lambda w: ALPHA.cam_from_world.perturbed(w).inverse().t,
+            lambda w: Se3(So3.from_matrix(rotation_from_vector(w) @ ALPHA.R), ALPHA.t).inverse().matrix()[:3, 3],
+            0.1 * vectors[0],
+            1e-8,
+        ),
+        "composed poses": Parity(
+            lambda t: (BETA.cam_from_world @ ALPHA.cam_from_world.replace(t=t).inverse()).t,
+            lambda t: (matrix4(BETA.R, BETA.t) @ inverse_transformation(matrix4(ALPHA.R, t)))[:3, 3],
+            ALPHA.t,
+        ),
+        "triangulation": Parity(
+            lambda x: triangulate([ALPHA, BETA], torch.stack([x_alpha, x])).X,
+            lambda x: epipolar.triangulate_points(projection(ALPHA), projection(BETA), x_alpha, x),
+            x_beta,
+            2e-6,
+        ),
+        "distortion": Parity(
+            lambda c: lens_view(c).distort(x_alpha)[0],
+            lambda c: calibration.distort_points(x_alpha[None], ALPHA.K[None], c[None])[0],
+            LENS,
+        ),
+        "undistortion": Parity(
+            lambda c: lens_view(c).undistort(x_alpha)[0],
+            lambda c: calibration.undistort_points(x_alpha[None], ALPHA.K[None], c[None], num_iters=60)[0],
+            LENS,
+            1e-6,
+        ),
+        "sampling": Parity(
+            lambda x: sample(IMAGE, x[None]).values[0],
+            lambda x: remap(IMAGE, x[None, None, :, 0], x[None, None, :, 1], align_corners=True)[0, :, 0],
+            x_alpha.clamp(1.3, 46.3),
+        ),
+        "pixel grid": Parity(
+            lambda s: s * pixel_grid((3, 5), dtype=F64), lambda s: s * created_grid(3, 5), torch.ones((), dtype=F64)
+        ),
+    }
+
+
+X = scene_points(RIG, 40)
+X_ALPHA, X_BETA = ALPHA.project(X).x, BETA.project(X).x
+CASES = cases(40)
+
+
+def matrix4(R: Tensor, t: Tensor) -> Tensor:
+    last = torch.tensor([[0.0, 0, 0, 1]], dtype=F64)
+    return torch.cat([torch.cat([R, t[:, None]], -1), last])
+
+
+def created_grid(h: int, w: int) -> Tensor:
+    from kornia.geometry.grid import create_meshgrid
+
+    return create_meshgrid(h, w, normalized_coordinates=False, dtype=F64)[0]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_values_and_gradients_agree(name):
+    ours, theirs, at, tolerance = CASES[name]
+    torch.testing.assert_close(ours(at), theirs(at), atol=tolerance, rtol=tolerance)
+    gradients = []
+    for f in (ours, theirs):
+        leaf = at.clone().requires_grad_()
+        value = f(leaf)
+        cotangent = torch.randn(value.shape, dtype=F64, generator=torch.Generator().manual_seed(2))
+        gradients.append(torch.autograd.grad((value * cotangent).sum(), leaf)[0])
+    # triangulation: two different least squares, equal for exact matches but not in what noise does to them
+    if name != "triangulation":
+        torch.testing.assert_close(gradients[0], gradients[1], atol=100 * tolerance, rtol=100 * tolerance)
+
+
+def pinhole(n: int = 1, sizes: tuple[int, ...] = (48,)) -> PinholeCamera:
+    """A batch of kornia cameras, all of RIG's alpha but for their heights."""
+    K, E = torch.eye(4, dtype=F64).repeat(n, 1, 1), torch.eye(4, dtype=F64).repeat(n, 1, 1)
+    K[:, :3, :3], E[:, :3, :3], E[:, :3, 3] = ALPHA.K, ALPHA.R, ALPHA.t
+    return PinholeCamera(K, E, torch.tensor(sizes).expand(n), torch.tensor([64]).expand(n))
+
+
+def test_a_rig_is_made_of_kornia_pinholes():
+    for rig in (
+        Rig.from_kornia({"a": pinhole(), "b": BETA.to_kornia()}, depth=(1, 2)),
+        Rig({"a": pinhole(), "b": BETA}, (1, 2)),
+    ):
+        assert rig == Rig({"a": ALPHA, "b": BETA}, depth=(1, 2))
+    with pytest.raises(TypeError, match="camera 'b' is a str: give a Camera, a LensView, a View or a kornia Pinhole"):
+        Rig({"a": ALPHA, "b": "colour"})
+
+
+def test_batches_of_one_are_one_camera_and_larger_ones_stay():
+    assert Camera.from_kornia(pinhole()) == ALPHA
+    assert Camera.from_kornia(pinhole(3)) == stack([ALPHA] * 3)
+    assert len(Rig({"a": pinhole(3), "b": stack([BETA] * 3)})) == 3
+    with pytest.raises(ValueError, match=r"images of 64x40 and 64x48: convert those of each size apart"):
+        Camera.from_kornia(pinhole(2, (48, 40)))
+
+
+def test_kornia_cameras_are_kept_up_to_date_by_gradients():
+    t = ALPHA.t.clone().requires_grad_()
+    camera = ALPHA.replace(cam_from_world=ALPHA.cam_from_world.replace(t=t))
+    there = camera.to_kornia()
+    torch.testing.assert_close(there.project(X[None])[0], camera.project(X).x)
+    there.project(X[None]).sum().backward()
+    assert t.grad.abs().min() > 0
+    again = t.grad.clone()
+    t.grad = None
+    Camera.from_kornia(camera.to_kornia()).project(X).x.sum().backward()
+    torch.testing.assert_close(t.grad, again)
+
+
+def test_our_tensors_go_through_kornia_and_back():
+    K = intrinsics(50.0, (48, 64))
+    found = epipolar.triangulate_points(projection(ALPHA), projection(BETA), X_ALPHA, X_BETA)
+    torch.testing.assert_close(BETA.project(found).x, X_BETA)
+    assert Camera.from_kornia(ALPHA.replace(K=K).to_kornia()).K.equal(K)
