@@ -170,7 +170,7 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
     def interrupted(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pat.cli.main.Demo.run", interrupted)
+    monkeypatch.setattr("pat.cli.fusing.Demo.run", interrupted)
     with pytest.raises(SystemExit) as stop:
         main(["demo"])
     assert stop.value.code == 130
