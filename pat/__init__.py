@@ -1,12 +1,46 @@
-"""The physics-aware transformer: one image from an array of unlike cameras."""
+"""The physics-aware transformer: one image from an array of unlike cameras.
+
+The front door: `fuse`, its result `Frame`, `load_weights` and `read_image`. Nothing is imported before it is used.
+"""
 
 from __future__ import annotations
 
+import sys
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from .support.moved import OldNames
 
 if TYPE_CHECKING:
-    from .networks.weights import Network
+    from .fusion.fuse import fuse
+    from .fusion.results import Frame
+    from .media.images import read_image
+    from .networks.weights import Network, load_weights
+
+__all__ = ["Frame", "from_pretrained", "fuse", "load_weights", "read_image"]
+
+_MODULES = {
+    "Frame": "pat.fusion.results",
+    "fuse": "pat.fusion.fuse",
+    "load_weights": "pat.networks.weights",
+    "read_image": "pat.media.images",
+}
+
+sys.meta_path.insert(0, OldNames)
+
+
+if not TYPE_CHECKING:
+
+    def __getattr__(name: str) -> Any:
+        """The front door, and modules that were imported as `pat.name`."""
+        if name not in _MODULES:
+            raise AttributeError(f"module 'pat' has no attribute '{name}'")
+        return getattr(import_module(_MODULES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *_MODULES]
 
 
 def from_pretrained(name: str | Path) -> Network:

@@ -97,13 +97,13 @@ def _command(arguments: list[str]) -> Any:
         return tyro.cli(_union(Pat), prog="pat", args=arguments)
     if arguments == ["--version"]:
         print(f"arraygeom-pat {_version()}")
-        sys.exit()
+        sys.exit(0)
     path, command = "pat", Pat
     while hasattr(command, "commands"):
         word = arguments[0] if arguments else "--help"
         if word in ("--help", "-h"):
             print(_help(path, command))
-            sys.exit()
+            sys.exit(0)
         if word not in command.commands:
             raise ValueError(f"no command '{path} {word}'{_near(word, command.commands)}")
         path, command, arguments = f"{path} {word}", command.commands[word], arguments[1:]

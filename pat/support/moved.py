@@ -1,13 +1,77 @@
-"""Modules under the names that they had, for one release: they work, and a DeprecationWarning names the new one."""
+"""Where the modules of `pat` have moved: their old names work for one release, with a DeprecationWarning."""
 
 from __future__ import annotations
 
+from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
+
+MOVED = {
+    "pat.ablate": "pat.evaluation.ablation",
+    "pat.attention.op": "pat.attention.attend",
+    "pat.attention.operator": "pat.attention.torch_op",
+    "pat.bands": "pat.networks.spectral_mix",
+    "pat.bandwise": "pat.networks.bandwise",
+    "pat.batch": "pat.fusion.batch",
+    "pat.blocks": "pat.networks.blocks",
+    "pat.classical": "pat.evaluation.baseline",
+    "pat.consensus": "pat.networks.semi_global",
+    "pat.data.protocol": "pat.evaluation.protocols",
+    "pat.demo": "pat.data.sample_array",
+    "pat.develop": "pat.media.raw",
+    "pat.evaluate": "pat.evaluation.stereo",
+    "pat.fuse": "pat.fusion.fuse",
+    "pat.guided": "pat.networks.guided",
+    "pat.hdr": "pat.systems.hdr",
+    "pat.images": "pat.media.images",
+    "pat.jobs": "pat.support.jobs",
+    "pat.memory": "pat.support.memory",
+    "pat.metrics": "pat.evaluation.metrics",
+    "pat.model": "pat.networks.paper",
+    "pat.motion": "pat.fusion.optical_flow",
+    "pat.results": "pat.fusion.results",
+    "pat.sequence": "pat.fusion.sequence",
+    "pat.showcase": "pat.systems.showcase",
+    "pat.synthesis.document": "pat.support.schema",
+    "pat.synthesis.pictures": "pat.synthesis.image_files",
+    "pat.threads": "pat.support.threads",
+    "pat.tiles": "pat.fusion.tiles",
+    "pat.train": "pat.training.train",
+    "pat.video": "pat.media.video",
+    "pat.weights": "pat.networks.weights",
+}
+
+RENAMED = {
+    "pat.batch.find_pictures": "pat.fusion.batch.find_images",
+    "pat.demo.report_figure": "pat.systems.demo.report_figure",
+    "pat.develop.ViewFiles": "pat.fusion.views.ViewFiles",
+    "pat.develop.read_views": "pat.fusion.views.read_views",
+    "pat.fuse.FusedFrame": "pat.fusion.results.Frame",
+    "pat.images.from_luma_chroma": "pat.media.colour.from_luma_chroma",
+    "pat.images.luminance": "pat.media.colour.luminance",
+    "pat.images.to_luma_chroma": "pat.media.colour.to_luma_chroma",
+    "pat.model.FusionNetwork": "pat.networks.protocol.FusionNetwork",
+    "pat.sequence.PictureFiles": "pat.fusion.sequence.ImageFiles",
+}
+"""New addresses of names that are not in the new module under the same name."""
+
+
+class OldNames:
+    """A finder for `sys.meta_path`; torch is imported only when one of the old names is."""
+
+    @staticmethod
+    def find_spec(fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """The specification of a module that has moved."""
+        if fullname not in MOVED:
+            return None
+        from arraygeom.moved import OldModules
+
+        return OldModules(MOVED, RENAMED).find_spec(fullname)
 
 
 class CallableModule(ModuleType):
     """A module that, called, calls its function of the same name."""
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call it."""
         return getattr(self, self.__name__.rpartition(".")[2])(*args, **kwargs)
