@@ -17,7 +17,7 @@ RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder 
 
 @dataclass
 class Evaluate:
-    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR and SSIM, tables and images.
+    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
 
     The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground truth.
     Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
@@ -76,7 +76,7 @@ class Evaluate:
 
 @dataclass
 class Ablate:
-    """Compare receptive fields, hence what calibration is worth: the same weights on the same scenes with each family.
+    """Compare families of receptive fields with the same weights on the same scenes: what calibration is worth.
 
     Scenes are layered photographs seen by unrectified rigs, alpha's focal length 1 to 3 times beta's.
     Example: pat ablate --scenes 12 --out out/ablate

@@ -162,7 +162,7 @@ class Fuse:
 
 @dataclass
 class Demo:
-    """Fuse the sample array of the package; write image, depth, confidence and a figure, print PSNR and SSIM."""
+    """Fuse the sample array of the package: image, depth, confidence, a figure, PSNR and SSIM."""
 
     out: Out = Path("out/demo")
     """Folder for the results."""

@@ -213,7 +213,7 @@ def command_line(arguments: list[str]) -> TrainConfig:
         ),
         default=base,
         args=arguments,
-        config=(tyro.conf.AvoidSubcommands,),
+        config=(tyro.conf.AvoidSubcommands, tyro.conf.DisallowNone),
     )
 
 
