@@ -153,17 +153,6 @@ def publish(partial: Path, final: Path) -> bool:
     return True
 
 
-def write_atomic(path: Path, text: str) -> None:
-    """A file that appears whole or not at all."""
-    temporary = path.with_name(f".{path.name}-{uuid4().hex[:12]}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        _sync(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
 def _sync(path: Path) -> None:
     handle = os.open(path, os.O_RDONLY)
     try:

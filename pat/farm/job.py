@@ -11,14 +11,15 @@ from typing import Any, Literal
 
 import yaml
 
+from arraygeom.atomic import write_text
 from arraygeom.rig import Rig
 from pat.sensors import seed_for
 from pat.support.schema import from_document, read_yaml, to_document
-from pat.synthesis.check import Limits as CheckLimits
+from pat.synthesis.check import Limits
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
-from .folders import JobFolder, write_atomic
-from .workshop import Limits
+from .folders import JobFolder
+from .workshop import RetryLimits
 
 MANIFEST = "manifest.yaml"
 FORMAT = "pat-render 1"
@@ -43,8 +44,8 @@ class RenderConfig:
     backend: Literal["layered", "blender"] = "layered"
     layered: LayeredSettings = field(default_factory=LayeredSettings)
     blender: BlenderSettings = field(default_factory=BlenderSettings)
-    check: CheckLimits = field(default_factory=CheckLimits)
-    limits: Limits = field(default_factory=Limits)
+    check: Limits = field(default_factory=Limits)
+    limits: RetryLimits = field(default_factory=RetryLimits)
 
     @classmethod
     def load(cls, path: str | Path) -> RenderConfig:
@@ -128,10 +129,8 @@ class Job:
 
     def save(self) -> None:
         """Write the file for workers."""
-        self.folder.work.mkdir(parents=True, exist_ok=True)
-        write_atomic(
-            self.file, json.dumps({"root": str(self.root), "tag": self.tag, "config": to_document(self.config)})
-        )
+        document = {"root": str(self.root), "tag": self.tag, "config": to_document(self.config)}
+        write_text(self.file, json.dumps(document))
 
     @classmethod
     def load(cls, path: Path) -> Job:
@@ -156,13 +155,13 @@ class Job:
                 )
             return
         manifest = {"format": FORMAT, "made from": json.loads(json.dumps(identity)), "versions": versions()}
-        write_atomic(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
+        write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
 
     def write_table(self, fact_file: str) -> int:
         """Write `scenes.jsonl` from what the scenes' folders say; how many there are."""
         facts = [(self.folder.scene(i) / fact_file) for i in self.folder.done()]
         lines = [json.dumps(json.loads(path.read_text(encoding="utf-8"))) for path in facts]
-        write_atomic(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
+        write_text(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
         return len(lines)
 
 

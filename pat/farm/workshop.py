@@ -15,13 +15,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+from ..support.jobs import JobError
 from .folders import RESERVE, JobFolder
 
 State = Literal["done", "there", "given up", "stopped"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class RetryLimits:
     """How long to try.
 
     A worker ends after `recycle` scenes, so that nothing it leaks adds up. It has `timeout` seconds for a scene, and
@@ -53,7 +54,7 @@ class Order:
     root: Path
     tag: str
     command: tuple[str, ...]
-    limits: Limits = field(default_factory=Limits)
+    limits: RetryLimits = field(default_factory=RetryLimits)
     scene_bytes: float = 0.0
 
     @property
@@ -63,7 +64,7 @@ class Order:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
+class SceneOutcome:
     """What became of a scene. "there": it was done before; "stopped": not tried to the end."""
 
     index: int
@@ -72,10 +73,6 @@ class Outcome:
     crashes: int = 0
     seconds: float = 0.0
     reason: str = ""
-
-
-class Stopped(Exception):
-    """The whole job cannot go on; one line says why."""
 
 
 class Workshop:
@@ -103,8 +100,8 @@ class Workshop:
             self._process.communicate()
         self._forget()
 
-    def make(self, index: int) -> Outcome:
-        """Make a scene unless it is there. Raises Stopped for what would befall every scene."""
+    def make(self, index: int) -> SceneOutcome:
+        """Make a scene unless it is there. Raises JobError for what would befall every scene."""
         folder, limits = self.order.folder, self.order.limits
         started, crashes, kills, refusals, reason = time.monotonic(), 0, 0, 0, ""
         state: State = "there"
@@ -123,14 +120,14 @@ class Workshop:
                 state = "given up"
                 break
         seconds = time.monotonic() - started
-        return Outcome(
+        return SceneOutcome(
             index=index, state=state, refusals=refusals, crashes=crashes + kills, seconds=seconds, reason=reason
         )
 
     def _ask(self, index: int, attempt: int) -> dict[str, Any]:
-        """One try. Raises Stopped."""
+        """One try. Raises JobError."""
         if self.order.folder.free() < RESERVE + 4 * self.order.scene_bytes:
-            raise Stopped(f"the disk of {self.order.root} is full: free space and run the same command again")
+            raise JobError(f"the disk of {self.order.root} is full: free space and run the same command again")
         process = self._started()
         order = {"scene": index, "attempt": attempt}
         try:
@@ -141,7 +138,7 @@ class Workshop:
             return self._dead()
         answer = self._answer(self.order.limits.timeout)
         if answer["answer"] == "stop":
-            raise Stopped(answer["reason"])
+            raise JobError(answer["reason"])
         self._made += 1
         if self._made >= self.order.limits.recycle and self._process is not None:
             self._retire()
@@ -152,9 +149,9 @@ class Workshop:
             self._start()
             answer = self._answer(self.order.limits.start)
             if answer["answer"] == "stop":
-                raise Stopped(answer["reason"])
+                raise JobError(answer["reason"])
             if answer["answer"] in ("crashed", "killed") and not self._may_start_again(answer):
-                raise Stopped(f"workers die when they start: {answer['reason']}")
+                raise JobError(f"workers die when they start: {answer['reason']}")
         return self._process
 
     def _may_start_again(self, answer: dict[str, Any]) -> bool:

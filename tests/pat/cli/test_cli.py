@@ -239,8 +239,8 @@ def test_every_command_has_help_that_reads_well(path, capsys):
 def test_names_are_those_of_the_package():
     from pat.networks.weights import shipped
 
-    assert WEIGHT_NAMES == tuple(sorted(shipped()))
-    assert FIELD_NAMES == tuple(FIELDS)
+    assert tuple(sorted(shipped())) == WEIGHT_NAMES
+    assert tuple(FIELDS) == FIELD_NAMES
     assert all(dataclasses.is_dataclass(field_named(name)) for name in FIELD_NAMES)
     assert field_named("auto") is None
 
