@@ -44,32 +44,24 @@ class Evaluate:
     def run(self) -> None:
         from arraygeom.atomic import write_text
 
-        from ..evaluation.stereo import (
-            BASELINES,
-            DATA_SETS,
-            PROTOCOLS,
-            controls,
-            evaluate_sets,
-            falls,
-            rectified_fusion,
-            sets_markdown,
-            write_csv,
-        )
+        from ..evaluation import stereo
         from ..networks.weights import load_weights
 
-        folders = {name: getattr(self, name) for name in DATA_SETS if getattr(self, name) is not None}
+        folders = {name: getattr(self, name) for name in stereo.DATA_SETS if getattr(self, name) is not None}
         if not folders:
-            raise ValueError(f"no images: give at least one of --{', --'.join(DATA_SETS)}")
+            raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
-        network, bands = load_weights(self.weights), PROTOCOLS[self.protocol]
-        wrong = controls(network, bands=bands) if self.controls else {}
-        methods = {**BASELINES, "fusion": rectified_fusion(network, bands=bands), **wrong}
-        rows = evaluate_sets(folders, methods, self.rates, out=self.out)
+        network, bands = load_weights(self.weights), stereo.PROTOCOLS[self.protocol]
+        wrong = stereo.controls(network, bands=bands) if self.controls else {}
+        methods = {**stereo.BASELINES, "fusion": stereo.rectified_fusion(network, bands=bands), **wrong}
+        rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out)
         every = [row for found in rows.values() for row in found]
-        text = sets_markdown(rows, protocol=self.protocol) + ("\n" + falls(every, names=wrong) if wrong else "")
+        text = stereo.sets_markdown(rows, protocol=self.protocol) + (
+            "\n" + stereo.falls(every, names=wrong) if wrong else ""
+        )
         write_text(self.out / "scores.md", text)
-        write_csv(self.out / "scores.csv", every)
+        stereo.write_csv(self.out / "scores.csv", every)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 

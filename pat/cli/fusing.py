@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from . import options
-from .options import RIG, Depth, FieldName, Images, Memory, Numbers, Out, RigFile, Weights, optional, say
+from .options import Depth, FieldName, Images, Memory, Numbers, Out, RigFile, Weights, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -31,7 +31,7 @@ class Fuse:
     and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
     """
 
-    spellings: ClassVar[Mapping[str, str]] = RIG | {
+    spellings: ClassVar[Mapping[str, str]] = {
         "--carry": "--propagate",
         "--no-carry": "--no-propagate",
         "--match-levels": "--normalise-radiometry",

@@ -107,7 +107,7 @@ def _command(arguments: list[str]) -> Any:
         if word not in command.commands:
             raise ValueError(f"no command '{path} {word}'{_near(word, command.commands)}")
         path, command, arguments = f"{path} {word}", command.commands[word], arguments[1:]
-    arguments = respelled(arguments, getattr(command, "spellings", {}))
+    arguments = respelled(arguments, command)
     if hasattr(command, "parse"):
         return command.parse(arguments)
     return tyro.cli(command, prog=path, args=arguments, config=(tyro.conf.DisallowNone,))

@@ -54,15 +54,16 @@ Memory = Annotated[str | None, optional("SIZE")]
 Weights = Annotated[str, arg(metavar="NAME|FILE", help=f"Weights: {', '.join(WEIGHT_NAMES)}, or a file.")]
 
 FIRST, LAST = "first", "last"
-RIG = {"--rig": FIRST}
-"""Spellings: the rig may be given as an option too."""
 
 
-def respelled(arguments: Iterable[str], spellings: Mapping[str, str]) -> list[str]:
-    """The arguments with other spellings of options replaced.
+def respelled(arguments: Iterable[str], command: Any) -> list[str]:
+    """The arguments with the other `spellings` of a command's options replaced.
 
-    FIRST and LAST stand for the first and the last positional argument, whose value follows the option.
+    FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig may
+    always be given so.
     """
+    spellings = {"--rig": FIRST} if "rig" in command.__annotations__ else {}
+    spellings |= getattr(command, "spellings", {})
     words = iter(arguments)
     first, rest, last = [], [], []
     for word in words:

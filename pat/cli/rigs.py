@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 
 from . import options
-from .options import LAST, RIG, Depth, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
+from .options import FIRST, LAST, Depth, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 @dataclass
 class Show:
     """Draw a rig, and the search segments of some alpha pixels in the other cameras."""
-
-    spellings: ClassVar[Mapping[str, str]] = RIG
 
     rig: RigFile
     alpha: Annotated[str | None, optional("NAME")] = None
@@ -65,8 +63,6 @@ class Explore:
     Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
     """
 
-    spellings: ClassVar[Mapping[str, str]] = RIG
-
     rig: RigFile
     image: Images
     """An image of each camera, once each."""
@@ -89,8 +85,6 @@ class Explore:
 @dataclass
 class Info:
     """Print fields of view, baselines, pixel footprints, and how long segments are for every pair."""
-
-    spellings: ClassVar[Mapping[str, str]] = RIG
 
     rig: RigFile
     depth: Depth = None
@@ -131,7 +125,7 @@ def _two(values: tuple[float, float] | None, between: str = ", ") -> str:
 class Convert:
     """Convert a rig file from one format to another."""
 
-    spellings: ClassVar[Mapping[str, str]] = RIG | {"--out": LAST, "-o": LAST}
+    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--out": LAST, "-o": LAST}
 
     source: Annotated[Positional[Path], arg(metavar="RIG")]
     """Rig file, or folder where the format is one; also: --rig RIG."""
@@ -159,7 +153,7 @@ class Doctor:
     Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
 
-    spellings: ClassVar[Mapping[str, str]] = RIG | {"--fix": "--out"}
+    spellings: ClassVar[Mapping[str, str]] = {"--fix": "--out"}
 
     rig: RigFile
     image: Images
@@ -193,8 +187,6 @@ class Refine:
     Held-out points decide: no rig is written unless they come nearer to their epipolar lines.
     Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
-
-    spellings: ClassVar[Mapping[str, str]] = RIG
 
     rig: RigFile
     image: Images

@@ -27,10 +27,12 @@ class RenderSummary:
     stopped: int = 0
     refusals: int = 0
     crashes: int = 0
+    started: float = field(default_factory=time.monotonic)
     seconds: float = 0.0
 
-    def add(self, outcome: SceneOutcome) -> None:
-        """Count a scene."""
+    def add(self, outcome: SceneOutcome) -> str:
+        """Count a scene; the figures so far."""
+        self.seconds = time.monotonic() - self.started
         self.made += outcome.state == "done"
         self.there += outcome.state == "there"
         self.stopped += outcome.state == "stopped"
@@ -38,6 +40,7 @@ class RenderSummary:
         self.crashes += outcome.crashes
         if outcome.state == "given up":
             self.given_up.append(outcome.index)
+        return f"{self.rate:.0f} an hour, {self.refusals} refused, {self.crashes} crashed"
 
     @property
     def complete(self) -> bool:
@@ -86,11 +89,12 @@ def render(
             outcomes = local_pool(order, missing, workers)
         else:
             outcomes = dask_pool(order, missing, Workers(workers, scheduler))
-        counted = _Counted(summary, len(missing))
         done = len(wanted) - len(missing)
         console = console or Console(stderr=True)
         try:
-            for _ in followed(outcomes, title="scenes", total=len(wanted), done=done, console=console, status=counted):
+            for _ in followed(
+                outcomes, title="scenes", total=len(wanted), done=done, console=console, status=summary.add
+            ):
                 pass
         finally:
             with suppress(OSError):
@@ -122,17 +126,3 @@ def check_space(folder: JobFolder, scenes: int, scene_bytes: float) -> None:
             f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {folder.root} has "
             f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another --out"
         )
-
-
-class _Counted:
-    """Counts outcomes in a summary; what there is to show after each."""
-
-    def __init__(self, summary: RenderSummary, left: int):
-        self.summary, self.left, self.started = summary, left, time.monotonic()
-
-    def __call__(self, outcome: SceneOutcome) -> str:
-        self.left -= 1
-        self.summary.add(outcome)
-        self.summary.seconds = time.monotonic() - self.started
-        s = self.summary
-        return f"{s.rate:.0f} an hour, {s.refusals} refused, {s.crashes} crashed"

@@ -1,4 +1,4 @@
-"""One worker process and what to do when it fails. Only the standard library: nothing here imports a renderer."""
+"""One worker process and what to do when it fails. Nothing here imports a renderer."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
@@ -23,7 +24,7 @@ State = Literal["done", "there", "given up", "stopped"]
 
 @dataclass(frozen=True, kw_only=True)
 class RetryLimits:
-    """How long to try.
+    """When to give up.
 
     A worker ends after `recycle` scenes, so that nothing it leaks adds up. It has `timeout` seconds for a scene, and
     `start` for its own start. A scene whose self-check refuses it is made from the next seed, `refusals` times; one
@@ -46,7 +47,7 @@ class RetryLimits:
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What workers of a job are told: where to render, how to start them, how long to try.
+    """What workers of a job need: where to render, how they are started, when to give up.
 
     `command` starts a worker that reads scenes as lines of JSON and answers each with a line (see `worker`).
     """
@@ -65,7 +66,7 @@ class Order:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneOutcome:
-    """What became of a scene. "there": it was done before; "stopped": not tried to the end."""
+    """The result of a scene. "there": it was done before; "stopped": not tried to the end."""
 
     index: int
     state: State
@@ -95,13 +96,12 @@ class Workshop:
 
     def close(self) -> None:
         """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-        self._forget()
+        self._end()
+        if self._log is not None:
+            self._log.unlink(missing_ok=True)
 
     def make(self, index: int) -> SceneOutcome:
-        """Make a scene unless it is there. Raises JobError for what would befall every scene."""
+        """Make a scene unless it is there. Raises JobError for what would happen to every scene."""
         folder, limits = self.order.folder, self.order.limits
         started, crashes, kills, refusals, reason = time.monotonic(), 0, 0, 0, ""
         state: State = "there"
@@ -125,7 +125,7 @@ class Workshop:
         )
 
     def _ask(self, index: int, attempt: int) -> dict[str, Any]:
-        """One try. Raises JobError."""
+        """One attempt. Raises JobError."""
         if self.order.folder.free() < RESERVE + 4 * self.order.scene_bytes:
             raise JobError(f"the disk of {self.order.root} is full: free space and run the same command again")
         process = self._started()
@@ -192,7 +192,7 @@ class Workshop:
         return dict(json.loads(line))
 
     def _dead(self) -> dict[str, Any]:
-        """What to say of a process that has ended by itself, or was ended by someone else."""
+        """The answer for a process that has ended by itself, or was ended from outside."""
         assert self._process is not None
         code = self._process.wait()
         self._end()
@@ -203,13 +203,11 @@ class Workshop:
         return {"answer": "crashed", "reason": ": ".join([f"the worker died ({cause})", *last])}
 
     def _retire(self) -> None:
-        """Let the process end in peace."""
+        """Let the process end by itself."""
         assert self._process is not None
-        try:
+        with suppress(subprocess.TimeoutExpired):
             self._process.communicate(timeout=30)
-        except subprocess.TimeoutExpired:
-            self._end()
-        self._process = None
+        self._end()
 
     def _end(self) -> None:
         if self._process is not None:
@@ -222,11 +220,6 @@ class Workshop:
         if self._log is None or not self._log.is_file():
             return ""
         return self._log.read_text(encoding="utf-8", errors="replace")[-20_000:]
-
-    def _forget(self) -> None:
-        self._process = None
-        if self._log is not None:
-            self._log.unlink(missing_ok=True)
 
 
 def worker_command(job: Path) -> tuple[str, ...]:

@@ -6,39 +6,25 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-MOVED = {
+_SAME_NAME = {
+    "evaluation": ("metrics",),
+    "fusion": ("batch", "fuse", "results", "sequence"),
+    "media": ("images", "video"),
+    "networks": ("bandwise", "guided", "weights"),
+    "support": ("jobs", "memory"),
+    "training": ("train",),
+}
+MOVED = {f"pat.{name}": f"pat.{room}.{name}" for room, names in _SAME_NAME.items() for name in names}
+MOVED |= {
     "pat.ablate": "pat.evaluation.ablation",
     "pat.attention.op": "pat.attention.attend",
-    "pat.attention.operator": "pat.attention.torch_op",
-    "pat.bands": "pat.networks.spectral_mix",
-    "pat.bandwise": "pat.networks.bandwise",
-    "pat.batch": "pat.fusion.batch",
-    "pat.blocks": "pat.networks.blocks",
     "pat.classical": "pat.evaluation.baseline",
-    "pat.consensus": "pat.networks.semi_global",
     "pat.data.protocol": "pat.evaluation.protocols",
     "pat.demo": "pat.data.sample_array",
     "pat.develop": "pat.media.raw",
     "pat.evaluate": "pat.evaluation.stereo",
-    "pat.fuse": "pat.fusion.fuse",
-    "pat.guided": "pat.networks.guided",
-    "pat.hdr": "pat.systems.hdr",
-    "pat.images": "pat.media.images",
-    "pat.jobs": "pat.support.jobs",
-    "pat.memory": "pat.support.memory",
-    "pat.metrics": "pat.evaluation.metrics",
     "pat.model": "pat.networks.paper",
     "pat.motion": "pat.fusion.optical_flow",
-    "pat.results": "pat.fusion.results",
-    "pat.sequence": "pat.fusion.sequence",
-    "pat.showcase": "pat.systems.showcase",
-    "pat.synthesis.document": "pat.support.schema",
-    "pat.synthesis.pictures": "pat.synthesis.image_files",
-    "pat.threads": "pat.support.threads",
-    "pat.tiles": "pat.fusion.tiles",
-    "pat.train": "pat.training.train",
-    "pat.video": "pat.media.video",
-    "pat.weights": "pat.networks.weights",
 }
 
 RENAMED = {

@@ -52,13 +52,15 @@ def read_yaml(path: str | Path) -> Any:
         raise ValueError(f"{path}: not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}") from None
 
 
-def near(name: object, known: Iterable[str]) -> str:
+def near(name: object, known: Iterable[object]) -> str:
     """What to say after an unknown name: the nearest known one, or all of them.
 
     >>> near("nois", ["noise", "clip"])
     "; did you mean 'noise'?"
     """
-    return _hint(name, tuple(known))
+    names = [str(k) for k in known]
+    close = difflib.get_close_matches(str(name), names, 1)
+    return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(names)}"
 
 
 def _default(field: dataclasses.Field[Any], value: Any) -> bool:
@@ -73,7 +75,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
         return _read_dataclass(kind, value, entry)
     if origin is typing.Literal:
         if value not in arguments:
-            raise ValueError(f"{entry}: is {value!r}{_hint(value, arguments)}")
+            raise ValueError(f"{entry}: is {value!r}{near(value, arguments)}")
         return value
     if origin is tuple:
         return _read_tuple(arguments, value, entry)
@@ -90,7 +92,7 @@ def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in fields:
-            raise ValueError(f"{_below(entry, key)}: unknown key{_hint(key, tuple(fields))}")
+            raise ValueError(f"{_below(entry, key)}: unknown key{near(key, fields)}")
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in value:
@@ -164,8 +166,3 @@ def _is_number(text: str) -> bool:
 
 def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
-
-
-def _hint(given: object, known: tuple[Any, ...]) -> str:
-    near = difflib.get_close_matches(str(given), [str(k) for k in known], 1)
-    return f"; did you mean '{near[0]}'?" if near else f"; known here: {', '.join(map(str, known))}"
