@@ -1,19 +1,14 @@
-"""What is done to images before fusion, and undone after it."""
+"""What is done to views before they are fused, and undone to the fused frame afterwards.
+
+A step's `do` takes views and returns them changed, with a function that takes the fused frame back.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from arraygeom import ReceptiveField
-from arraygeom.fields.default import default_field
-
-from .results import Frame
-
-Fields = Mapping[str, ReceptiveField | None]
-
 import math
-from collections.abc import Mapping, Sequence
-from typing import Literal
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Float
@@ -38,23 +33,154 @@ from arraygeom import (
     pixel_grid,
     resampled,
 )
+from arraygeom.fields.default import default_field
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between
 
-from ..media.colour import luminance
 from ..media.images import Images
-from ..networks.protocol import FusionNetwork, Look
-from .tiles import (
-    touched,
-)
+from ..media.raw import as_bright
+from ..networks.protocol import FusionNetwork, JoinsBands, box_around, ends_of
+from .results import Frame
+from .views import Fields, Views
+
+Undo = Callable[[Frame], Frame]
 
 
-def together(
-    rig: Rig, names: Sequence[str], fields: Fields, which: Literal["no", "neighbours", "all"]
-) -> list[list[str]]:
-    """The betas in groups that see the same from one place (K, R, t, lens and size), and are looked at alike.
+class Done(NamedTuple):
+    """Views after a step, and how to take the fused frame back to those before it."""
 
-    `which` says whether such are put together only if they follow each other, or all, or none.
+    views: Views
+    undo: Undo
+
+
+class Step(Protocol):
+    """One step."""
+
+    def do(self, views: Views) -> Done:
+        """Change the views."""
+        ...
+
+
+def steps_for(network: FusionNetwork, *, normalise: bool) -> list[Step]:
+    """The steps that a network needs, in order."""
+    resize = [EqualResolution(network)] if network.equal_resolution else []
+    radiometry = [Radiometry()] if normalise else []
+    return [Undistort(), LinearLuminance(), Upright(), *resize, *radiometry, JoinBands(network.joins_bands)]
+
+
+def _as_it_is(frame: Frame) -> Frame:
+    return frame
+
+
+@dataclass(frozen=True)
+class Undistort:
+    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through lenses.
+
+    Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to alpha's
+    own image, and what the pinhole view leaves out has confidence 0.
+    """
+
+    def do(self, views: Views) -> Done:
+        """Resample every image with a lens."""
+        if not any(_has_lens(views.rig[name]) for name in views.images) or any(
+            map(_through_lenses, views.fields.values())
+        ):
+            return Done(views, _as_it_is)
+        rig, images = without_lenses(views.rig, views.images)
+        lens, pinhole = views.rig[views.alpha], rig[views.alpha]
+        fields = {name: _for_pinhole(field, lens, pinhole) for name, field in views.fields.items()}
+        straight, own = images[views.alpha], views.own
+        done = Views(rig, images, views.alpha, fields)
+        return Done(done, lambda frame: _distorted(frame, straight, own, pinhole, lens))
+
+
+@dataclass(frozen=True)
+class LinearLuminance:
+    """The result as bright as alpha's camera saw it, if that measured the luminance of light (`as_bright`)."""
+
+    def do(self, views: Views) -> Done:
+        """Leave the views as they are; undone, one colour beta's frame is made as bright as alpha."""
+        if [views.images[name].shape[0] for name in views.betas] != [3]:
+            return Done(views, _as_it_is)
+        own, sensor = views.own, views.rig[views.alpha].sensor
+        return Done(views, lambda frame: frame._replace(image=as_bright(frame.image, own, sensor)))
+
+
+@dataclass(frozen=True)
+class Upright:
+    """Betas rotated by about a quarter or half a turn against alpha are rotated back."""
+
+    def do(self, views: Views) -> Done:
+        """Rotate images and rig."""
+        for name in views.betas:
+            k = quarter_turns(views.pair(name))
+            if k:
+                rotated = views.images[name].rot90(k, (-2, -1))
+                views = views.replace(rig=views.rig.turn(name, k), **{name: rotated})
+        return Done(views, _as_it_is)
+
+
+@dataclass(frozen=True)
+class EqualResolution:
+    """Betas at about alpha's angular resolution where the views meet, without large parts that alpha cannot see."""
+
+    network: FusionNetwork
+
+    def do(self, views: Views) -> Done:
+        """Crop and resize."""
+        for name in views.betas:
+            views = _resized(self._cropped(views, name), name)
+        return Done(views, _as_it_is)
+
+    def _cropped(self, views: Views, name: str) -> Views:
+        """A calibrated beta without what no search segment reaches, if that is much: it would be enlarged for nothing.
+
+        Not where the field may depend on the images' sizes.
+        """
+        pair, field = views.pair(name), views.fields.get(name)
+        h, w = pair.beta.hw
+        follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
+        if not follows or pair.link is not None or not pair.calibrated or resolution_ratio(pair) > 0.8:
+            return views
+        found = (field or default_field(pair))(pair, coarse_grid(pair.alpha.hw).reshape(-1, 2))
+        top, bottom, left, right = box_around(ends_of(found), (h, w), self.network.beta_halo, self.network.multiple)
+        if (bottom - top) * (right - left) > 0.75 * h * w:
+            return views
+        rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
+        return views.replace(rig=rig, **{name: views.images[name][..., top:bottom, left:right]})
+
+
+@dataclass(frozen=True)
+class Radiometry:
+    """Each beta with alpha's mean and standard deviation: for cameras of other exposures or filters."""
+
+    def do(self, views: Views) -> Done:
+        """Normalise the betas."""
+        return Done(views.replace(**{n: normalised(views.images[n], views.own) for n in views.betas}), _as_it_is)
+
+
+@dataclass(frozen=True)
+class JoinBands:
+    """Betas that differ at most in their sensors as one of several bands; undone, bands are in the rig's order."""
+
+    which: JoinsBands
+
+    def do(self, views: Views) -> Done:
+        """Concatenate the bands of co-located betas under the first one's name."""
+        names = views.betas
+        groups = co_located(views.rig, names, views.fields, self.which)
+        if len(groups) == len(names):
+            return Done(views, _as_it_is)
+        order = _band_order(names, groups, {name: views.images[name].shape[0] for name in names})
+        joined = {group[0]: torch.cat([views.images[name] for name in group]) for group in groups}
+        done = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
+        return Done(done, lambda frame: frame._replace(image=frame.image[order]))
+
+
+def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands) -> list[list[str]]:
+    """The betas in groups with the same K, R, t, lens and size, and the same field.
+
+    `which` says whether such are joined only if they follow each other, or all, or none.
     """
     groups: list[list[str]] = []
     for name in names:
@@ -105,13 +231,13 @@ def _has_lens(view: View) -> bool:
     return isinstance(view, LensView) and view.distortion is not None
 
 
-def _follows_lenses(field: ReceptiveField | None) -> bool:
+def _through_lenses(field: ReceptiveField | None) -> bool:
     while isinstance(field, Widened | Moved):
         field = field.field
     return isinstance(field, Curved | ThroughLenses)
 
 
-def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
+def _for_pinhole(field: ReceptiveField | None, lens: View, pinhole: View) -> ReceptiveField | None:
     """The field for the pinhole view of alpha: displacements are between pixels of that, too."""
     if not (isinstance(field, Moved) and isinstance(lens, LensView) and isinstance(pinhole, LensView)):
         return field
@@ -125,15 +251,15 @@ def _straightened(field: ReceptiveField | None, lens: View, pinhole: View) -> Re
     return Moved(field.field, step.movedim(-1, 0).to(field.displacement))
 
 
-def _bent(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:
+def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens: View) -> Frame:
     """The frame at the pixels of alpha's own image."""
     if not (isinstance(pinhole, LensView) and isinstance(lens, LensView) and lens.distortion is not None):
         return frame
-    added = frame.image - _grey(straight)
+    added = frame.image - straight
     inverse = (1 / frame.depth).nan_to_num(0.0)
     back = resampled(torch.cat([added, frame.confidence[None]]), pinhole, lens, interpolation="bilinear").values[0]
     depth = 1 / resampled(inverse[None], pinhole, lens, interpolation="nearest").values[0, 0]
-    return Frame(_grey(own) + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
+    return Frame(own + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
 
 
 def normalised(image: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
@@ -141,40 +267,17 @@ def normalised(image: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) 
     return (image - image.mean()) / image.std().clamp(min=1e-6) * like.std() + like.mean()
 
 
-def _grey(image: Tensor) -> Tensor:
-    return luminance(image) if image.shape[0] == 3 else image
-
-
-def _common_part(
-    pair: Pair, image: Tensor, field: ReceptiveField | None, network: FusionNetwork
-) -> tuple[Pair, Tensor]:
-    """A calibrated beta without what alpha never looks at, if that is much: it would be enlarged for nothing.
-
-    Not where the field may go by the images' sizes.
-    """
-    h, w = pair.beta.hw
-    follows = field is None or isinstance(field, (Epipolar, EpipolarLine))
-    if not follows or pair.link is not None or not pair.calibrated or pitch_ratio(pair) > 0.8:
-        return pair, image
-    found = Look.along(field or default_field(pair), pair).at(coarse_grid(pair.alpha.hw).reshape(-1, 2))
-    top, bottom, left, right = touched(found, (h, w), network)
-    if (bottom - top) * (right - left) > 0.75 * h * w:
-        return pair, image
-    part = pair.transform_beta(shift_matrix(left, top), (bottom - top, right - left))
-    return part, image[..., top:bottom, left:right]
-
-
-def _at_equal_pitch(pair: Pair, image: Tensor) -> tuple[Pair, Tensor]:
-    """Beta resized so that where the views meet its pixels are about the size of alpha's."""
-    scale = pitch_ratio(pair)
+def _resized(views: Views, name: str) -> Views:
+    """Beta resized so that its pixels are about the size of alpha's where the views meet."""
+    scale, (h, w) = resolution_ratio(views.pair(name)), views.rig[name].hw
     if 0.8 < scale < 1.25:
-        return pair, image
-    hw = (max(round(pair.beta.hw[0] / scale), 16), max(round(pair.beta.hw[1] / scale), 16))
-    image = interpolate(image, size=hw, mode="bicubic", align_corners=False, antialias=True).clamp(0, 1)
-    return pair.resize_beta(hw), image
+        return views
+    hw = (max(round(h / scale), 16), max(round(w / scale), 16))
+    image = interpolate(views.images[name][None], size=hw, mode="bicubic", align_corners=False, antialias=True)
+    return views.replace(rig=views.rig.resize(name, hw), **{name: image[0].clamp(0, 1)})
 
 
-def pitch_ratio(pair: Pair) -> float:
+def resolution_ratio(pair: Pair) -> float:
     """Pixels of beta to a pixel of alpha, by the pair's rough homography at the middle of alpha; 1 if undefined."""
     steps = _steps_in_beta(pair)
     area = 0.0 if steps is None else abs(float(torch.linalg.det(steps)))
@@ -182,7 +285,7 @@ def pitch_ratio(pair: Pair) -> float:
 
 
 def quarter_turns(pair: Pair) -> int:
-    """How often beta's image must be turned (see `Camera.turn`) to be upright as alpha's is, 0 to 3."""
+    """How many quarter turns (see `Camera.rot90`) make beta's image upright as alpha's is, 0 to 3."""
     steps = _steps_in_beta(pair)
     if steps is None:
         return 0

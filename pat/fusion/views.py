@@ -1,21 +1,96 @@
-"""Images of a rig's cameras, read and developed once."""
+"""The images of a rig's cameras, each read and developed once, with the rig that describes them."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Rig
+from arraygeom import Pair, ReceptiveField, Rig, Sensor
 
-from ..media.images import check_size, read_image
+from ..media.colour import luminance_of as grey
+from ..media.images import Images, check_size, read_image
 from ..media.raw import develop, developed_rig
 
+Fields = Mapping[str, ReceptiveField | None]
+"""The field of each beta; None, or a beta that is missing, stands for the default."""
 
-class Views(NamedTuple):
-    """Images ready to fuse, and the rig that says so of them."""
+
+@dataclass(frozen=True)
+class Views:
+    """What is fused: images (C, H, W) by camera, the rig that describes them, the camera alpha, the betas' fields."""
+
+    rig: Rig
+    images: Mapping[str, Tensor]
+    alpha: str
+    fields: Fields = dataclasses.field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls,
+        rig: Rig,
+        images: Images,
+        *,
+        alpha: str,
+        depth: tuple[float, float] | None = None,
+        field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
+    ) -> Views:
+        """Check names and images; each is asked for once, and alpha made grey.
+
+        Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of another size
+        than the rig says, or with values that are not finite.
+        """
+        for name in (alpha, *images):
+            rig.require(name)
+        if alpha not in images:
+            raise ValueError(f"no image of alpha, '{alpha}'")
+        names = [name for name in rig.betas(alpha) if name in images]
+        if not names:
+            raise ValueError(f"no image of any other camera than alpha, '{alpha}': fusion needs at least one beta")
+        checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
+        fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
+        rig = rig if depth is None else rig.replace(depth=depth)
+        return cls(rig, {**checked, alpha: grey(checked[alpha])}, alpha, fields)
+
+    @property
+    def own(self) -> Float[Tensor, "1 h w"]:
+        """Alpha's image."""
+        return self.images[self.alpha]
+
+    @property
+    def betas(self) -> list[str]:
+        """The betas that have images, in the rig's order."""
+        return [name for name in self.rig.betas(self.alpha) if name in self.images]
+
+    def pair(self, beta: str) -> Pair:
+        """Alpha and a beta."""
+        return self.rig.pair(self.alpha, beta)
+
+    def replace(self, *, rig: Rig | None = None, **images: Tensor) -> Views:
+        """The same with another rig and other images of some cameras."""
+        return dataclasses.replace(self, rig=rig or self.rig, images={**self.images, **images})
+
+
+def _checked(rig: Rig, images: Images, name: str) -> Tensor:
+    image, (h, w) = images[name], rig[name].hw
+    if tuple(image.shape[1:]) != (h, w):
+        got = f"{image.shape[2]}x{image.shape[1]}"
+        raise ValueError(
+            f"the image of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right image"
+        )
+    if not torch.isfinite(image).all():
+        raise ValueError(f"the image of '{name}' has NaN or infinite values")
+    return image
+
+
+class DevelopedImages(NamedTuple):
+    """Images ready to fuse, and the rig that describes them."""
 
     rig: Rig
     images: dict[str, Tensor]
@@ -36,25 +111,33 @@ class ViewFiles(Mapping[str, Tensor]):
     def __len__(self) -> int:
         return len(self.files)
 
+    def __contains__(self, name: object) -> bool:
+        return name in self.files
+
     def __getitem__(self, name: str) -> Tensor:
-        path, view = self.files[name], self.rig[name]
-        image = read_image(path, name=name, bits=view.sensor.bits)
-        check_size(image, view.hw, f"{name}: {path}")
-        if view.sensor.bayer and image.shape[0] != 1:
-            raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
-        return develop(image, view.sensor, like=self.like)
+        return read_view(self.rig, name, self.files[name], like=self.like)
 
     @property
     def developed(self) -> Rig:
-        """The rig that says of the images what they are now."""
+        """The rig that describes the images as they are now."""
         return developed_rig(self.rig, self.files)
 
 
-def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> Views:
-    """Read one image of each camera and develop it.
+def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[Tensor, "c h w"]:
+    """Read and develop the image of one camera, on the scale of light of the sensor `like`.
 
     Raises ValueError or FileNotFoundError naming the camera and the file for what cannot be read, has another size
     than the rig says, or is in colour where the rig says raw.
     """
+    view = rig[name]
+    image = read_image(path, name=name, bits=view.sensor.bits)
+    check_size(image, view.hw, f"{name}: {path}")
+    if view.sensor.bayer and image.shape[0] != 1:
+        raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
+    return develop(image, view.sensor, like=like)
+
+
+def read_views(rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> DevelopedImages:
+    """Read one image of each camera and develop it; raises as `read_view` does."""
     views = ViewFiles(rig, files, alpha=alpha)
-    return Views(views.developed, dict(views))
+    return DevelopedImages(views.developed, dict(views))

@@ -34,9 +34,9 @@ def from_luma_chroma(luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 
     return torch.cat([red, green, blue], -3) + luma
 
 
-def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "1 h w"]:
-    """The image itself if it is grey, else its luminance."""
-    return image if image.shape[0] == 1 else luminance(image)
+def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
+    """The luminance of an RGB image; any other image itself."""
+    return luminance(image) if image.shape[0] == 3 else image
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:

@@ -7,18 +7,14 @@ finishes each with the same weights. Permuting bands or betas permutes the outpu
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Literal
+from dataclasses import asdict, dataclass
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
 
-from arraygeom import Segments
-
-from .guided import Encoded, GuidedPAT, GuidedPATConfig, Seen, fused_from, hw_of, segments_of
-from .protocol import FusionOutput, Look, Looks
+from .guided import BetaEstimate, Encoded, GuidedPAT, GuidedPATConfig, output_of
+from .pieces import Prepared, prepared
+from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import FINE, Normalisations, SemiGlobalMatches, semi_global_matching
 from .spectral_mix import SpectralMix, coarse_mix, semi_global_matching_of_bands
 
@@ -42,8 +38,8 @@ class BandwisePAT(nn.Module):
     """A mono alpha and any number of betas of any number of bands; the image has all bands, in order."""
 
     multiple = GuidedPAT.multiple
-    equal_pitch = GuidedPAT.equal_pitch
-    joins_bands: Literal["no", "neighbours", "all"] = "all"
+    equal_resolution = GuidedPAT.equal_resolution
+    joins_bands: JoinsBands = "all"
     halo = GuidedPAT.halo
     beta_halo = GuidedPAT.beta_halo
     bytes_per_pixel = GuidedPAT.bytes_per_pixel
@@ -55,66 +51,56 @@ class BandwisePAT(nn.Module):
         if config.head_dim and self.single.head.last.bias is not None:
             nn.init.zeros_(self.single.head.last.bias)
 
-    def normalisation(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
-        """The look with how the bands of the whole images are combined, levelled and made equally sharp."""
+    def prepare(self, inputs: Inputs) -> Prepared:
+        """For each beta how its bands are combined and normalised, and by that its semi-global matches."""
+        return prepared(inputs, self._combination, _matches)
+
+    def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
+        """The combination of the one beta's bands that is most like alpha, and how that is normalised."""
+        alpha, (beta,) = inputs.alpha, inputs.betas
         factor = 2
         while factor < self.multiple // 2 and alpha.shape[-2] * alpha.shape[-1] > COARSELY * factor**2:
             factor *= 2
-        mix = coarse_mix(alpha, beta, *_segments(alpha, look, factor), factor)
-        return replace(look, mix=mix, normalisations=Normalisations.of(alpha, mix.of(beta)))
+        segments, blocks = (beta.field.of_blocks(side) for side in (factor, FINE * factor))
+        mix = coarse_mix(alpha, beta.image, segments, blocks, factor)
+        return mix, Normalisations.of(alpha, mix.of(beta.image))
 
-    def _told(self, alpha: Tensor, beta: Tensor, look: Look) -> tuple[SpectralMix, Normalisations]:
-        """What `balance` says, of these images if not known of the whole ones."""
-        if look.mix is None or look.normalisations is None:
-            look = self.normalisation(alpha, beta, look)
-        assert look.mix is not None
-        assert look.normalisations is not None
-        return look.mix, look.normalisations
+    def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
+        """Fuse alpha with each band of each beta. Position, deviation and confidence are one for each beta."""
+        return self.explain(inputs, state)[0]
 
-    def survey(
-        self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look
-    ) -> SemiGlobalMatches:
-        """What can be known before attention looks, once for all bands of a beta."""
-        mix, normalisations = self._told(alpha, beta, look)
-        whole, blocks = _segments(alpha, look, 1)
-        if beta.shape[1] == 1:
-            return semi_global_matching(alpha, beta, beta, whole, blocks, normalisations)
-        return semi_global_matching_of_bands(alpha, beta, whole, blocks, mix, normalisations)
+    def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
+        """The same, with the estimate of each beta, which training supervises."""
+        state = state or self.prepare(inputs)
+        own = self.single.encoder(inputs.alpha)
+        parts = [
+            self._of_beta(own, inputs.alpha, beta, found, mix)
+            for beta, found, (mix, _) in zip(inputs.betas, state.matches, state.common)
+        ]
+        estimates = [estimate for _, estimate in parts]
+        return output_of(torch.cat([image for image, _ in parts], 1), estimates), estimates
 
-    def forward(
-        self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> FusionOutput:
-        """Fuse alpha with each band of each beta. Position, spread and confidence are one for each beta."""
-        return self.explain(alpha, betas, looks)[0]
-
-    def explain(
-        self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> tuple[FusionOutput, list[Seen]]:
-        """The same, with what each beta told, which training supervises."""
-        own = self.single.encoder(alpha)
-        parts = [self._of_beta(own, alpha, beta, look) for beta, look in zip(betas, looks)]
-        seen = [told for _, told in parts]
-        return fused_from(torch.cat([image for image, _ in parts], 1), seen), seen
-
-    def _of_beta(self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look) -> tuple[Tensor, Seen]:
+    def _of_beta(
+        self, own: Encoded, alpha: Tensor, beta: Beta, found: SemiGlobalMatches, mix: SpectralMix
+    ) -> tuple[Tensor, BetaEstimate]:
         """One beta's bands at alpha's view.
 
-        What the network makes of each is counted from its local regression on alpha: where a band is unlike alpha,
+        The network's result for each is counted from its local regression on alpha: where a band is unlike alpha,
         its difference from alpha is not alike in places that look alike.
         """
-        mix, normalisations = self._told(alpha, beta, look)
-        look = replace(look, mix=mix, normalisations=normalisations)
-        known = look.known if look.known is not None else self.survey(alpha, beta, look)
-        seen = self.single.seen(own, alpha, beta, replace(look, known=known), guide=mix.of)
-        base = known.colour[:, 0]
+        estimate = self.single.estimate(own, alpha, beta, found, guide=mix.of)
+        base = found.colour[:, 0]
         bands = [
-            regressed + self.single.blended(own, regressed, [seen.beyond(base, i)])
+            regressed + self.single.blended(own, regressed, [estimate.beyond(base, i)])
             for i, regressed in enumerate((alpha + base).split(1, 1))
         ]
-        return mix.reconciled(torch.cat(bands, 1), alpha), seen
+        return mix.reconciled(torch.cat(bands, 1), alpha), estimate
 
 
-def _segments(alpha: Tensor, look: Look, side: int) -> tuple[Segments, Segments]:
-    """Those of alpha's blocks of `side` pixels, and of blocks `FINE` times as large."""
-    hw, like = hw_of(alpha), alpha.double()
-    return segments_of(look, hw, side, like), segments_of(look, hw, FINE * side, like)
+def _matches(inputs: Inputs, combined: tuple[SpectralMix, Normalisations]) -> SemiGlobalMatches:
+    """The matches of the one beta, once for all its bands."""
+    alpha, (beta,), (mix, normalisations) = inputs.alpha, inputs.betas, combined
+    segments, blocks = beta.field.straight, beta.field.of_blocks(FINE)
+    if beta.image.shape[1] == 1:
+        return semi_global_matching(alpha, beta.image, beta.image, segments, blocks, normalisations)
+    return semi_global_matching_of_bands(alpha, beta.image, segments, blocks, mix, normalisations)

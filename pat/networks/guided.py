@@ -9,20 +9,21 @@ that are certain to those that are not, and adds it to alpha.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pixel_shuffle, pixel_unshuffle
 
-from arraygeom import Local, Pair, Segments, View, lazily, pixel_grid
+from arraygeom import Local, Pair, Segments, View, lazily
 
 from ..attention import Attended, attend, attend_with_statistics
 from ..media.colour import luminance
 from .blocks import ResidualBlock, conv, enlarge
-from .protocol import FusionOutput, Look, Looks
+from .pieces import Prepared, prepared
+from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import FILLS, FINE, Normalisations, SemiGlobalMatches, along, matches, semi_global_matching
 
 COARSE = 4
@@ -56,7 +57,7 @@ class GuidedPATConfig:
     keep_luminance: bool = True
 
 
-class Seen(NamedTuple):
+class BetaEstimate(NamedTuple):
     """What one beta tells of alpha's view.
 
     colour: (B, C, H, W), its bands minus alpha, where attention and the consensus found them, mixed.
@@ -71,7 +72,7 @@ class Seen(NamedTuple):
     logit: Tensor
     choice: Tensor
 
-    def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> Seen:
+    def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
         of = slice(band, band + 1)
         return self._replace(colour=(self.colour - base)[:, of], spread=(self.spread - base[:, None])[:, :, of])
@@ -92,8 +93,8 @@ class GuidedPAT(nn.Module):
     """
 
     multiple = 16
-    equal_pitch = True
-    joins_bands: Literal["no", "neighbours", "all"] = "neighbours"
+    equal_resolution = True
+    joins_bands: JoinsBands = "neighbours"
     halo = 640
     """Encoder 85, judge 176, trust 8, carrying 148, propagation 180 and head 16: the sum, rounded up."""
     beta_halo = 96
@@ -112,41 +113,33 @@ class GuidedPAT(nn.Module):
             self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
-    def normalisation(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look) -> Look:
-        """The look with how the whole images are levelled and made equally sharp, for surveys of pieces of them."""
-        return replace(look, normalisations=Normalisations.of(alpha, _guide(beta)))
+    def prepare(self, inputs: Inputs) -> Prepared:
+        """Semi-global matches of each beta, and how its whole image is normalised."""
+        return prepared(inputs, _normalisations, _matches)
 
-    def survey(
-        self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b _ hb wb"], look: Look
-    ) -> SemiGlobalMatches:
-        """What can be known before attention looks, of whole images; for pieces of them it is cut, not redone."""
-        whole, blocks = (segments_of(look, hw_of(alpha), step, alpha.double()) for step in (1, FINE))
-        return semi_global_matching(alpha, _guide(beta), beta, whole, blocks, look.normalisations)
-
-    def forward(
-        self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> FusionOutput:
+    def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
 
         Raises ValueError if those do not add up to the configured number.
         """
-        return self.explain(alpha, betas, looks)[0]
+        return self.explain(inputs, state)[0]
 
-    def explain(
-        self, alpha: Float[Tensor, "b 1 h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> tuple[FusionOutput, list[Seen]]:
-        """The same, with what each beta told, which training supervises."""
-        bands = sum(b.shape[1] for b in betas)
+    def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
+        """The same, with the estimate of each beta, which training supervises."""
+        bands = sum(beta.image.shape[1] for beta in inputs.betas)
         if bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
+        alpha, state = inputs.alpha, state or self.prepare(inputs)
         own = self.encoder(alpha)
-        seen = [self.seen(own, alpha, beta, look) for beta, look in zip(betas, looks)]
-        residual = self.blended(own, alpha, seen)
+        estimates = [self.estimate(own, alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
+        residual = self.blended(own, alpha, estimates)
         if self.config.keep_luminance:
             residual = residual - luminance(residual)
-        return fused_from(alpha + residual, seen), seen
+        return output_of(alpha + residual, estimates), estimates
 
-    def blended(self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], seen: Sequence[Seen]) -> Float[Tensor, "b c h w"]:
+    def blended(
+        self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], seen: Sequence[BetaEstimate]
+    ) -> Float[Tensor, "b c h w"]:
         """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
         certain = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in seen], 1)
         colour = torch.cat([s.colour for s in seen], 1)
@@ -158,7 +151,7 @@ class GuidedPAT(nn.Module):
         context = self.propagate(torch.cat([own.quarter, rough], 1))
         return blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
 
-    def _unseen(self, own: Encoded, seen: Seen) -> Tensor:
+    def _unseen(self, own: Encoded, seen: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: carried at 1/4 of the size from certain pixels to others
         that look alike in alpha, or as the consensus spread it."""
         certain = seen.logit.sigmoid()
@@ -169,24 +162,29 @@ class GuidedPAT(nn.Module):
         choices = torch.cat([enlarge(colour, COARSE)[:, None], seen.spread], 1)
         return (seen.choice.softmax(1)[:, :, None] * choices).sum(1)
 
-    def seen(
-        self, own: Encoded, alpha: Tensor, beta: Tensor, look: Look, *, guide: Callable[[Tensor], Tensor] | None = None
-    ) -> Seen:
-        """What one beta of any bands tells; `guide` is what of these is compared with alpha."""
-        of = guide or _guide
-        other = self.encoder(of(beta))
-        segments = segments_of(look, hw_of(alpha), 1, self._exact(alpha))
-        known = look.known if look.known is not None else self.survey(alpha, beta, look)
-        window = window_around(known.disparity, segments, self.config.window)
+    def estimate(
+        self,
+        own: Encoded,
+        alpha: Tensor,
+        beta: Beta,
+        found: SemiGlobalMatches,
+        *,
+        guide: Callable[[Tensor], Tensor] | None = None,
+    ) -> BetaEstimate:
+        """The estimate of one beta of any bands; `guide` is what of these is compared with alpha."""
+        of = guide or brightness
+        other = self.encoder(of(beta.image))
+        segments = _in_type(beta.field.straight, self._exact(alpha))
+        window = window_around(found.disparity, segments, self.config.window)
         query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
-        found = attend_with_statistics(query, key, self._exact(beta), window, samples=self.config.taps)
-        value = found.value.to(alpha)
-        facts = torch.cat([of(value) - alpha, found.peak[:, None].to(alpha), found.spread[:, None].to(alpha)], 1)
-        judged = self._judged(own, known, facts, segments.valid[:, None])
+        attended = attend_with_statistics(query, key, self._exact(beta.image), window, samples=self.config.taps)
+        value = attended.value.to(alpha)
+        facts = [of(value) - alpha, attended.peak[:, None].to(alpha), attended.spread[:, None].to(alpha)]
+        judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
-        logit = torch.where(found.peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, known.matched, exact.sigmoid())
-        return Seen(found, colour, known.colour, logit, choice)
+        logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
+        colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
+        return BetaEstimate(attended, colour, found.colour, logit, choice)
 
     def _judged(self, own: Encoded, known: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the consensus's match."""
@@ -201,7 +199,7 @@ class GuidedPAT(nn.Module):
         return x if self.training else x.double()
 
 
-def fused_from(image: Float[Tensor, "b c h w"], seen: Sequence[Seen]) -> FusionOutput:
+def output_of(image: Float[Tensor, "b c h w"], seen: Sequence[BetaEstimate]) -> FusionOutput:
     """The image with where each beta was looked at, and with what confidence."""
     return FusionOutput(
         image,
@@ -211,7 +209,7 @@ def fused_from(image: Float[Tensor, "b c h w"], seen: Sequence[Seen]) -> FusionO
     )
 
 
-def _guide(beta: Tensor) -> Tensor:
+def brightness(beta: Tensor) -> Tensor:
     """What alpha is compared with."""
     return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
 
@@ -264,15 +262,23 @@ def window_around(disparity: Float[Tensor, "b 1 h w"], segments: Segments, windo
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
-def segments_of(look: Look, hw: tuple[int, int], step: int, like: Tensor) -> Segments:
-    """The segments of every `step`-th block of alpha pixels, at its centre: (B or 1, h / step, w / step)."""
-    grid = (hw[0] // step, hw[1] // step)
-    x = (pixel_grid(grid, dtype=like.dtype, device=like.device) + 0.5) * step - 0.5
-    found = look.at(x.reshape(-1, 2))
-    if not isinstance(found, Segments):
-        raise ValueError("GuidedPAT looks along straight segments: choose a straight field, or undistort the images")
-    start, end = (v.reshape(-1, *grid, 2) for v in (found.start, found.end))
-    return Segments(start, end, found.valid.reshape(-1, *grid))
+def _in_type(segments: Segments, like: Tensor) -> Segments:
+    """Segments in the type of a tensor."""
+    return Segments(segments.start.to(like), segments.end.to(like), segments.valid)
+
+
+def _normalisations(inputs: Inputs) -> Normalisations:
+    """How the one beta's brightness is brought to alpha's, of whole images."""
+    return Normalisations.of(inputs.alpha, brightness(inputs.betas[0].image))
+
+
+def _matches(inputs: Inputs, normalisations: Normalisations) -> SemiGlobalMatches:
+    """The matches of the one beta."""
+    (beta,) = inputs.betas
+    blocks = beta.field.of_blocks(FINE)
+    return semi_global_matching(
+        inputs.alpha, brightness(beta.image), beta.image, beta.field.straight, blocks, normalisations
+    )
 
 
 class Encoder(nn.Module):

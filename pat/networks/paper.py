@@ -11,12 +11,14 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
 from torch import Tensor, nn
+
+from arraygeom import Segments
+from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention import Attended, attend_with_statistics
 from .blocks import ResidualASPP, ResidualBlock
-from .protocol import FusionOutput, Look, Looks
+from .protocol import FusionOutput, Inputs, JoinsBands
 
 
 @dataclass(frozen=True)
@@ -48,8 +50,8 @@ class PAT(nn.Module):
     """Features reach 59 pixels and post-fusion 10; the sum, rounded up."""
     beta_halo = 64
     multiple = 1
-    equal_pitch = False
-    joins_bands: Literal["no", "neighbours", "all"] = "no"
+    equal_resolution = False
+    joins_bands: JoinsBands = "no"
     bytes_per_pixel = 1600.0
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
@@ -60,29 +62,23 @@ class PAT(nn.Module):
         self.engine = AttentionEngine(c.betas, d, c.interpolation)
         self.post = PostFusion((c.betas + 1) * d, d, c.out_channels, c.scale)
 
-    def forward(
-        self, alpha: Float[Tensor, "b c h w"], betas: Sequence[Float[Tensor, "b _ _ _"]], looks: Looks
-    ) -> FusionOutput:
+    def forward(self, inputs: Inputs, state: None = None) -> FusionOutput:
         """Fuse alpha with the betas, in the order the network was made for.
 
         Raises ValueError for another number of betas than configured, or channels that do not fit.
         """
-        if len(betas) != self.config.betas or len(looks) != len(betas):
-            raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(betas)} and {len(looks)} looks")
-        own = self.features(self._channels(alpha))
-        others = [self.features(self._channels(beta)) for beta in betas]
-        attended = self.engine(own, others, looks)
+        if len(inputs.betas) != self.config.betas:
+            raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}")
+        own = self.features(self._channels(inputs.alpha))
+        others = [self.features(self._channels(beta.image)) for beta in inputs.betas]
+        attended = self.engine(own, others, [beta.field for beta in inputs.betas])
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
-            image = image + self._enlarged(alpha)
+            image = image + self._enlarged(inputs.alpha)
         return FusionOutput(image, *(list(part) for part in list(zip(*attended))[1:]))
 
-    def normalisation(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
-        """The same look: nothing need be known."""
-        return look
-
-    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> None:
-        """Nothing: each piece of a frame is fused by itself."""
+    def prepare(self, inputs: Inputs) -> None:
+        """Nothing: each part of a frame is fused by itself."""
 
     def _channels(self, image: Tensor) -> Tensor:
         wanted = self.config.in_channels
@@ -123,15 +119,25 @@ class AttentionEngine(nn.Module):
         self.key = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
         self.value = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
 
-    def forward(self, own: Tensor, others: Sequence[Tensor], looks: Looks) -> list[Attended]:
+    def forward(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Attended]:
         """For each beta, its values seen from alpha, and where they were."""
         query = self.query(self.before(own))
         return [
             attend_with_statistics(
-                query, key(self.before(f)), value(f), look.at, samples=look.samples, interpolation=self.interpolation
+                query,
+                key(self.before(f)),
+                value(f),
+                field.at if field.pixels is None else _segments(field.pixels, query),
+                samples=field.samples,
+                interpolation=self.interpolation,
             )
-            for f, key, value, look in zip(others, self.key, self.value, looks)
+            for f, key, value, field in zip(others, self.key, self.value, fields)
         ]
+
+
+def _segments(segments: Segments, like: Tensor) -> Segments:
+    """Segments in the type of features."""
+    return Segments(segments.start.to(like), segments.end.to(like), segments.valid)
 
 
 class PostFusion(nn.Sequential):

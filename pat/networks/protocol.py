@@ -1,65 +1,133 @@
-"""The protocol between the fusion and its networks."""
+"""What the fusion hands to a network, and what it gets back."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Literal, NamedTuple, Protocol, runtime_checkable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Pair, Positions, ReceptiveField, Segments, lazily, pixel_grid
-
-from .semi_global import Normalisations, SemiGlobalMatches
-from .spectral_mix import SpectralMix
+from arraygeom import Positions, Segments
+from arraygeom.fields.grid import Box, FieldOnGrid
+from arraygeom.pixels import HW
 
 
 @dataclass(frozen=True)
-class Look:
-    """Where to look in one beta: `at` maps alpha pixels (n, 2) to segments or positions in beta's pixels.
+class Beta:
+    """One beta's image (B, C, H, W), the field of alpha's pixels in it, and where its first pixel is in the whole image.
 
-    `at` may answer for one rig (n) or for a batch of rigs (B, n). Segments are looked at in `samples` places.
-    `known` is what a survey of the whole images has found, for networks that make one, and `balances` and `mix` what
-    the survey of a piece is to know of the whole.
+    `offset` is (x, y), other than (0, 0) for a part of an image.
     """
 
-    at: Callable[[Tensor], Segments | Positions]
-    samples: int
-    known: SemiGlobalMatches | None = None
-    normalisations: Normalisations | None = None
-    mix: SpectralMix | None = None
-
-    @classmethod
-    def along(cls, field: ReceptiveField, pair: Pair) -> Look:
-        """The field of a pair, with about one sample for each pixel of beta on the longest segment."""
-        device = pair.cameras[0].K.device if pair.calibrated else None
-        sparse = pixel_grid(pair.alpha.hw, device=device)[::4, ::4].reshape(-1, 2)
-        at = lazily(field, pair)
-        found = at(sparse)
-        if isinstance(found, Positions):
-            return cls(at, found.xy.shape[-2])
-        longest = torch.where(found.valid, found.length.detach(), 0.0).max()
-        return cls(at, math.ceil(float(longest)) + 1)
+    image: Float[Tensor, "b c h w"]
+    field: FieldOnGrid
+    offset: tuple[int, int] = (0, 0)
 
 
-Looks = Sequence[Look]
+@dataclass(frozen=True)
+class Inputs:
+    """Alpha's image (B, C, H, W) and the betas, which may be of any sizes.
+
+    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments.
+    """
+
+    alpha: Float[Tensor, "b c h w"]
+    betas: tuple[Beta, ...]
+    multiple: int = 1
+    beta_halo: int = 0
+
+    @property
+    def hw(self) -> HW:
+        """Height and width of alpha's image."""
+        return self.alpha.shape[-2], self.alpha.shape[-1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of images and fields."""
+        return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
+
+    def of_beta(self, i: int) -> Inputs:
+        """The same with one beta alone."""
+        return replace(self, betas=self.betas[i : i + 1])
+
+    def cut(self, box: Box) -> Inputs:
+        """A part of alpha, (top, bottom, left, right), with the part of each beta that its segments touch."""
+        top, bottom, left, right = box
+        return replace(
+            self, alpha=self.alpha[..., top:bottom, left:right], betas=tuple(self._cut(b, box) for b in self.betas)
+        )
+
+    def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
+        """The part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with the halo."""
+        hw = beta.image.shape[-2], beta.image.shape[-1]
+        return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
+
+    def _cut(self, beta: Beta, box: Box) -> Beta:
+        y0, y1, x0, x1 = self.touched(beta, box)
+        offset = (beta.offset[0] + x0, beta.offset[1] + y0)
+        return Beta(beta.image[..., y0:y1, x0:x1], beta.field.cut(box, (x0, y0)), offset)
+
+
+def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
+    """The ends of valid segments, or the positions that count."""
+    if isinstance(found, Positions):
+        return found.xy[found.mask]
+    return torch.cat([found.start[found.valid], found.end[found.valid]])
+
+
+def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
+    """The part of an image around points (x, y), with a halo, its corners at whole multiples or the image's end."""
+    if not len(points):
+        return 0, multiple, 0, multiple
+    low, high = points.amin(0) - halo, points.amax(0) + halo
+    (x0, y0), (x1, y1) = (
+        torch.div(v, multiple, rounding_mode="floor").long() * multiple for v in (low, high + multiple)
+    )
+    return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
+
+
+def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
+    """The ends of the segments, or the positions, of every `step`-th pixel of a box."""
+    top, bottom, left, right = box
+    rows, columns = torch.arange(top, bottom, step), torch.arange(left, right, step)
+    if field.pixels is None:
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        return ends_of(field.at(torch.stack([x, y], -1).reshape(-1, 2).float()))
+    some = (slice(None), rows[:, None], columns)
+    return ends_of(Segments(field.pixels.start[some], field.pixels.end[some], field.pixels.valid[some]))
+
+
+class State(Protocol):
+    """What a network has found out about whole images before parts of them are fused; opaque to the fusion."""
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        ...
+
+    def cut(self, box: Box) -> State:
+        """What belongs to a part of alpha."""
+        ...
 
 
 class FusionOutput(NamedTuple):
-    """What a fusion network says of alpha's view.
+    """A network's result at alpha's view.
 
     image: (B, C, s H, s W), the fused image.
     position: one (B, 2, H, W) for each beta, where its pixels were found, in beta's pixels.
-    spread: one (B, H, W) for each beta, the uncertainty of that, in beta's pixels.
-    confidence: one (B, H, W) for each beta, 0 to 1: whether beta sees the point, and where is known.
+    deviation: one (B, H, W) for each beta, the standard deviation of that position, in beta's pixels.
+    confidence: one (B, H, W) for each beta, 0 to 1: whether beta sees the point and its position is certain.
     """
 
     image: Tensor
     position: list[Tensor]
-    spread: list[Tensor]
+    deviation: list[Tensor]
     confidence: list[Tensor]
+
+
+JoinsBands = Literal["no", "neighbours", "all"]
 
 
 @runtime_checkable
@@ -67,28 +135,23 @@ class FusionNetwork(Protocol):
     """What `fuse` asks of a network."""
 
     halo: int
-    """How far around a pixel alpha's image, and where it looks, can matter, pixels."""
+    """How far around a pixel alpha's image, and the fields of its pixels, can matter, pixels."""
     beta_halo: int
-    """How far around where it is looked at beta's image can matter, pixels."""
+    """How far around the segments beta's image can matter, pixels."""
     bytes_per_pixel: float
     """Working memory for each pixel of alpha and of the betas, measured."""
     multiple: int
     """Images are padded to multiples of this, and cut at them."""
-    equal_pitch: bool
-    """Whether betas want to be resized so that their pixels subtend about the angle that alpha's do."""
+    equal_resolution: bool
+    """Whether betas are to be resized to about alpha's angular resolution."""
+    joins_bands: JoinsBands
+    """Which co-located betas are to come as one of several bands: none, those that follow each other (where the order
+    of the bands matters), or all."""
 
-    joins_bands: Literal["no", "neighbours", "all"]
-    """Which betas that see the same from one place are to come as one of several bands: none, those that follow each
-    other (where the order of the bands matters), or all."""
-
-    def normalisation(self, alpha: Tensor, beta: Tensor, look: Look) -> Look:
-        """The look with what surveys of pieces are to know of the whole images (of whole multiples), if anything."""
+    def prepare(self, inputs: Inputs) -> State | None:
+        """What must be known of whole images (of whole multiples) before parts of them are fused, if anything."""
         ...
 
-    def survey(self, alpha: Tensor, beta: Tensor, look: Look) -> SemiGlobalMatches | None:
-        """What is to be known of whole images (of whole multiples) before pieces of them are fused, if anything."""
-        ...
-
-    def __call__(self, alpha: Tensor, betas: Sequence[Tensor], looks: Looks) -> FusionOutput:
-        """Fuse alpha (B, C, H, W) with betas of any sizes."""
+    def __call__(self, inputs: Inputs, state: Any = None) -> FusionOutput:
+        """Fuse; without a state, one is prepared from these inputs."""
         ...

@@ -1,0 +1,102 @@
+"""From views to what a network is given: padded images, and each field evaluated once for every pixel of alpha."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from arraygeom import Moved, Pair, depth_from_track, pixel_grid
+from arraygeom.fields import pinhole_track
+from arraygeom.fields.default import default_field
+from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.pixels import HW
+
+from ..networks.protocol import Beta, FusionNetwork, FusionOutput, Inputs
+from .views import Views
+
+UNSEEN = 1e-4
+"""At confidences up to this beta does not see the point: then its position gives no depth."""
+
+
+class Placement(NamedTuple):
+    """How a beta is related to alpha.
+
+    `points` says where alpha's pixels are when beta records: elsewhere only if they move (`Moved`).
+    """
+
+    pair: Pair
+    points: Callable[[Tensor], Tensor]
+
+
+class FrameInputs(NamedTuple):
+    """A network's inputs, padded to whole multiples; how each beta is placed; alpha's size without padding."""
+
+    inputs: Inputs
+    placements: list[Placement]
+    hw: HW
+
+
+def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
+    """The inputs of a network for views that are prepared for it.
+
+    Raises ValueError if alpha's pixels have no valid search segment in a beta: views that do not overlap.
+    """
+    m, hw = network.multiple, views.rig[views.alpha].hw
+    alpha = padded(views.own[None], m)
+    betas, placements = [], []
+    for name in views.betas:
+        pair = views.pair(name)
+        field = views.fields.get(name) or default_field(pair)
+        on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=network.equal_resolution)
+        _check_overlap(on_grid, pair, name)
+        betas.append(Beta(padded(views.images[name][None], m), on_grid))
+        placements.append(Placement(pair, field.points if isinstance(field, Moved) else lambda x: x))
+    return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo), placements, hw)
+
+
+def _check_overlap(field: FieldOnGrid, pair: Pair, name: str) -> None:
+    h, w = pair.alpha.hw
+    if field.pixels is not None:
+        overlap = field.pixels.valid[..., :h:8, :w:8].any()
+    else:
+        found = field.at(pixel_grid((h, w))[::8, ::8].reshape(-1, 2))
+        overlap = getattr(found, "mask").any()  # noqa: B009
+    if not overlap:
+        bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
+        raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
+
+
+def padded(image: Tensor, multiple: int) -> Tensor:
+    """The image continued at the bottom and the right to whole multiples."""
+    h, w = image.shape[-2:]
+    return pad(image, (0, -w % multiple, 0, -h % multiple), mode="replicate")
+
+
+def depth_and_confidence(
+    output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the least confidence.
+
+    `corner` is the (x, y) of the part's first pixel in alpha; `hw` the size of the part without padding.
+    """
+    h, w = hw
+    like = output.position[0]
+    x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
+    total, weights = like.new_zeros(2, h, w)
+    for beta, (pair, points), position, confidence in zip(part.betas, placements, output.position, output.confidence):
+        if pair.link is not None or not pair.calibrated:
+            continue
+        where = position[0, :, :h, :w].movedim(0, -1) + like.new_tensor(beta.offset)
+        found = depth_from_track(pinhole_track(pair, points(x)), where.reshape(-1, 2))
+        valid = found.valid.reshape(h, w)
+        weight = torch.where(valid & (confidence[0, :h, :w] > UNSEEN), confidence[0, :h, :w], 0.0)
+        total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
+        weights = weights + weight
+    known = weights > 0
+    depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
+    return depth.to(output.image), torch.stack([c[0, :h, :w] for c in output.confidence]).amin(0)

@@ -1,0 +1,124 @@
+"""Cutting frames into pieces with halos, and matching large frames piece by piece."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from arraygeom.fields.grid import Box
+from arraygeom.pixels import HW
+
+from ..support.memory import give_back
+from .protocol import Inputs
+from .semi_global import SemiGlobalMatches
+
+MATCHING_HALO = 256
+"""The halo of the pieces in which large frames are matched, pixels."""
+MATCHED_AT_ONCE = 1_600_000
+"""Pixels of alpha matched at once. Larger frames are cut the same way whatever memory is allowed, so that results do
+not depend on it."""
+
+
+class Tile(NamedTuple):
+    """Rows and columns of the output, and of alpha's image that they need: (top, bottom, left, right)."""
+
+    inner: Box
+    outer: Box
+
+
+def area(box: Box) -> int:
+    """Pixels in a box."""
+    top, bottom, left, right = box
+    return (bottom - top) * (right - left)
+
+
+def whole(hw: HW) -> Tile:
+    """A frame as one tile."""
+    return Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
+
+
+def tiles_of(hw: HW, side: int | tuple[int, int], halo: int) -> Iterator[Tile]:
+    """Tiles (square, or of a height and a width) with a halo, cut off at the frame's borders."""
+    (h, w), (rows, columns) = hw, side if isinstance(side, tuple) else (side, side)
+    for top in range(0, h, rows):
+        for left in range(0, w, columns):
+            bottom, right = min(top + rows, h), min(left + columns, w)
+            outer = (max(top - halo, 0), min(bottom + halo, h), max(left - halo, 0), min(right + halo, w))
+            yield Tile((top, bottom, left, right), outer)
+
+
+def sides_by_work(hw: HW, halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
+    """Heights and widths of tiles of at most `most` pixels with their halos, the least work first."""
+    h, w = hw
+    sides: dict[tuple[int, int], int] = {}
+    for rows in range(1, -(-h // 64) + 1):
+        for columns in range(1, -(-w // 64) + 1):
+            side = max(-(-h // rows // multiple) * multiple, 64), max(-(-w // columns // multiple) * multiple, 64)
+            if side not in sides and math.prod(min(s + 2 * halo, n) for s, n in zip(side, hw)) <= most:
+                sides[side] = math.prod(_covered_length(n, s, halo) for n, s in zip(hw, side))
+    return sorted(sides, key=lambda side: sides[side])
+
+
+def _covered_length(length: int, side: int, halo: int) -> int:
+    """The sum of the lengths of pieces with their halos."""
+    return sum(min(i + side + halo, length) - max(i - halo, 0) for i in range(0, length, side))
+
+
+def matching_pieces(hw: HW, multiple: int) -> list[Tile]:
+    """The pieces in which a frame is matched: one, or those with the least work of at most `MATCHED_AT_ONCE` pixels."""
+    if math.prod(hw) <= MATCHED_AT_ONCE:
+        return [whole(hw)]
+    return list(tiles_of(hw, sides_by_work(hw, MATCHING_HALO, multiple, MATCHED_AT_ONCE)[0], MATCHING_HALO))
+
+
+def matched_in_pieces(inputs: Inputs, match: Callable[[Inputs], SemiGlobalMatches]) -> SemiGlobalMatches:
+    """The matches of a whole frame from the inner parts of its pieces; `inputs` have one beta."""
+    pieces = matching_pieces(inputs.hw, inputs.multiple)
+    if len(pieces) == 1:
+        return match(inputs)
+    found: list[Tensor] = []
+    for inner, outer in pieces:
+        top, bottom, left, right = inner
+        part = match(inputs.cut(outer)).cut((top - outer[0], bottom - outer[0], left - outer[2], right - outer[2]))
+        steps = [(bottom - top) // p.shape[-2] for p in part]
+        found = found or [p.new_empty(*p.shape[:-2], *(n // s for n in inputs.hw)) for p, s in zip(part, steps)]
+        for target, p, s in zip(found, part, steps):
+            target[..., top // s : bottom // s, left // s : right // s] = p
+        del part, p
+        give_back()
+    return SemiGlobalMatches(*found)
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """The matches of each beta, and what else holds for a whole beta (`common`, one for each)."""
+
+    matches: tuple[SemiGlobalMatches, ...]
+    common: tuple[Any, ...]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held."""
+        return sum(part.nbytes for found in self.matches for part in found)
+
+    def cut(self, box: Box) -> Prepared:
+        """Of a part of alpha."""
+        return Prepared(tuple(found.cut(box) for found in self.matches), self.common)
+
+
+@torch.no_grad()
+def prepared(
+    inputs: Inputs,
+    common: Callable[[Inputs], Any],
+    match: Callable[[Inputs, Any], SemiGlobalMatches],
+) -> Prepared:
+    """`common` of each beta, and by that its matches."""
+    betas = [inputs.of_beta(i) for i in range(len(inputs.betas))]
+    facts = tuple(common(one) for one in betas)
+    found = (matched_in_pieces(one, lambda piece, f=f: match(piece, f)) for one, f in zip(betas, facts))
+    return Prepared(tuple(found), facts)
