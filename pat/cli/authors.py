@@ -57,9 +57,8 @@ class Evaluate:
         methods = {**stereo.BASELINES, "fusion": stereo.rectified_fusion(network, bands=bands), **wrong}
         rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out)
         every = [row for found in rows.values() for row in found]
-        text = stereo.sets_markdown(rows, protocol=self.protocol) + (
-            "\n" + stereo.falls(every, names=wrong) if wrong else ""
-        )
+        text = stereo.sets_markdown(rows, protocol=self.protocol)
+        text += "\n" + stereo.falls(every, names=wrong) if wrong else ""
         write_text(self.out / "scores.md", text)
         stereo.write_csv(self.out / "scores.csv", every)
         print(text, end="")

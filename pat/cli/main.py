@@ -149,7 +149,7 @@ def _union(group: Any) -> Any:
             inner = tyro.conf.OmitSubcommandPrefixes[_union(command)]
             command = make_dataclass(name, [("command", inner)])
         made.append(Annotated[command, tyro.conf.subcommand(name)])
-    return Union[tuple(made)]
+    return Union[tuple(made)]  # noqa: UP007
 
 
 sys.modules[__name__].__class__ = CallableModule  # `from pat.cli import main; main()` is of before there was a package

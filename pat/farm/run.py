@@ -89,12 +89,9 @@ def render(
             outcomes = local_pool(order, missing, workers)
         else:
             outcomes = dask_pool(order, missing, Workers(workers, scheduler))
-        done = len(wanted) - len(missing)
-        console = console or Console(stderr=True)
+        shown = {"title": "scenes", "done": len(wanted) - len(missing), "console": console or Console(stderr=True)}
         try:
-            for _ in followed(
-                outcomes, title="scenes", total=len(wanted), done=done, console=console, status=summary.add
-            ):
+            for _ in followed(outcomes, total=len(wanted), status=summary.add, **shown):
                 pass
         finally:
             with suppress(OSError):
