@@ -24,6 +24,7 @@ class OldModule(ModuleType):
         return moved_name(self.__name__, name, self._renamed.get(name, f"{self._new}.{name}"), silent=True)
 
     def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """Call the function of the same name."""
         return getattr(self, self.__name__.rpartition(".")[2])(*args, **kwargs)
 
 

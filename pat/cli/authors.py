@@ -153,31 +153,20 @@ class SystemsRun:
 
     def run(self) -> None:
         from ..systems import load_system, run_system
-
-        out = self.out or Path("out/systems") / self.name
-        if self.recording is not None:
-            return self._recorded(self.recording, out)
-        result = run_system(
-            self.name,
-            out,
-            full=self.full,
-            photos=self.photos,
-            weights=self.weights,
-            max_memory=self.max_memory,
-            say=say,
-        )
-        print(result.table, end="")
-        if not self.full and load_system(self.name).expected:
-            say(f"\nexpected:\n{load_system(self.name).expected}")
-        say(f"written: {', '.join(map(str, result.written))}")
-
-    def _recorded(self, recording: Path, out: Path) -> None:
         from ..systems.fast_slow.recorded import run_recorded
 
-        if self.name != "fast-slow":
+        out = self.out or Path("out/systems") / self.name
+        if self.recording is None:
+            further = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
+            result = run_system(self.name, out, weights=self.weights, say=say, **further)
+        elif self.name == "fast-slow":
+            result = run_recorded(self.recording, out, weights=self.weights, say=say)
+        else:
             raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
-        result = run_recorded(recording, out, weights=self.weights, say=say)
         print(result.table, end="")
+        expected = load_system(self.name).expected
+        if expected and self.recording is None and not self.full:
+            say(f"\nexpected:\n{expected}")
         say(f"written: {', '.join(map(str, result.written))}")
 
 

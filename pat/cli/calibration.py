@@ -58,7 +58,7 @@ class Calibrate:
 
 
 @dataclass
-class Board:
+class PrintBoard:
     """Make a calibration board to print at its true size.
 
     Example: pat board charuco:8x6:30mm -o board.pdf

@@ -25,7 +25,7 @@ class Pat:
         "show": rigs.Show,
         "explore": rigs.Explore,
         "calibrate": calibration.Calibrate,
-        "board": calibration.Board,
+        "board": calibration.PrintBoard,
         "rig": rigs.RigCommands,
         "demo": fusing.Demo,
     }
@@ -96,7 +96,9 @@ def _command(arguments: list[str]) -> Any:
     if "--tyro-print-completion" in arguments or "--tyro-write-completion" in arguments:
         return tyro.cli(_union(Pat), prog="pat", args=arguments)
     if arguments == ["--version"]:
-        print(f"arraygeom-pat {_version()}")
+        from importlib.metadata import version
+
+        print(f"arraygeom-pat {version('arraygeom-pat')}")
         sys.exit(0)
     path, command = "pat", Pat
     while hasattr(command, "commands"):
@@ -105,7 +107,9 @@ def _command(arguments: list[str]) -> Any:
             print(_help(path, command))
             sys.exit(0)
         if word not in command.commands:
-            raise ValueError(f"no command '{path} {word}'{_near(word, command.commands)}")
+            from ..support.schema import near
+
+            raise ValueError(f"no command '{path} {word}'{near(word, command.commands)}")
         path, command, arguments = f"{path} {word}", command.commands[word], arguments[1:]
     arguments = respelled(arguments, command)
     if hasattr(command, "parse"):
@@ -114,7 +118,7 @@ def _command(arguments: list[str]) -> Any:
 
 
 def _help(path: str, group: Any) -> str:
-    """What a group of commands prints as its help: a line for each command, from its docstring."""
+    """The help of a group of commands: a line for each, from its docstring."""
     parts = {"commands": group.commands}
     if group is Pat:
         parts = {"commands": Pat.users, "for the development of networks": Pat.authors}
@@ -127,18 +131,6 @@ def _help(path: str, group: Any) -> str:
 
 def _first_line(command: Any) -> str:
     return (getdoc(command) or "").partition("\n")[0]
-
-
-def _near(word: str, known: Mapping[str, Any]) -> str:
-    from ..support.schema import near
-
-    return near(word, known)
-
-
-def _version() -> str:
-    from importlib.metadata import version
-
-    return version("arraygeom-pat")
 
 
 def _union(group: Any) -> Any:

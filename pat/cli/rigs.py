@@ -223,7 +223,7 @@ class Refine:
 
 
 @dataclass
-class Start:
+class RigFromImages:
     """Make a rig from images alone: fundamental matrices and rough homographies, good enough to fuse with.
 
     Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
@@ -257,5 +257,5 @@ class RigCommands:
         "show": Show,
         "doctor": Doctor,
         "refine": Refine,
-        "start": Start,
+        "start": RigFromImages,
     }

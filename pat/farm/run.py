@@ -19,7 +19,7 @@ from .workshop import Order, SceneOutcome, worker_command
 
 @dataclass
 class RenderSummary:
-    """What a run has done."""
+    """Scenes made by a run, and what went wrong."""
 
     made: int = 0
     there: int = 0

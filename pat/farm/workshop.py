@@ -116,7 +116,7 @@ class Workshop:
             kills += answer["answer"] == "killed"
             state = "done"
             if refusals >= limits.refusals or crashes >= limits.crashes or kills >= limits.kills:
-                folder.give_up(index, reason, self._said(), refusals=refusals, crashes=crashes, kills=kills)
+                folder.give_up(index, reason, self._log_end(), refusals=refusals, crashes=crashes, kills=kills)
                 state = "given up"
                 break
         seconds = time.monotonic() - started
@@ -199,7 +199,7 @@ class Workshop:
         if code == -signal.SIGKILL:
             return {"answer": "killed", "reason": "the worker was killed (SIGKILL; out of memory?)"}
         cause = signal.Signals(-code).name if code < 0 else f"exit status {code}"
-        last = [line for line in self._said().splitlines() if line.strip()][-1:]
+        last = [line for line in self._log_end().splitlines() if line.strip()][-1:]
         return {"answer": "crashed", "reason": ": ".join([f"the worker died ({cause})", *last])}
 
     def _retire(self) -> None:
@@ -215,8 +215,8 @@ class Workshop:
             self._process.communicate()
             self._process = None
 
-    def _said(self) -> str:
-        """The end of what the last process wrote."""
+    def _log_end(self) -> str:
+        """The end of the last process's log."""
         if self._log is None or not self._log.is_file():
             return ""
         return self._log.read_text(encoding="utf-8", errors="replace")[-20_000:]

@@ -16,18 +16,18 @@ import yaml
 T = TypeVar("T")
 
 
-def to_document(value: Any, *, whole: bool = False) -> Any:
+def to_document(value: Any, *, defaults: bool = False) -> Any:
     """Dataclasses as mappings, tuples as lists, paths as text, the rest as it is.
 
-    What is at its default is left out, if not `whole`.
+    Entries at their default are left out, unless `defaults`.
     """
     if dataclasses.is_dataclass(value):
         entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return {f.name: to_document(v, whole=whole) for f, v in entries.items() if whole or not _default(f, v)}
+        return {f.name: to_document(v, defaults=defaults) for f, v in entries.items() if defaults or not _default(f, v)}
     if isinstance(value, tuple | list):
-        return [to_document(v, whole=whole) for v in value]
+        return [to_document(v, defaults=defaults) for v in value]
     if isinstance(value, dict):
-        return {k: to_document(v, whole=whole) for k, v in value.items()}
+        return {k: to_document(v, defaults=defaults) for k, v in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 
@@ -40,7 +40,7 @@ def from_document(kind: type[T], document: Any, entry: str = "") -> T:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """What a YAML file holds. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    """The content of a YAML file. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -53,7 +53,7 @@ def read_yaml(path: str | Path) -> Any:
 
 
 def near(name: object, known: Iterable[object]) -> str:
-    """What to say after an unknown name: the nearest known one, or all of them.
+    """The end of a message about an unknown name: the nearest known one, or all of them.
 
     >>> near("nois", ["noise", "clip"])
     "; did you mean 'noise'?"
@@ -123,16 +123,16 @@ def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[An
 
 
 def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
-    """The first of several types that fits; if none does, what one that is about as wanted says."""
+    """The first of several types that fits; if none does, the error of one of the same form."""
     if value is None and type(None) in arguments:
         return None
-    said = []
+    errors = []
     for kind in (k for k in arguments if k is not type(None)):
         try:
             return _read(kind, value, entry)
         except ValueError as error:
-            said.append((isinstance(value, dict) == dataclasses.is_dataclass(kind), str(error)))
-    raise ValueError(max(said, key=lambda s: s[0])[1])
+            errors.append((isinstance(value, dict) == dataclasses.is_dataclass(kind), str(error)))
+    raise ValueError(max(errors, key=lambda e: e[0])[1])
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
