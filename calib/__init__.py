@@ -4,8 +4,8 @@ import sys
 
 from arraygeom.moved import OldModules
 
-_BOARDS = ("bundle", "calibrate", "collect", "corners", "covariance", "coverage", "detect", "intrinsics")
-_BOARDS += ("observability", "photos", "poses", "rehearsal", "report", "run")
+_BOARDS = ["bundle", "calibrate", "collect", "corners", "covariance", "coverage", "detect", "intrinsics"]
+_BOARDS += ["observability", "photos", "poses", "rehearsal", "report", "run"]
 _IMAGES = ("doctor", "lenses", "matches", "mistakes", "photometric", "refine", "residuals")
 _MOVED = {f"calib.{name}": f"calib.boards.{name}" for name in _BOARDS}
 _MOVED |= {f"calib.{name}": f"calib.images.{name}" for name in _IMAGES}

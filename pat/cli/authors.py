@@ -157,7 +157,7 @@ class SystemsRun:
 
         out = self.out or Path("out/systems") / self.name
         if self.recording is None:
-            further = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
+            further: dict[str, Any] = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
             result = run_system(self.name, out, weights=self.weights, say=say, **further)
         elif self.name == "fast-slow":
             result = run_recorded(self.recording, out, weights=self.weights, say=say)

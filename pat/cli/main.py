@@ -38,7 +38,7 @@ class Pat:
         "render": authors.Render,
         "train": authors.Train,
     }
-    commands: ClassVar[Mapping[str, Any]] = users | authors
+    commands: ClassVar[Mapping[str, Any]] = {**users, **authors}
 
 
 def command_paths(group: Any = Pat, before: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:

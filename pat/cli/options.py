@@ -65,7 +65,9 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
     spellings = {"--rig": FIRST} if "rig" in command.__annotations__ else {}
     spellings |= getattr(command, "spellings", {})
     words = iter(arguments)
-    first, rest, last = [], [], []
+    first: list[str] = []
+    rest: list[str] = []
+    last: list[str] = []
     for word in words:
         option, equals, value = word.partition("=")
         new = spellings.get(option.replace("_", "-") if option.startswith("--") else option)

@@ -138,7 +138,7 @@ class JobFolder:
 
 
 def publish(partial: Path, final: Path) -> bool:
-    """Publish a complete folder under its name, after all of it is on disk; False, and it is removed, if that is taken."""
+    """Publish a complete folder under its name, after all of it is on disk; False if that is taken: it is removed."""
     for path in [*partial.iterdir(), partial]:
         _sync(path)
     final.parent.mkdir(parents=True, exist_ok=True)

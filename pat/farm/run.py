@@ -6,6 +6,7 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -89,7 +90,11 @@ def render(
             outcomes = local_pool(order, missing, workers)
         else:
             outcomes = dask_pool(order, missing, Workers(workers, scheduler))
-        shown = {"title": "scenes", "done": len(wanted) - len(missing), "console": console or Console(stderr=True)}
+        shown: dict[str, Any] = {
+            "title": "scenes",
+            "done": len(wanted) - len(missing),
+            "console": console or Console(stderr=True),
+        }
         try:
             for _ in followed(outcomes, total=len(wanted), status=summary.add, **shown):
                 pass

@@ -224,7 +224,7 @@ assert not {{"torch", "numpy", "scipy", "numba", "arraygeom", "rich"}} & set(sys
     assert "fuse" in done.stdout or "info" in done.stdout
 
 
-@pytest.mark.parametrize("path", command_paths(), ids=" ".join)
+@pytest.mark.parametrize("path", [*command_paths()], ids=" ".join)
 def test_every_command_has_help_that_reads_well(path, capsys):
     with pytest.raises(SystemExit) as stop:
         main([*path, "--help"])
