@@ -117,4 +117,6 @@ if not TYPE_CHECKING:
 
     def __getattr__(name: str) -> Any:
         """Functions by the names that they had, for one release."""
-        return moved_name(__name__, name, {"retaken": "arraygeom.resampled"}.get(name))
+        return moved_name(
+            __name__, name, {"retaken": "arraygeom.resampled", "look": "arraygeom.sampling_locations"}.get(name)
+        )

@@ -1,4 +1,4 @@
-"""Run the notebooks in place, outputs kept: python notebooks/run.py [FILE ...]. A file appears whole or not at all."""
+"""Run the notebooks in place, outputs kept: python notebooks/run.py [FILE ...]. Files are written atomically."""
 
 from __future__ import annotations
 

@@ -73,7 +73,7 @@ def test_outputs_are_kept_and_none_is_an_error(path):
 @pytest.mark.slow
 def test_the_explorer_is_shown_by_a_cell(tmp_path):
     pytest.importorskip("panel")
-    source = "from pat.systems.demo import load_sample\nfrom pat.explore import explorer\nexplorer(*load_sample()[:2])"
+    source = "from pat.data.sample_array import load_sample\nfrom pat.explore import explorer\nexplorer(*load_sample()[:2])"
     cells = [nbformat.v4.new_code_cell(source)]
     fresh = run().execute(nbformat.v4.new_notebook(cells=cells), tmp_path)
     shown = [kind for output in fresh.cells[0].outputs for kind in output.get("data", {})]

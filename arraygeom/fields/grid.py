@@ -48,9 +48,12 @@ class FieldOnGrid:
         """
         at, hw = lazily(field, pair), hw or pair.alpha.hw
         device = pair.cameras[0].K.device if pair.calibrated else None
-        pixels = _on_grid(at, pixel_grid(hw, dtype=torch.float64, device=device))
-        if isinstance(pixels, Positions):
-            return cls(at, pixels.xy.shape[-2], None)
+        grid = pixel_grid(hw, dtype=torch.float64, device=device)
+        # Explicit positions of a whole frame may not fit into memory: one point tells which the field gives.
+        kind = at(grid[:1, 0] + 0.25)
+        if isinstance(kind, Positions):
+            return cls(at, kind.xy.shape[-2], None)
+        pixels = _on_grid(at, grid)
         h, w = pair.alpha.hw
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
         longest = torch.where(pixels.valid[sparse], pixels.length[sparse].detach().float(), 0.0).max()
@@ -68,9 +71,7 @@ class FieldOnGrid:
             raise ValueError("this network samples straight segments: choose a straight field, or undistort the images")
         h, w = self.pixels.valid.shape[-2:]
         grid = pixel_grid((h // side, w // side), dtype=torch.float64, device=self.pixels.start.device)
-        found = _on_grid(self.at, (grid + 0.5) * side - 0.5)
-        assert isinstance(found, Segments)
-        return found
+        return _on_grid(self.at, (grid + 0.5) * side - 0.5)
 
     @property
     def straight(self) -> Segments:
@@ -110,15 +111,14 @@ class FieldOnGrid:
         return FieldOnGrid(lambda x: one(self.at(x)), self.samples, pixels, blocks)  # type: ignore[arg-type]
 
 
-def _on_grid(at: Callable[[Tensor], Segments | Positions], x: Tensor) -> Segments | Positions:
-    """The field at a grid of pixels (h, w, 2) as (B or 1, h, w); explicit positions as they come, of some rows."""
+def _on_grid(at: Callable[[Tensor], Segments | Positions], x: Tensor) -> Segments:
+    """A straight field at a grid of pixels (h, w, 2) as (B or 1, h, w)."""
     h, w = x.shape[:2]
     rows = max(_CHUNK // max(w, 1), 1)
     whole: list[Tensor] = []
     for top in range(0, h, rows):
         found = at(x[top : top + rows].reshape(-1, 2))
-        if isinstance(found, Positions):
-            return found
+        assert isinstance(found, Segments)
         part = [t.reshape(-1, min(rows, h - top), w, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))]
         if rows >= h:
             return Segments(*part)

@@ -1,12 +1,23 @@
-"""From photographs of a board to a rig: target, corners, intrinsics, poses, bundle adjustment, report."""
+"""Calibration from images of a board: from its specification to a rig with covariance and report.
 
-from typing import TYPE_CHECKING, Any
+`target` (boards) -> `photos`, `detect`, `corners`, `collect` (detections) -> `intrinsics` (one camera) -> `poses`
+(initial rig) -> `bundle`, `observability` (adjustment) -> `rig` (calibration) -> `coverage`, `covariance`, `report`.
+`run` does all of it from files to files, `simulation` renders the images that a planned rig would take.
+"""
 
-if not TYPE_CHECKING:
+from .. import _lazy
 
-    def __getattr__(name: str) -> Any:
-        """Names that this package had when it was a module, of `target` now."""
-        from arraygeom.moved import moved_name
+__all__ = ["calibrate", "calibrate_photos", "collect_folder", "parse_board", "simulate_photos", "write_board"]
 
-        known = {"Board", "Charuco", "Chessboard", "Circles", "draw_board", "parse_board"}
-        return moved_name(__name__, name, f"{__name__}.target.{name}" if name in known else None)
+__getattr__ = _lazy(
+    __name__,
+    {
+        "calibrate": "rig",
+        "calibrate_photos": "run",
+        "collect_folder": "collect",
+        "parse_board": "target",
+        "simulate_photos": "simulation",
+        "write_board": "run",
+    },
+    {name: f"{__name__}.target.{name}" for name in ("Board", "Charuco", "Chessboard", "Circles", "draw_board")},
+)

@@ -1,4 +1,4 @@
-"""Looking for the board in all images, and saying where it was not found and why it may be."""
+"""Board detection in all images, with likely reasons where it failed."""
 
 from __future__ import annotations
 
@@ -10,59 +10,57 @@ from pathlib import Path
 from typing import Any
 
 from .detect import Detection, Grey, detect, explain, other_size
-from .intrinsics import Views
-from .photos import FrameKey, Photo, Photos
+from .intrinsics import BoardViews
+from .photos import FrameKey, Photo, Photos, find_photos
 from .target import Board
 
-TO_EXPLAIN = 4
-"""So many images without a board are looked at again to find out why."""
+EXPLAINED_IMAGES = 4
+"""Images without a board that are analysed for the reason."""
 NAMED = 6
-"""So many images are named in a sentence."""
+"""Images named in a message."""
 
 Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 
 @dataclass(frozen=True)
-class Collected:
-    """What each camera saw; the names of its images; what was found wrong with some, in sentences."""
+class CollectedViews:
+    """Detections of each camera, the names of its images, and notes on failed ones."""
 
-    views: dict[str, Views]
+    views: dict[str, BoardViews]
     labels: dict[str, dict[FrameKey, str]]
     notes: tuple[str, ...]
 
 
-def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -> Collected:
-    """The board's points in all images of all cameras.
+def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -> CollectedViews:
+    """Detect the board in all images of all cameras.
 
     Raises ValueError, naming images and cause, if a camera's images differ in size, if the board is found in
     none of them, or if they show a board of another size.
     """
     jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
     with ThreadPoolExecutor(2) as pool:
-        results = pool.map(lambda job: _look(job[2], board), jobs)
-        looked = list(progress(results, len(jobs)) if progress else results)
-    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, looked) if n == name] for name in photos}
+        results = pool.map(lambda job: _detect_photo(job[2], board), jobs)
+        detected = list(progress(results, len(jobs)) if progress else results)
+    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, detected) if n == name] for name in photos}
     views, notes = {}, []
     for name, moments in photos.items():
         sizes = {key: hw for key, (hw, _) in by_camera[name]}
         _check_sizes(name, moments, sizes)
         seen = {key: found for key, (_, found) in by_camera[name] if found is not None}
         _check_board(name, moments, seen, board)
-        views[name] = Views(next(iter(sizes.values())), seen)
+        views[name] = BoardViews(next(iter(sizes.values())), seen)
         notes += _missing(name, moments, seen, board)
-    return Collected(views, {n: {k: p.label for k, p in m.items()} for n, m in photos.items()}, tuple(notes))
+    return CollectedViews(views, {n: {k: p.label for k, p in m.items()} for n, m in photos.items()}, tuple(notes))
 
 
 def collect_folder(
     folder: str | Path, board: Board, *, patterns: Mapping[str, str] | None = None, progress: Progress | None = None
-) -> Collected:
-    """`collect` for the images that `find_photos` finds."""
-    from .photos import find_photos
-
+) -> CollectedViews:
+    """`collect` for the images of a folder (see `find_photos`)."""
     return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
 
 
-def _look(photo: Photo, board: Board) -> tuple[tuple[int, int], Detection | None]:
+def _detect_photo(photo: Photo, board: Board) -> tuple[tuple[int, int], Detection | None]:
     grey = photo.read()
     return (grey.shape[0], grey.shape[1]), detect(grey, board)
 
@@ -103,8 +101,8 @@ def _missing(
 
 
 def _greys(photos: list[Photo]) -> Iterable[Grey]:
-    step = max(1, len(photos) // TO_EXPLAIN)
-    return (photo.read() for photo in photos[::step][:TO_EXPLAIN])
+    step = max(1, len(photos) // EXPLAINED_IMAGES)
+    return (photo.read() for photo in photos[::step][:EXPLAINED_IMAGES])
 
 
 def _named(labels: list[str], most: int) -> str:

@@ -1,10 +1,10 @@
-"""Where chessboard corners are, to a hundredth of a pixel: the corner as it should look, laid over the image.
+"""Chessboard corners to a hundredth of a pixel, by fitting a parametric corner model to the image.
 
 Four squares meet in a corner: grey is a + b S(d) S(e) with d, e the distances in pixels from the two edges, S the step
 from -1 to 1 blurred by a Gaussian. Position, levels and blur of each corner are fitted by least squares to the pixels
-beside its edges (Gauss-Newton); the edges' directions and how a lens bends them come from a smooth map of the whole
-board, as all its corners tell it. The pixels looked at are symmetric about the corner, so that gamma, glare and ink
-that spreads, which move every edge towards one colour, hardly move a corner.
+beside its edges (Gauss-Newton); the directions and curvatures of the edges come from a smooth map of the whole board,
+fitted to all its corners. The pixels used are symmetric about the corner, so that gamma, glare and ink bleed, which
+move every edge towards one colour, hardly move a corner.
 """
 
 from __future__ import annotations
@@ -17,55 +17,55 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from scipy.special import erf
 
-LONGEST = 12.0
-"""Edges are looked at up to so many pixels from their corner: bent by a lens, they are parabolas no further."""
-SHORTEST = 2.5
-"""Corners whose edges can be seen over fewer pixels than this are left where they are."""
-WIDEST = 5.0
-"""So many pixels to either side of an edge are looked at, at most."""
-THINNEST = 0.7
-"""And so many at least."""
+LONGEST_EDGE = 12.0
+"""Edges are used up to this many pixels from their corner: distorted edges are parabolas no further."""
+SHORTEST_EDGE = 2.5
+"""Corners whose edges are visible over fewer pixels than this are not refined."""
+WIDEST_BAND = 5.0
+"""Largest number of pixels used to either side of an edge."""
+NARROWEST_BAND = 0.7
+"""Smallest such number."""
 BLEED = 0.7
-"""The blur of what is beyond the corner's own squares reaches so many pixels into them."""
+"""Pixels by which the blur of neighbouring edges extends into the corner's own squares."""
 STEPS = 12
-SETTLED = 1e-3
-"""Steps below this, in pixels, end the search."""
+CONVERGED = 1e-3
+"""Steps below this, in pixels, end the iteration."""
 BLUR = 0.4, 3.0
 """Least and most standard deviation of the blur, pixels."""
 DEGREES = {0: 0, 12: 1, 30: 3, 42: 4, 54: 5}
-"""The degree of the polynomial that bends the board's map, by how many points there are at least."""
+"""Degree of the polynomial part of the board's map, by the least number of points."""
 PASSES = 2
-"""The map of the board is made again from better corners."""
+"""The map of the board is fitted again to the refined corners."""
 FEWEST = 8
-"""With fewer corners there is no telling where the others should be."""
+"""Corners needed to predict the others."""
 MISFIT = 0.4
-"""A corner that looks this different from a corner (root mean square, in parts of its contrast) is none."""
-MOVED = 0.5
-"""A corner this far (of the reach of its edges) from where its neighbours expect it is none."""
+"""Largest residual of a corner (root mean square, as a share of its contrast)."""
+LARGEST_SHIFT = 0.5
+"""Largest distance of a corner from its prediction, as a share of the length of its edges."""
 
 Array = np.ndarray
 Map = Callable[[Float[np.ndarray, "n 2"]], Float[np.ndarray, "n 2"]]
 
 
-class Shape(NamedTuple):
-    """The two edges through each corner: unit normals (pixels), and how they bend along themselves.
+class EdgeGeometry(NamedTuple):
+    """The two edges through each corner.
 
-    along: the direction of each edge, pixels a square; normal: across it, towards the next square; bend: how many
-    pixels along the normal the edge leaves its tangent per square pixel.
+    along: direction of each edge, pixels per square; normal: unit normal, towards the next square; curvature: pixels
+    along the normal by which the edge leaves its tangent, per square pixel.
     """
 
     along: Float[np.ndarray, "n 2 2"]
     normal: Float[np.ndarray, "n 2 2"]
-    distort: Float[np.ndarray, "n 2"]
+    curvature: Float[np.ndarray, "n 2"]
 
 
 def refine_corners(
     grey: UInt8[np.ndarray, "h w"], x: Float[np.ndarray, "n 2"], p: Float[np.ndarray, "n 2"], *, clear: float = 0.5
 ) -> tuple[Float[np.ndarray, "n 2"], Bool[np.ndarray, " n"]]:
-    """Corners at about `x` where the image has them, and which of them look like corners at all.
+    """Refine corners near `x`, and flag those that fit the corner model.
 
-    `p` is their place on the board, in squares; nothing but the corner's own squares is nearer to its edges than
-    `clear` squares.
+    `p` are their positions on the board, in squares; nothing but the corner's own squares is within `clear` squares of
+    its edges.
     """
     found, good = x, np.ones(len(x), dtype=bool)
     for _ in range(PASSES):
@@ -78,30 +78,33 @@ def refine_corners(
 
 
 def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: Bool[np.ndarray, " n"]) -> Map:
-    """From the board to the image: a homography and on top of it a polynomial, of degree 5 if the points allow.
+    """The map from the board to the image: a homography plus a polynomial, of degree 5 if the points allow.
 
-    Points that are far off the others' map have no say.
+    Outliers are down-weighted.
     """
     middle, size = p[good].mean(0), max(float(np.abs(p[good] - p[good].mean(0)).max()), 1e-9)
     H, kept = cv2.findHomography(p[good], x[good], cv2.RANSAC, 3.0)
     weight = kept[:, 0].astype(float) if kept.mean() > 0.5 else np.ones(int(good.sum()))
     degree = max(d for fewest, d in DEGREES.items() if good.sum() >= fewest)
     flat = cv2.perspectiveTransform(p[good][:, None], H)[:, 0]
-    basis = _powers((p[good] - middle) / size, degree)
+    basis = monomials((p[good] - middle) / size, degree)
     for _ in range(4):
-        distort = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * (x[good] - flat), rcond=None)[0]
-        off = np.linalg.norm(x[good] - flat - basis @ distort, axis=-1)
+        coefficients = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * (x[good] - flat), rcond=None)[0]
+        off = np.linalg.norm(x[good] - flat - basis @ coefficients, axis=-1)
         weight = 1 / (1 + (off / max(3 * float(np.median(off)), 1e-3)) ** 2)
-    return lambda q: cv2.perspectiveTransform(q[:, None], H)[:, 0] + _powers((q - middle) / size, degree) @ distort
+    return lambda q: (
+        cv2.perspectiveTransform(q[:, None], H)[:, 0] + monomials((q - middle) / size, degree) @ coefficients
+    )
 
 
-def _powers(q: Array, degree: int) -> Array:
+def monomials(q: Float[np.ndarray, "n 2"], degree: int) -> Float[np.ndarray, "n m"]:
+    """All products of powers of u and v up to a total degree."""
     u, v = q.T
     return np.stack([u**i * v**j for i in range(degree + 1) for j in range(degree + 1 - i)], 1)
 
 
-def _shape(board: Map, p: Array) -> Shape:
-    """Of the edges along the board's y (first) and x (second), by differences over a quarter of a square."""
+def _shape(board: Map, p: Array) -> EdgeGeometry:
+    """The edges along the board's y (first) and x (second), by differences over a quarter of a square."""
     step, middle = 0.25, board(p)
     ends = [[board(p + s * step * np.eye(2)[axis]) for s in (1, -1)] for axis in (1, 0)]
     along = np.stack([(a - b) / (2 * step) for a, b in ends], 1)
@@ -109,96 +112,100 @@ def _shape(board: Map, p: Array) -> Shape:
     length = np.linalg.norm(along, axis=-1)
     normal = np.stack([along[..., 1], -along[..., 0]], -1) / length[..., None]
     normal *= np.sign((normal * along[:, ::-1]).sum(-1, keepdims=True))
-    return Shape(along, normal, (curve * normal).sum(-1) / 2 / length**2)
+    return EdgeGeometry(along, normal, (curve * normal).sum(-1) / 2 / length**2)
 
 
-def _fitted(grey: Array, start: Array, shape: Shape, clear: float) -> tuple[Array, Array]:
-    """Corners from their expected places on."""
+def _fitted(grey: Array, start: Array, shape: EdgeGeometry, clear: float) -> tuple[Array, Array]:
+    """Corners fitted from their predicted positions."""
     h, w = grey.shape
     length = np.linalg.norm(shape.along, axis=-1).min(1)
     inside = np.minimum(np.minimum(start[:, 0], w - 1 - start[:, 0]), np.minimum(start[:, 1], h - 1 - start[:, 1]))
-    disparity = np.minimum(np.minimum(0.45 * length, LONGEST), inside - 1)
+    extent = np.minimum(np.minimum(0.45 * length, LONGEST_EDGE), inside - 1)
     sine = np.abs(np.linalg.det(shape.normal))
-    width = np.minimum(clear * length * sine - BLEED, WIDEST)
-    usable = (disparity >= SHORTEST) & (width >= THINNEST) & (sine > 0.2)
+    width = np.minimum(clear * length * sine - BLEED, WIDEST_BAND)
+    usable = (extent >= SHORTEST_EDGE) & (width >= NARROWEST_BAND) & (sine > 0.2)
     found, good = start.copy(), np.zeros(len(start), dtype=bool)
     if usable.any():
-        part = Shape(*(v[usable] for v in shape))
-        at, misfit = _least_squares(grey, start[usable], part, disparity[usable], width[usable])
-        near = np.linalg.norm(at - start[usable], axis=-1) < MOVED * disparity[usable]
+        part = EdgeGeometry(*(v[usable] for v in shape))
+        at, misfit = _least_squares(grey, start[usable], part, extent[usable], width[usable])
+        near = np.linalg.norm(at - start[usable], axis=-1) < LARGEST_SHIFT * extent[usable]
         found[usable], good[usable] = at, near & (misfit < MISFIT)
     return found, good
 
 
-class Look(NamedTuple):
-    """Corners as they are taken to look: place, mean grey, contrast (signed), blur; one row each."""
+class CornerModel(NamedTuple):
+    """Parameters of the corner model: position, mean grey, contrast (signed), blur; one row per corner."""
 
     x: Float[np.ndarray, "n 2"]
     level: Float[np.ndarray, "n 1"]
     contrast: Float[np.ndarray, "n 1"]
     blur: Float[np.ndarray, "n 1"]
 
-    def changed(self, step: Float[np.ndarray, "n 5"]) -> Look:
-        """After a step: at most a pixel, and by a factor of the blur between 0.6 and 1.6."""
+    def changed(self, step: Float[np.ndarray, "n 5"]) -> CornerModel:
+        """The model after a step of at most a pixel, and a factor of the blur between 0.6 and 1.6."""
         blur = (self.blur * np.exp(step[:, 4:].clip(-0.5, 0.5))).clip(*BLUR)
-        return Look(self.x + step[:, :2].clip(-1, 1), self.level + step[:, 2:3], self.contrast + step[:, 3:4], blur)
+        return CornerModel(
+            self.x + step[:, :2].clip(-1, 1), self.level + step[:, 2:3], self.contrast + step[:, 3:4], blur
+        )
 
 
-def _least_squares(grey: Array, start: Array, shape: Shape, disparity: Array, width: Array) -> tuple[Array, Array]:
-    """Gauss-Newton on all corners at once: their places, and what is left (root mean square) in contrasts."""
-    pixels = _around(start, disparity)
+def _least_squares(grey: Array, start: Array, shape: EdgeGeometry, extent: Array, width: Array) -> tuple[Array, Array]:
+    """Gauss-Newton on all corners at once: positions, and residuals (root mean square) in contrasts."""
+    pixels = _around(start, extent)
     values = grey[pixels[..., 1].clip(0, grey.shape[0] - 1), pixels[..., 0].clip(0, grey.shape[1] - 1)]
-    look = _first_look(values, pixels, Look(start, *np.ones((3, len(start), 1))), shape, disparity, width)
+    model = _initial_model(values, pixels, CornerModel(start, *np.ones((3, len(start), 1))), shape, extent, width)
     for _ in range(STEPS):
-        root, left, J = _linearised(values, pixels, look, shape, disparity, width)
+        root, left, J = _linearised(values, pixels, model, shape, extent, width)
         J *= root[..., None]
         A = J.swapaxes(1, 2) @ J
         A += 1e-6 * np.eye(5) * (np.trace(A, axis1=1, axis2=2)[:, None, None] / 5 + 1e-9)
         step = np.linalg.solve(A, J.swapaxes(1, 2) @ (root * left)[..., None])[..., 0]
-        look = look.changed(step)
-        if np.abs(step[:, :2]).max() < SETTLED:
+        model = model.changed(step)
+        if np.abs(step[:, :2]).max() < CONVERGED:
             break
     misfit = np.sqrt(((root * left) ** 2).sum(1) / (root**2).sum(1).clip(1e-9))
-    return look.x, misfit / np.abs(look.contrast[:, 0]).clip(1e-9)
+    return model.x, misfit / np.abs(model.contrast[:, 0]).clip(1e-9)
 
 
-def _around(x: Array, disparity: Array) -> Array:
+def _around(x: Array, extent: Array) -> Array:
     """The pixels (n, m, 2) of a square about each corner."""
-    half = int(np.ceil(disparity.max()))
+    half = int(np.ceil(extent.max()))
     row = np.arange(-half, half + 1)
     return np.rint(x).astype(int)[:, None] + np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
 
 
-def _first_look(values: Array, pixels: Array, look: Look, shape: Shape, disparity: Array, width: Array) -> Look:
-    """With the level and the contrast that fit at the places given."""
-    root, d, e = _distances(pixels - look.x[:, None], shape, disparity, width)
+def _initial_model(
+    values: Array, pixels: Array, model: CornerModel, shape: EdgeGeometry, extent: Array, width: Array
+) -> CornerModel:
+    """The model with the level and the contrast that fit at the given positions."""
+    root, d, e = _distances(pixels - model.x[:, None], shape, extent, width)
     pattern, weight = erf(d) * erf(e), root**2
     level = np.average(values, weights=weight + 1e-9, axis=1)[:, None]
     contrast = (weight * pattern * (values - level)).sum(1) / (weight * pattern**2).sum(1).clip(1e-9)
-    return look._replace(level=level, contrast=contrast[:, None])
+    return model._replace(level=level, contrast=contrast[:, None])
 
 
 def _linearised(
-    values: Array, pixels: Array, look: Look, shape: Shape, disparity: Array, width: Array
+    values: Array, pixels: Array, model: CornerModel, shape: EdgeGeometry, extent: Array, width: Array
 ) -> tuple[Array, Array, Array]:
-    """Roots of the weights (n, m), what is left of the values (n, m), derivatives by a step (n, m, 5)."""
-    root, d, e = _distances(pixels - look.x[:, None], shape, disparity, width)
-    _, _, b, blur = look
+    """Square roots of the weights (n, m), residuals (n, m), derivatives of the model by a step (n, m, 5)."""
+    root, d, e = _distances(pixels - model.x[:, None], shape, extent, width)
+    _, _, b, blur = model
     S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
     by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))
     by_d, by_e = by_d * T, by_e * S
     by_x = [-(by_d * shape.normal[:, :1, k] + by_e * shape.normal[:, 1:, k]) for k in (0, 1)]
     J = np.stack([*by_x, np.ones_like(d), S * T, -(by_d * d + by_e * e)], -1)
-    return root, values - look.level - b * S * T, J
+    return root, values - model.level - b * S * T, J
 
 
-def _distances(offset: Array, shape: Shape, disparity: Array, width: Array) -> tuple[Array, Array, Array]:
-    """The root of how much each pixel counts, and its distances from the first and the second edge."""
+def _distances(offset: Array, shape: EdgeGeometry, extent: Array, width: Array) -> tuple[Array, Array, Array]:
+    """The square root of each pixel's weight, and its distances from the first and the second edge."""
     unit = shape.along / np.linalg.norm(shape.along, axis=-1, keepdims=True)
     straight = np.einsum("npk,njk->npj", offset, shape.normal)
     run = np.einsum("npk,njk->npj", offset, unit)
-    d, e = np.moveaxis(straight - shape.distort[:, None] * run**2, -1, 0)
+    d, e = np.moveaxis(straight - shape.curvature[:, None] * run**2, -1, 0)
     far = np.linalg.norm(offset, axis=-1)
     beside = np.minimum(np.abs(d), np.abs(e))
-    weight = np.clip(disparity[:, None] + 0.5 - far, 0, 1) * np.clip(width[:, None] + 0.5 - beside, 0, 1)
+    weight = np.clip(extent[:, None] + 0.5 - far, 0, 1) * np.clip(width[:, None] + 0.5 - beside, 0, 1)
     return np.sqrt(weight), d, e

@@ -1,4 +1,4 @@
-"""How well the numbers of a rig are known: their covariance, in a file beside the rig's, and what follows from it."""
+"""Covariance of a rig's parameters, in a file beside the rig's, and its propagation to pixels and baselines."""
 
 from __future__ import annotations
 
@@ -21,33 +21,33 @@ FORMAT = "arraygeom-covariance 1"
 
 @dataclass(frozen=True)
 class RigCovariance:
-    """The covariance of some numbers of a rig; all others are exactly as they are (fixed, or the world's own).
+    """The covariance of some parameters of a rig; all others are fixed.
 
-    names: parameters as `Rig.parameters` names them and which of their numbers, "left.rotation.0", "left.focal.1":
-    rotation vectors in radians about the camera's axes, metres, pixels, coefficients of lenses.
+    names: parameters as `Rig.parameters` names them with the index of a component, "left.rotation.0", "left.focal.1":
+    rotation vectors in radians about the camera's axes, metres, pixels, distortion coefficients.
     """
 
     names: tuple[str, ...]
     matrix: Float[np.ndarray, "c c"]
 
     def deviation(self, name: str) -> float:
-        """The standard deviation of one number; 0 for one that is not among them."""
+        """The standard deviation of one parameter; 0 for one that is fixed."""
         if name not in self.names:
             return 0.0
         i = self.names.index(name)
         return float(np.sqrt(self.matrix[i, i]))
 
     def of(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
-        """Which of these numbers each of a camera's is: a selection, in the order of `parameter_names`."""
+        """The selection matrix of a camera's parameters, in the order of `parameter_names`, among these."""
         selection = np.zeros((len(parameter_names(camera)), len(self.names)))
-        index = {known: i for i, known in enumerate(self.names)}
+        index = {free: i for i, free in enumerate(self.names)}
         for row, entry in enumerate(parameter_names(camera)):
             if (column := index.get(f"{name}.{entry}")) is not None:
                 selection[row, column] = 1.0
         return selection
 
     def save(self, path: str | Path) -> None:
-        """Write it as JSON, whole or not at all."""
+        """Write it as JSON, atomically."""
         document = {"format": FORMAT, "names": list(self.names), "covariance": self.matrix.tolist()}
         write_text(path, json.dumps(document))
 
@@ -63,16 +63,16 @@ class RigCovariance:
         except (ValueError, KeyError, TypeError):
             raise ValueError(f"{path}: is not a covariance file of this program") from None
         if matrix.shape != (len(names), len(names)):
-            raise ValueError(f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file whole?")
+            raise ValueError(f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file complete?")
         return cls(names, matrix)
 
 
 def beta_covariance(
     rig: Rig, covariance: RigCovariance, alpha: str, beta: str, x: Float[np.ndarray, "n 2"], depth: float
 ) -> Float[np.ndarray, "n 2 2"]:
-    """The covariance, in pixels^2 of beta, of where the rig says that alpha's pixels at a depth (metres) are seen.
+    """The covariance, in pixels^2 of beta, of the predicted positions of alpha's pixels at a depth (metres).
 
-    To first order: the point moves in alpha's plane of that depth so that alpha's pixel stays what it is.
+    To first order: the point moves in alpha's plane of that depth so that alpha's pixel is unchanged.
     NaN where alpha's lens has no ray or beta does not see the point.
     """
     a, b = rig.pair(alpha, beta).cameras
@@ -87,18 +87,12 @@ def beta_covariance(
     return found
 
 
-def centre_covariance(camera: Camera, name: str, covariance: RigCovariance) -> Float[np.ndarray, "3 3"]:
-    """Of a camera's optical centre in the world, m^2."""
-    t = camera.t.numpy()
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    by_pose = -camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1)
-    change = by_pose @ covariance.of(name, camera)[:6]
-    return change @ covariance.matrix @ change.T
-
-
 def baseline_deviation(rig: Mapping[str, Camera], name: str, covariance: RigCovariance) -> float:
     """The standard deviation of the distance between a camera and the world's origin, metres."""
     camera = rig[name]
-    centre = camera.centre.numpy()
+    centre, (x, y, z) = camera.centre.numpy(), camera.t.numpy()
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    centre_by_pose = -camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1)
     direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
-    return float(np.sqrt(direction @ centre_covariance(camera, name, covariance) @ direction))
+    change = direction @ centre_by_pose @ covariance.of(name, camera)[:6]
+    return float(np.sqrt(change @ covariance.matrix @ change))

@@ -1,4 +1,4 @@
-"""Which part of each image, which depths and which tilts the boards covered, and what is missing."""
+"""Coverage of images, depths and tilts by the observed boards, and advice on what is missing."""
 
 from __future__ import annotations
 
@@ -10,23 +10,23 @@ from jaxtyping import Int
 
 from arraygeom import Pose
 
-from .intrinsics import Views
+from .intrinsics import BoardViews
 from .photos import FrameKey
 from .target import Board
 
 CELLS = 6, 8
-"""The image is divided into so many rows and columns."""
+"""Rows and columns of the coverage grid."""
 WIDE_ENOUGH = 0.6
 DEEP_ENOUGH = 1.5
 TILTED_ENOUGH = 20.0
-PLACES = ("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right")
+POSITIONS = ("top left", "top", "top right"), ("left", "middle", "right"), ("bottom left", "bottom", "bottom right")
 
 
 class Coverage(NamedTuple):
-    """What one camera's boards covered.
+    """Coverage of one camera by its boards.
 
     cells: points in each cell of the image. depths: (nearest, furthest) point, metres. tilts: (least, most)
-    angle between the board's normal and the optical axis, degrees. missing: sentences on what is lacking.
+    angle between the board's normal and the optical axis, degrees. missing: advice, one sentence each.
     """
 
     cells: Int[np.ndarray, "r c"]
@@ -40,36 +40,34 @@ class Coverage(NamedTuple):
         return float((self.cells > 0).mean())
 
 
-def coverage(views: Views, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
-    """What a camera's boards covered, from their poses in it."""
+def coverage(views: BoardViews, cam_from_board: Mapping[FrameKey, Pose], board: Board) -> Coverage:
+    """Coverage of a camera by its boards, from their poses in it."""
     h, w = views.hw
     x = np.concatenate([d.x for d in views.seen.values()])
     rows, columns = CELLS
     cells, _, _ = np.histogram2d(x[:, 1], x[:, 0], bins=(rows, columns), range=((-0.5, h - 0.5), (-0.5, w - 0.5)))
-    depths = np.concatenate(
-        [
-            (board.points[d.ids] @ p.R[2].numpy()) + float(p.t[2])
-            for d, p in ((d, cam_from_board[k]) for k, d in views.seen.items())
-        ]
-    )
-    tilts = np.degrees([np.arccos(min(1.0, abs(float(cam_from_board[k].R[2, 2])))) for k in views.seen])
-    found = Coverage(
-        cells.astype(np.int64), (float(depths.min()), float(depths.max())), (float(tilts.min()), float(tilts.max())), ()
-    )
+    poses = {key: cam_from_board[key] for key in views.seen}
+    depths = [board.points[d.ids] @ poses[k].R[2].numpy() + float(poses[k].t[2]) for k, d in views.seen.items()]
+    tilts = np.degrees([np.arccos(min(1.0, abs(float(pose.R[2, 2])))) for pose in poses.values()])
+    found = Coverage(cells.astype(np.int64), _range(np.concatenate(depths)), _range(tilts), ())
     return found._replace(missing=tuple(_missing(found)))
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
 
 
 def _missing(found: Coverage) -> list[str]:
     missing = []
     thirds = found.cells.reshape(3, CELLS[0] // 3, CELLS[1])
     empty = [
-        PLACES[i][j]
+        POSITIONS[i][j]
         for i, band in enumerate(thirds)
         for j, part in enumerate(np.array_split(band, 3, axis=1))
         if not part.any()
     ]
     if empty:
-        missing.append(f"no points at the {', '.join(empty)} of the image: the lens is a guess there")
+        missing.append(f"no points at the {', '.join(empty)} of the image: the lens model is extrapolated there")
     elif found.share < WIDE_ENOUGH:
         missing.append(f"points in only {found.share:.0%} of the image: fill it, corners too")
     if found.depths[1] < DEEP_ENOUGH * found.depths[0]:

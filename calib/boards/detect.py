@@ -1,4 +1,4 @@
-"""Finding a board's points in an image, to a fraction of a pixel.
+"""Detection of a board's points in an image, to a fraction of a pixel.
 
 OpenCV 4.10 and newer, and 5. Images that are dim, flat or inverted (near infrared, narrow bands) are stretched,
 equalised and inverted in turn until the board is found.
@@ -14,24 +14,24 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
-from .corners import refine_corners
+from .corners import monomials, refine_corners
 from .target import Board, Charuco, Chessboard, Circles, marker_dictionary
 
 Grey = UInt8[np.ndarray, "h w"]
 
 FEWEST = 8
-"""Fewer points of a board than this in an image are not used: a pose needs 4, a check of it more."""
+"""Points that a detection must have: a pose needs 4, a check of it more."""
 ENOUGH = 0.6
-"""If less than this share of a board's corners look like corners, the image is not fit for fitting them."""
-CROOKED = 0.35
-"""A board is refused if its points are this far (of their spacing) from a smoothly bent grid: a false detection."""
+"""Share of a board's corners that must fit the corner model, else all are refined by gradients."""
+LARGEST_MISFIT = 0.35
+"""Largest median distance (in spacings) of the points from a smoothly distorted grid: beyond it, a false detection."""
 SMALL = 640
-"""Images are reduced to this width when they are only asked which board they show."""
+"""Width to which images are reduced to identify the board they show."""
 OTHER_DICTIONARIES = ("4x4_1000", "5x5_1000", "6x6_1000", "7x7_1000", "aruco_original", "apriltag_36h11")
 
 
 class Detection(NamedTuple):
-    """The points of a board seen in one image: their numbers on the board and their pixels."""
+    """Points of a board detected in one image: their indices on the board and their pixels."""
 
     ids: Int[np.ndarray, " n"]
     x: Float[np.ndarray, "n 2"]
@@ -41,9 +41,9 @@ def detect(grey: Grey, board: Board) -> Detection | None:
     """The board's points in a grey image (uint8), or None if it is not found."""
     for candidate in _versions(grey):
         found = _FINDERS[type(board)](candidate, board)
-        if found is not None and _believable(found, board):
+        if found is not None and _plausible(found, board):
             refined = _refined(grey, found, board)
-            return refined if _believable(refined, board) else found
+            return refined if _plausible(refined, board) else found
     return None
 
 
@@ -58,13 +58,13 @@ def to_grey(image: np.ndarray) -> Grey:
 
 
 def explain(images: Iterable[Grey], board: Board) -> str:
-    """Why a board may not have been found in images: the likeliest cause, in words."""
+    """The likeliest reason why a board was not found in images, as text."""
     reasons = Counter(_reason(grey, board) for grey in images)
     return reasons.most_common(1)[0][0] if reasons else "there are no images"
 
 
 def other_size(images: Iterable[Grey], board: Board) -> str | None:
-    """The size of the chessboard that images show if most of them show another one than `board`, in its words."""
+    """The size of the chessboard in the images, as "9x6", if most show one of another size than `board`."""
     if not isinstance(board, Chessboard):
         return None
     sizes = Counter(size for grey in images if (size := _grid_size(grey)) is not None)
@@ -96,7 +96,7 @@ def _chessboard(grey: Grey, board: Chessboard) -> Detection | None:
 
 
 def _right_handed(grid: np.ndarray) -> np.ndarray:
-    """The corners numbered so that x, y and the view into the board are a right-handed frame."""
+    """The corners ordered so that x, y and the direction into the board are a right-handed frame."""
     (ax, ay), (bx, by) = grid[0, -1] - grid[0, 0], grid[-1, 0] - grid[0, 0]
     return (grid if ax * by - ay * bx > 0 else grid[:, ::-1]).reshape(-1, 2)
 
@@ -129,9 +129,9 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
 
 
 def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
-    """Corners where they are to a hundredth of a pixel; of boards that may be seen in part, without those that hide.
+    """Corners refined to a hundredth of a pixel; of boards that may be seen in part, without occluded ones.
 
-    Where few look as corners should, as in images too small for it, all are taken where gradients say.
+    Where few fit the corner model, as in images that are too small for it, all are refined by gradients.
     """
     if isinstance(board, Circles):
         return found
@@ -144,40 +144,35 @@ def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
     return Detection(found.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
 
 
-def _by_gradients(grey: Grey, x: np.ndarray, disparity: float) -> np.ndarray:
-    """Corners where the gradients around them say, in windows that reach this share of the way to the next corner."""
+def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
+    """Corners by OpenCV's gradient criterion, in windows of `share` times the distance to the next corner."""
     apart = np.sort(np.linalg.norm(x[:, None] - x[None], axis=-1), axis=1)[:, 1]
-    half = int(np.clip(disparity * np.quantile(apart, 0.1), 2, 11))
+    half = int(np.clip(share * np.quantile(apart, 0.1), 2, 11))
     criteria = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_COUNT, 60, 1e-4)
     refined = cv2.cornerSubPix(grey, x.astype(np.float32).reshape(-1, 1, 2), (half, half), (-1, -1), criteria)
     return refined.reshape(-1, 2).astype(np.float64)
 
 
-def _believable(found: Detection, board: Board) -> bool:
-    """Whether there are enough points, not on one line, and on a smoothly bent grid."""
-    return len(found.ids) >= FEWEST and _spans_a_plane(found, board) and _smooth(found, board)
-
-
-def _spans_a_plane(found: Detection, board: Board) -> bool:
-    """Whether the points do not all lie on one line of the board."""
+def _plausible(found: Detection, board: Board) -> bool:
+    """Whether there are enough points, not collinear, and on a smoothly distorted grid."""
     p = board.points[found.ids, :2]
-    return bool(np.linalg.svd(p - p.mean(0), compute_uv=False)[1] > 0.5 * board.spacing)
+    if len(p) < FEWEST or np.linalg.svd(p - p.mean(0), compute_uv=False)[1] <= 0.5 * board.spacing:
+        return False
+    return _smooth(found, board)
 
 
 def _smooth(found: Detection, board: Board) -> bool:
-    """Whether a polynomial of degree 3 of the points on the board, on top of a homography, gives the pixels."""
+    """Whether a homography plus a polynomial of degree 3 maps the points on the board to the pixels."""
     p = board.points[found.ids, :2]
     H, _ = cv2.findHomography(p, found.x)
     if H is None:
         return False
     flat = cv2.perspectiveTransform(p[:, None], H)[:, 0]
     apart = np.sort(np.linalg.norm(flat[:, None] - flat[None], axis=-1), axis=1)[:, 1]
-    u, v = ((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0)).T
-    terms = [u**i * v**j for i in range(4) for j in range(4 - i)] if len(p) >= 30 else [u**0, u, v]
-    basis = np.stack(terms, 1)
+    basis = monomials((p - p.mean(0)) / np.abs(p - p.mean(0)).max(0), 3 if len(p) >= 30 else 1)
     distort = np.linalg.lstsq(basis, found.x - flat, rcond=None)[0]
     left = np.linalg.norm(found.x - flat - basis @ distort, axis=-1)
-    return bool(np.median(left) < CROOKED * np.median(apart) and np.isfinite(left).all())
+    return bool(np.median(left) < LARGEST_MISFIT * np.median(apart) and np.isfinite(left).all())
 
 
 def _reason(grey: Grey, board: Board) -> str:
@@ -187,30 +182,30 @@ def _reason(grey: Grey, board: Board) -> str:
     if isinstance(board, Charuco) and (reason := _charuco_reason(grey, board)):
         return reason
     if other := other_size([grey], board):
-        return f"a chessboard with {other} inner corners is seen: is the board's size right?"
+        return f"a chessboard with {other} inner corners is visible: is the board's size right?"
     if detect(np.ascontiguousarray(grey[:, ::-1]), board) is not None:
-        return "it is found once the image is mirrored: save the images as the camera sees, not mirrored"
+        return "it is found once the image is mirrored: save the images as captured, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
         return "the images are blurred: focus, and hold the board still"
-    whole = "" if isinstance(board, Charuco) else ", whole and with its white margin"
-    return f"no such board is seen{whole}: check the board's name, and that it is in the image, large and lit"
+    margin = "" if isinstance(board, Charuco) else " completely and with its white margin"
+    return f"no such board is visible{margin}: check the board's name, and that it is in the image, large and lit"
 
 
 def _charuco_reason(grey: Grey, board: Charuco) -> str | None:
     needed = (board.columns + 1) * (board.rows + 1) // 2
     ids = _markers(grey, board.dictionary)
     if len(ids) >= 4 and max(ids) >= needed:
-        return f"markers up to number {max(ids)} are seen and the board has 0 to {needed - 1}: is its size right?"
+        return f"markers up to number {max(ids)} are visible and the board has 0 to {needed - 1}: is its size right?"
     if len(ids) >= 4:
         return (
-            f"{len(ids)} of its markers are seen, but not where they should be: is the size right (squares across x "
+            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (squares across x "
             "down)? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _markers(grey, name)) >= 6:
-            return f"{len(seen)} markers of the dictionary {name} are seen, not of {board.dictionary}: name that one"
+            return f"{len(seen)} markers of the dictionary {name} are visible, not of {board.dictionary}: name that one"
     if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)) >= 4:
-        return "its markers are found once the image is mirrored: save the images as the camera sees, not mirrored"
+        return "its markers are found once the image is mirrored: save the images as captured, not mirrored"
     return None
 
 

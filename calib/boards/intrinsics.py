@@ -1,4 +1,4 @@
-"""One camera from its images of a board, to start from: Zhang's method, by OpenCV."""
+"""Initial calibration of one camera from its images of a board: Zhang's method, by OpenCV."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from .target import Board
 Lens = Literal["brown-conrady", "kannala-brandt", "none"]
 FEWEST_IMAGES = 3
 FEWEST_TILT = 8.0
-"""Boards whose normals are all within this many degrees of each other count as parallel."""
+"""Boards whose normals differ by less than this many degrees count as parallel."""
 
 
 @dataclass(frozen=True)
-class Views:
-    """What one camera saw of the board: its images' size and, by moment, the points found."""
+class BoardViews:
+    """One camera's image size and, by moment, the board points detected."""
 
     hw: HW
     seen: Mapping[FrameKey, Detection]
@@ -34,7 +34,7 @@ class Views:
 Solved = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 
 
-class Start(NamedTuple):
+class InitialCamera(NamedTuple):
     """A camera at the origin, the board's pose in it by moment, and each image's reprojection error in pixels."""
 
     camera: Camera
@@ -42,7 +42,7 @@ class Start(NamedTuple):
     rms: dict[FrameKey, float]
 
 
-def calibrate_camera(name: str, views: Views, board: Board, *, lens: Lens = "brown-conrady") -> Start:
+def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady") -> InitialCamera:
     """A camera's intrinsics, lens and board poses from its own images.
 
     Raises ValueError if there are fewer than three images with a board, or if the board was never tilted.
@@ -57,24 +57,24 @@ def calibrate_camera(name: str, views: Views, board: Board, *, lens: Lens = "bro
         K, coefficients, rotations, translations = _fisheye(views, board) if fisheye else _pinhole(views, board, lens)
     except cv2.error as error:
         raise ValueError(
-            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): are they all alike?"
+            f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same board?"
         ) from None
     distortion = None if lens == "none" else Distortion(lens, torch.tensor(coefficients))
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     poses = {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
     check_tilts(name, poses)
     rms = {key: _rms(camera, pose, views.seen[key], board) for key, pose in poses.items()}
-    return Start(camera, poses, rms)
+    return InitialCamera(camera, poses, rms)
 
 
 def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
-    """Raises ValueError if all boards are parallel: the focal length cannot be told from the distance then."""
+    """Raises ValueError if all boards are parallel: focal length and distance are ambiguous then."""
     normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
     widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if widest < FEWEST_TILT:
         raise ValueError(
-            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance cannot be "
-            "told apart: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
+            f"{name}: all boards are parallel (to {widest:.1f} degrees), so that focal length and distance are "
+            "ambiguous: tilt the board by 20 to 40 degrees, to different sides, in most of the images"
         )
 
 
@@ -84,15 +84,14 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     flat = rays[usable, :2] / rays[usable, 2:]
-    _, r, t = cv2.solvePnP(board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), flags=cv2.SOLVEPNP_IPPE)
-    _, r, t = cv2.solvePnP(
-        board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4), r, t, True, cv2.SOLVEPNP_ITERATIVE
-    )
+    correspondences = board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4)
+    _, r, t = cv2.solvePnP(*correspondences, flags=cv2.SOLVEPNP_IPPE)
+    _, r, t = cv2.solvePnP(*correspondences, r, t, True, cv2.SOLVEPNP_ITERATIVE)
     return _pose(r, t)
 
 
-def _pinhole(views: Views, board: Board, lens: Lens) -> Solved:
-    """Two radial terms are enough to start from: (K, k1 k2 p1 p2 k3, rotations, translations)."""
+def _pinhole(views: BoardViews, board: Board, lens: Lens) -> Solved:
+    """Two radial terms suffice initially: (K, k1 k2 p1 p2 k3, rotations, translations)."""
     points = [board.points[d.ids].astype(np.float32) for d in views.seen.values()]
     pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
     h, w = views.hw
@@ -103,7 +102,7 @@ def _pinhole(views: Views, board: Board, lens: Lens) -> Solved:
     return K, c.reshape(-1)[:5], list(rotations), list(translations)
 
 
-def _fisheye(views: Views, board: Board) -> Solved:
+def _fisheye(views: BoardViews, board: Board) -> Solved:
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw

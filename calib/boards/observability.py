@@ -1,4 +1,4 @@
-"""What the images can tell of a camera, and what had better be left alone."""
+"""Which camera parameters the images determine; unobservable ones are fixed."""
 
 from __future__ import annotations
 
@@ -9,99 +9,100 @@ from jaxtyping import Float
 
 from arraygeom import Camera
 
-from .bundle import Expected, Free, Scene, intrinsic_numbers, normal_equations, parameter_names
+from .bundle import BundleProblem, Free, IntrinsicsPrior, intrinsic_values, normal_equations, parameter_names
 
-NATURAL = {
+TYPICAL_COEFFICIENTS = {
     "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
     "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
 }
-"""How large the coefficients of lenses usually are, at most."""
+"""Upper bounds of the usual sizes of distortion coefficients."""
 LENS_TERMS = {
     "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
     "kannala-brandt": ("k1", "k2", "k3", "k4"),
 }
-"""What the coefficients are called, in their order."""
-NATURAL_FOCAL, NATURAL_CENTRE = 0.1, 0.1
-"""The same for the error of a guessed focal length, as a share of it, and of the principal point, of the width."""
-USUAL_CENTRE, USUAL_ASPECT = 0.03, 0.01
-"""Cameras tend to have the principal point so near to the middle (as a share of the width), and pixels so square."""
-UNTOLD = 0.5
-"""A number whose deviation, all others unknown, stays above this share of its natural size is not told."""
+"""Names of the coefficients, in order."""
+TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1
+"""Likewise of the error of a guessed focal length, as a share of it, and of the principal point, of the width."""
+CENTRE_DEVIATION, ASPECT_DEVIATION = 0.03, 0.01
+"""Standard deviations of the principal point about the centre (share of the width), and of the aspect ratio."""
+UNOBSERVABLE = 0.5
+"""A parameter is unobservable if its posterior deviation stays above this share of its typical size."""
 
 
-def natural_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
-    """What each number of a camera may be off by when nothing is measured, in the order of `parameter_names`."""
-    focal = NATURAL_FOCAL * camera.K[:2, :2].det().abs().sqrt().item()
+def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
+    """Typical errors of a camera's parameters before any measurement, in the order of `parameter_names`."""
+    focal = TYPICAL_FOCAL_ERROR * camera.K[:2, :2].det().abs().sqrt().item()
     lens = camera.distortion
-    coefficients = () if lens is None else NATURAL[lens.model][: len(lens.coefficients)]
-    return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [NATURAL_CENTRE * camera.hw[1]] * 2 + [*coefficients])
+    coefficients = () if lens is None else TYPICAL_COEFFICIENTS[lens.model][: len(lens.coefficients)]
+    return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [TYPICAL_CENTRE_ERROR * camera.hw[1]] * 2 + [*coefficients])
 
 
-def usual(camera: Camera) -> Expected:
-    """What cameras are like: square pixels, the principal point about the middle, a lens that does not bend wildly.
+def typical_prior(camera: Camera) -> IntrinsicsPrior:
+    """Prior of ordinary cameras: square pixels, a principal point near the centre, moderate distortion.
 
-    Next to nothing where boards were seen at many places and tilts; where they were not, it keeps a camera plausible.
+    Negligible where boards were observed at many positions and tilts; elsewhere it keeps a camera plausible.
     """
     h, w = camera.hw
-    mean = np.zeros(len(intrinsic_numbers(camera)))
+    mean = np.zeros(len(intrinsic_values(camera)))
     mean[8:10] = (w - 1) / 2, (h - 1) / 2
-    deviation = natural_sizes(camera)
-    deviation[8:10] = USUAL_CENTRE * w
+    deviation = typical_sizes(camera)
+    deviation[8:10] = CENTRE_DEVIATION * w
     information = np.diag(deviation**-2.0)
     information[:8, :8] = 0.0
     focal = camera.K[:2, :2].det().abs().sqrt().item()
-    information[6:8, 6:8] = np.array([[1, -1], [-1, 1]]) / (USUAL_ASPECT * focal) ** 2
-    return Expected(mean, information)
+    information[6:8, 6:8] = np.array([[1, -1], [-1, 1]]) / (ASPECT_DEVIATION * focal) ** 2
+    return IntrinsicsPrior(mean, information)
 
 
 def gate(
-    scene: Scene, free: Free, sigma: dict[str, float], *, final: bool = True
-) -> tuple[Scene, dict[str, np.ndarray], list[str]]:
-    """Keep fixed, at what a plain camera has, every number of a lens that the images do not tell, worst first.
+    problem: BundleProblem, free: Free, sigma: dict[str, float], *, final: bool = True
+) -> tuple[BundleProblem, dict[str, np.ndarray], list[str]]:
+    """Fix every unobservable parameter of the lens and the principal point at its default, worst first.
 
-    Returns the scene with those numbers set, what is still free, and sentences that say so. Once the fit is `final`,
-    raises ValueError where a focal length is not told.
+    Returns the problem with those parameters set, the remaining free ones, and a note on each. Once the fit is `final`,
+    raises ValueError where a focal length is unobservable.
     """
-    mine, notes = {name: mask.copy() for name, mask in free.items()}, []
-    places = [(name, int(i)) for name in scene.cameras for i in np.flatnonzero(free[name])]
-    information = _relative_information(scene, free, sigma)
-    while (worst := _worst(places, information)) is not None:
-        name, index = places[worst]
-        entry = parameter_names(scene.cameras[name])[index]
+    observable = {name: mask.copy() for name, mask in free.items()}
+    notes: list[str] = []
+    candidates = [(name, int(i)) for name in problem.cameras for i in np.flatnonzero(free[name])]
+    information = _relative_information(problem, free, sigma)
+    while (worst := _worst(candidates, information)) is not None:
+        name, index = candidates[worst]
+        entry = parameter_names(problem.cameras[name])[index]
         if entry.startswith("focal"):
             if not final:
                 break
             raise ValueError(
-                f"{name}: the images do not tell the focal length: tilt the board by 20 to 40 degrees, to different "
-                "sides, and bring it close in some of them"
+                f"{name}: the images do not determine the focal length: tilt the board by 20 to 40 degrees, to "
+                "different sides, and bring it close in some of them"
             )
-        mine[name][index] = False
-        places.pop(worst)
+        observable[name][index] = False
+        candidates.pop(worst)
         information = np.delete(np.delete(information, worst, 0), worst, 1)
-        scene = _plain(scene, name, entry)
-        notes.append(f"{name}: {_described(scene.cameras[name], entry)}: the images do not tell it")
-    return scene, mine, notes
+        problem = _with_default(problem, name, entry)
+        notes.append(f"{name}: {_described(problem.cameras[name], entry)}: the images do not determine it")
+    return problem, observable, notes
 
 
-def _relative_information(scene: Scene, free: Free, sigma: dict[str, float]) -> np.ndarray:
-    """The inverse covariance of the free numbers in units of their natural sizes."""
-    sizes = np.concatenate([natural_sizes(camera)[free[name]] for name, camera in scene.cameras.items()])
-    told = normal_equations(replace(scene, expected={}), free, sigma).information()
-    return told * sizes[:, None] * sizes
+def _relative_information(problem: BundleProblem, free: Free, sigma: dict[str, float]) -> np.ndarray:
+    """The inverse covariance of the free parameters in units of their typical sizes."""
+    sizes = np.concatenate([typical_sizes(camera)[free[name]] for name, camera in problem.cameras.items()])
+    information = normal_equations(replace(problem, priors={}), free, sigma).information()
+    return information * sizes[:, None] * sizes
 
 
-def _worst(places: list[tuple[str, int]], information: np.ndarray) -> int | None:
-    """The number whose deviation is the largest share of its natural size, if too large; focal lengths last."""
-    covariance = np.linalg.inv(information + np.eye(len(places)))
+def _worst(candidates: list[tuple[str, int]], information: np.ndarray) -> int | None:
+    """The parameter whose deviation is the largest share of its typical size, if too large; focal lengths last."""
+    covariance = np.linalg.inv(information + np.eye(len(candidates)))
     shares = np.sqrt(np.maximum(covariance.diagonal(), 0))
-    order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in places]) * (shares > UNTOLD)
+    order = np.array([2 if i >= 8 else 1 if i >= 6 else 0 for _, i in candidates]) * (shares > UNOBSERVABLE)
     worst = int(np.lexsort((shares, order))[-1])
     return worst if order[worst] else None
 
 
-def _plain(scene: Scene, name: str, entry: str) -> Scene:
-    """The scene with one number of a camera as a plain camera has it."""
-    camera = scene.cameras[name]
+def _with_default(problem: BundleProblem, name: str, entry: str) -> BundleProblem:
+    """The problem with one parameter of a camera at its default: principal point centred, coefficient 0."""
+    camera = problem.cameras[name]
     kind, index = entry.split(".")
     if kind == "centre":
         K = camera.K.clone()
@@ -111,12 +112,12 @@ def _plain(scene: Scene, name: str, entry: str) -> Scene:
         coefficients = camera.distortion.coefficients.clone()
         coefficients[int(index)] = 0.0
         camera = camera.replace(distortion=type(camera.distortion)(camera.distortion.model, coefficients))
-    return replace(scene, cameras={**scene.cameras, name: camera})
+    return replace(problem, cameras={**problem.cameras, name: camera})
 
 
 def _described(camera: Camera, entry: str) -> str:
     kind, index = entry.split(".")
     if kind == "centre":
-        return f"the principal point's {'xy'[int(index)]} is kept at the image's middle"
+        return f"the principal point's {'xy'[int(index)]} is fixed at the image's centre"
     assert camera.distortion is not None
-    return f"the lens's {LENS_TERMS[camera.distortion.model][int(index)]} is kept at 0"
+    return f"the lens's {LENS_TERMS[camera.distortion.model][int(index)]} is fixed at 0"

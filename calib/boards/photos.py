@@ -1,7 +1,7 @@
-"""Which camera took which image when: folders, file names, videos.
+"""Cameras and moments of the images in a folder: subfolders, file names, videos.
 
 A folder for each camera, or files in one folder whose names begin with the camera's, or patterns. Images of
-one moment have the same number (or the same name, apart from what all names of the camera share).
+one moment have the same number (or the same name, apart from the part that all names of a camera share).
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,15 +21,15 @@ from .detect import Grey, to_grey
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
 VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
-"""Of a video, at most this many frames are looked at: every first, second, fourth, eighth ..., so that videos of
-somewhat different lengths share them."""
+"""Largest number of frames used of a video: every first, second, fourth, eighth ..., so that videos of somewhat
+different lengths share them."""
 
 FrameKey = int | str
 
 
 @dataclass(frozen=True)
 class Photo:
-    """One image of one camera; decoding it is put off until it is needed. `label` is what to call it in words."""
+    """One image of one camera, decoded when needed. `label` names it in messages."""
 
     label: str
     decode: Callable[[], np.ndarray]
@@ -45,10 +46,9 @@ Photos = Mapping[str, Mapping[FrameKey, Photo]]
 def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> Photos:
     """The images of every camera below a folder.
 
-    `patterns` (camera name: pattern of file names, relative to the folder) says it outright. Otherwise every
-    subfolder with images or a video is a camera, or, where there is none, every beginning of file names before
-    a final number is (left01.jpg, right01.jpg), or every video.
-    Raises FileNotFoundError and ValueError, saying what was looked for.
+    `patterns` maps camera names to patterns of file names, relative to the folder. Without it every subfolder with
+    images or a video is a camera; where there is none, every prefix of file names before a final number
+    (left01.jpg, right01.jpg), or every video. Raises FileNotFoundError and ValueError.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of images: give one with a subfolder for each camera")
@@ -59,7 +59,7 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:
-    """What tells the images of one camera apart: the part of the names that differs, as a number if it is one.
+    """What distinguishes the images of one camera: the part of the names that differs, as a number if it is one.
 
     >>> frame_keys(["cam01_08_int", "cam01_09_int", "cam01_10_int"])
     [8, 9, 10]
@@ -68,14 +68,14 @@ def frame_keys(stems: list[str]) -> list[FrameKey]:
     if len(stems) == 1:
         numbers = pieces[0][1::2]
         return [int(numbers[-1]) if numbers else stems[0]]
-    head = _alike(pieces)
-    tail = _alike([p[head:][::-1] for p in pieces])
+    head = _common_prefix(pieces)
+    tail = _common_prefix([p[head:][::-1] for p in pieces])
     middles = ["".join(p[head : len(p) - tail]) for p in pieces]
     return [int(m) if m.isdecimal() else m for m in middles]
 
 
-def _alike(lists: list[list[str]]) -> int:
-    """How many first items all lists share."""
+def _common_prefix(lists: list[list[str]]) -> int:
+    """The number of first items that all lists share."""
     return next((i for i, items in enumerate(zip(*lists)) if len(set(items)) > 1), min(map(len, lists)))
 
 
@@ -116,18 +116,15 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
         raise ValueError(f"{name}: two images have the same number, such as {files[0].name}: give each its own")
-    return {key: Photo(file.name, _reader(file)) for key, file in zip(keys, files)}
+    return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
 
 
-def _reader(path: Path) -> Callable[[], np.ndarray]:
-    def decode() -> np.ndarray:
-        flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
-        image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
-        if image is None:
-            raise ValueError(f"{path}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
-        return image
-
-    return decode
+def _decode_file(path: Path) -> np.ndarray:
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    if image is None:
+        raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
+    return image
 
 
 def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
@@ -138,17 +135,14 @@ def _video_frames(path: Path) -> Iterator[tuple[int, Photo]]:
         raise ValueError(f"{path}: not a video that can be read: save images from it, or convert it to .mp4")
     step = 1 << max(0, math.ceil(math.log2(count / MOST_FRAMES)))
     for index in range(0, count, step):
-        yield index, Photo(f"{path.name} frame {index}", _frame_reader(path, index))
+        yield index, Photo(f"{path.name} frame {index}", partial(_decode_frame, path, index))
 
 
-def _frame_reader(path: Path, index: int) -> Callable[[], np.ndarray]:
-    def decode() -> np.ndarray:
-        video = cv2.VideoCapture(str(path))
-        video.set(cv2.CAP_PROP_POS_FRAMES, index)
-        done, image = video.read()
-        video.release()
-        if not done:
-            raise ValueError(f"{path}: frame {index} cannot be read: is the video whole?")
-        return image
-
-    return decode
+def _decode_frame(path: Path, index: int) -> np.ndarray:
+    video = cv2.VideoCapture(str(path))
+    video.set(cv2.CAP_PROP_POS_FRAMES, index)
+    done, image = video.read()
+    video.release()
+    if not done:
+        raise ValueError(f"{path}: frame {index} cannot be read: is the video complete?")
+    return image

@@ -1,4 +1,4 @@
-"""The report of a calibration: one HTML file with its figures inside."""
+"""The report of a calibration: one HTML file with embedded figures."""
 
 from __future__ import annotations
 
@@ -6,21 +6,23 @@ import base64
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from io import BytesIO
+from itertools import cycle
 from typing import Any
 
 import numpy as np
+import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from torch import Tensor
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Camera, Rig
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
-from .bundle import BoardPoses
-from .calibrate import Calibration
 from .covariance import RigCovariance, baseline_deviation, beta_covariance
 from .coverage import CELLS, Coverage, coverage
 from .observability import LENS_TERMS
+from .rig import Calibration
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -37,7 +39,9 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<p>{escape(summary(calibration))}</p>",
-        _list(advice) if advice else "<p>Nothing is missing.</p>",
+        "<ul>" + "".join(f'<li class="note">{escape(a)}</li>' for a in advice) + "</ul>"
+        if advice
+        else "<p>No advice.</p>",
         "<h2>Cameras</h2>",
         camera_table(calibration, covers),
         "<h2>Pairs</h2>" + pair_table(calibration) if len(calibration.views) > 1 else "",
@@ -54,9 +58,9 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
     if len(calibration.views) > 1 and calibration.fit.covariance is not None:
         near, far = depths(covers.values())
         parts += [
-            "<h2>Uncertainty of what is predicted</h2>",
-            "<p>How far (pixels, one standard deviation, worst direction) what the first camera sees may be from where "
-            f"the rig says the others see it, at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
+            "<h2>Uncertainty of predicted positions</h2>",
+            "<p>Standard deviation (pixels, worst direction) of the positions predicted in the other cameras for "
+            f"pixels of the first, at {near:.3g} m (nearest board) and {far:.3g} m (furthest).</p>",
             image(draw_uncertainty(calibration, (near, far))),
         ]
     body = "\n".join(parts)
@@ -66,38 +70,31 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
 
 def summary(calibration: Calibration) -> str:
     """The calibration in a sentence or two."""
-    points = sum(len(seen.x) for seen in calibration.fit.scene.seen.values())
+    points = sum(len(seen.x) for seen in calibration.fit.problem.seen.values())
     text = (
         f"{len(calibration.views)} cameras, {len(calibration.frames)} frames of {calibration.board}, {points} points: "
         f"reprojection error {calibration.rms:.3f} px (RMS)."
     )
     for where, errors in (("", calibration.epipolar), (" on held-out frames", calibration.held_out)):
         if errors:
-            everything = np.concatenate(list(errors.values()))
-            most = np.quantile(everything, 0.95)
-            text += f" Epipolar error{where} {everything.mean():.3f} px (mean; 95 % below {most:.3f})."
+            pooled = np.concatenate(list(errors.values()))
+            text += f" Epipolar error{where} {_mean_and_quantile(pooled, ' px (mean; 95 % below ')})."
     return text
 
 
 def coverages(calibration: Calibration) -> dict[str, Coverage]:
-    """Of every camera."""
-    structure = calibration.fit.scene.structure
-    assert isinstance(structure, BoardPoses)
-    boards = structure.world_from_board
+    """Coverage of every camera."""
+    problem = calibration.fit.problem
+    boards = problem.board_poses(calibration.frames)
     found = {}
     for name, views in calibration.views.items():
-        camera = calibration.fit.scene.cameras[name]
-        poses = {
-            key: camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
-            for i, key in enumerate(calibration.frames)
-            if key in views.seen
-        }
+        poses = {key: problem.cameras[name].cam_from_world @ boards[key] for key in views.seen}
         found[name] = coverage(views, poses, calibration.board)
     return found
 
 
 def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
-    """Of the nearest and the furthest board point."""
+    """Depths of the nearest and the furthest board point, metres."""
     near, far = zip(*(c.depths for c in covers))
     return max(min(near), 1e-3), max(far)
 
@@ -106,18 +103,18 @@ def depths(covers: Iterable[Coverage]) -> tuple[float, float]:
 
 
 def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> str:
-    """One row a camera: how much was seen, how well it fits, and its numbers with their deviations."""
-    residuals = calibration.fit.scene.residuals()
+    """One row per camera: points, residuals, and parameters with standard deviations."""
+    residuals = calibration.fit.problem.residuals()
     head = "camera|images, points|error px, together (alone)|noise px|focal length px|principal point px|lens|covered"
     rows = []
-    for name, camera in calibration.fit.scene.cameras.items():
+    for name, camera in calibration.fit.problem.cameras.items():
         views, r, covered = calibration.views[name], residuals[name], covers[name]
         rms = np.sqrt((r**2).sum(-1).mean())
         rows.append(
             (
                 f"{name} {camera.hw[1]}x{camera.hw[0]}",
                 f"{len(views.seen)}, {len(r)}",
-                f"{rms:.3f} ({calibration.alone[name]:.3f})",
+                f"{rms:.3f} ({calibration.single[name]:.3f})",
                 f"{calibration.fit.sigma[name]:.3f}",
                 _with_deviations(calibration, name, camera, "focal"),
                 _with_deviations(calibration, name, camera, "centre"),
@@ -130,9 +127,9 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
 
 
 def pair_table(calibration: Calibration) -> str:
-    """One row a pair: baseline, turn and epipolar errors."""
+    """One row per pair: baseline, relative rotation and epipolar errors."""
     covariance = rig_covariance(calibration)
-    cameras = calibration.fit.scene.cameras
+    cameras = calibration.fit.problem.cameras
     first = next(iter(cameras))
     rows = []
     for (a, b), errors in calibration.epipolar.items():
@@ -143,16 +140,20 @@ def pair_table(calibration: Calibration) -> str:
             (
                 f"{a} – {b}",
                 f"{1e3 * baseline:.2f}" + (f" ± {1e3 * deviation:.2f}" if deviation is not None else ""),
-                f"{_turn(cameras[a], cameras[b]):.3f}",
-                f"{errors.mean():.3f}, {np.quantile(errors, 0.95):.3f}",
-                "" if held is None or not len(held) else f"{held.mean():.3f}, {np.quantile(held, 0.95):.3f}",
+                f"{_rotation_angle(cameras[a], cameras[b]):.3f}",
+                _mean_and_quantile(errors),
+                "" if held is None or not len(held) else _mean_and_quantile(held),
             )
         )
-    return _table(["pair", "baseline mm", "turn deg", "epipolar error px, mean, 95 %", "on held-out frames"], rows)
+    return _table(["pair", "baseline mm", "rotation deg", "epipolar error px, mean, 95 %", "on held-out frames"], rows)
+
+
+def _mean_and_quantile(errors: np.ndarray, between: str = ", ") -> str:
+    return f"{errors.mean():.3f}{between}{np.quantile(errors, 0.95):.3f}"
 
 
 def rig_covariance(calibration: Calibration) -> RigCovariance | None:
-    """The covariance of the calibration's free numbers, if they can be told."""
+    """The covariance of the calibration's free parameters, if they are observable."""
     matrix = calibration.fit.covariance
     return None if matrix is None else RigCovariance(calibration.fit.names, matrix)
 
@@ -169,7 +170,7 @@ def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: 
     for i, value in enumerate(values):
         label = "" if kind != "distortion" or lens is None else f"{LENS_TERMS[lens.model][i]} "
         if f"{name}.{kind}.{i}" not in calibration.fit.names:
-            texts.append(f"{label}{value:.4g} (kept)" if value or kind != "distortion" else "")
+            texts.append(f"{label}{value:.4g} (fixed)" if value or kind != "distortion" else "")
             continue
         deviation = covariance.deviation(f"{name}.{kind}.{i}") if covariance else float("nan")
         texts.append(f"{label}{value:.{_digits(deviation)}f} ± {deviation:.2g}")
@@ -177,11 +178,11 @@ def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: 
 
 
 def _digits(deviation: float) -> int:
-    """Decimals that a number with a deviation deserves."""
+    """Significant decimals of a value with a standard deviation."""
     return int(np.clip(1 - np.floor(np.log10(deviation)), 0, 8)) if deviation > 0 else 4
 
 
-def _turn(a: Camera, b: Camera) -> float:
+def _rotation_angle(a: Camera, b: Camera) -> float:
     cosine = (float((b.R @ a.R.T).trace()) - 1) / 2
     return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
@@ -192,33 +193,27 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return f"<table><tr>{top}</tr>{''.join(lines)}</table>"
 
 
-def _list(items: Sequence[str]) -> str:
-    return "<ul>" + "".join(f'<li class="note">{escape(item)}</li>' for item in items) + "</ul>"
-
-
 # Figures ------------------------------------------------------------------------------------------------------
 
 
 def draw_scene(calibration: Calibration) -> Figure:
-    """The rig alone, and the boards as the first camera's neighbours saw them, from above."""
-    structure = calibration.fit.scene.structure
-    assert isinstance(structure, BoardPoses)
-    figure = draw_rig(Rig({_plain(n): c for n, c in calibration.rig.cameras.items()}))
+    """The rig alone, and the rig with the boards from above."""
+    figure = draw_rig(Rig({_escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
     axes.set_position((0.0, 0.02, 0.46, 0.94))
     figure.set_layout_engine("none")
     above = figure.add_axes((0.55, 0.12, 0.43, 0.8))
     corners = _outline(calibration)
-    for i in range(len(structure)):
-        X = corners @ structure.world_from_board.R[i].numpy().T + structure.world_from_board.t[i].numpy()
+    for pose in calibration.fit.problem.board_poses(calibration.frames).values():
+        X = pose.apply(corners).numpy()
         above.plot(X[:, 0], X[:, 2], color="0.75", lw=0.8)
-    for colour, (name, camera) in zip(_colours(), calibration.fit.scene.cameras.items()):
+    for colour, (name, camera) in zip(cycle(COLOURS), calibration.fit.problem.cameras.items()):
         x, _, z = camera.centre.tolist()
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
         above.annotate(
-            _plain(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
+            _escaped(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
         )
         above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
     above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
@@ -232,15 +227,14 @@ def draw_by_image(calibration: Calibration) -> Figure:
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
-    for colour, (name, r) in zip(_colours(), calibration.fit.scene.residuals().items()):
-        block = calibration.fit.scene.seen[name].block
-        squared = np.bincount(block, (r**2).sum(-1), len(frames)) / np.maximum(
-            np.bincount(block, minlength=len(frames)), 1
-        )
-        present = np.bincount(block, minlength=len(frames)) > 0
-        axes.plot(np.flatnonzero(present), np.sqrt(squared[present]), "o", ms=4, color=colour, label=_plain(name))
+    for colour, (name, r) in zip(cycle(COLOURS), calibration.fit.problem.residuals().items()):
+        block = calibration.fit.problem.seen[name].block
+        counts = np.bincount(block, minlength=len(frames))
+        present = np.flatnonzero(counts)
+        squared = np.bincount(block, (r**2).sum(-1), len(frames))[present] / counts[present]
+        axes.plot(present, np.sqrt(squared), "o", ms=4, color=colour, label=_escaped(name))
     step = max(1, len(frames) // 30)
-    axes.set_xticks(range(0, len(frames), step), [_plain(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
+    axes.set_xticks(range(0, len(frames), step), [_escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
     axes.set(ylim=(0, None), xlabel="frame", ylabel="RMS residual (px)")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(fontsize=8, frameon=False, loc="outside right upper")
@@ -248,15 +242,15 @@ def draw_by_image(calibration: Calibration) -> Figure:
 
 
 def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figure:
-    """One camera: where points were seen; the mean residual of each part of the image, magnified; their scatter."""
-    seen, r = calibration.fit.scene.seen[name], calibration.fit.scene.residuals()[name]
+    """One camera: observed points; the median residual of each part of the image, magnified; their scatter."""
+    seen, r = calibration.fit.problem.seen[name], calibration.fit.problem.residuals()[name]
     hw = calibration.views[name].hw
     figure = Figure(figsize=(10.4, 10.4 / 3.4 * min(1.6, max(0.8, 1.33 * hw[0] / hw[1])) + 0.5), layout="compressed")
     left, middle, right = figure.subplots(1, 3)
     show_image(left, hw)
     left.imshow(np.where(covered.cells, np.nan, 1.0), extent=_extent(hw), cmap="Reds", vmin=0, vmax=4, aspect="equal")
     left.plot(*seen.x.T, ".", ms=1.5, color=COLOURS[0])
-    left.set_title(f"points seen (red: none), {covered.share:.0%} covered", fontsize=9)
+    left.set_title(f"points observed (red: none), {covered.share:.0%} covered", fontsize=9)
     show_image(middle, hw)
     _draw_field(middle, seen.x, r, hw)
     limit = max(4 * calibration.fit.sigma[name], 1e-3)
@@ -268,7 +262,7 @@ def draw_camera(calibration: Calibration, name: str, covered: Coverage) -> Figur
 
 
 def _draw_field(axes: Any, x: np.ndarray, r: np.ndarray, hw: tuple[int, int]) -> None:
-    """The median residual in each cell as an arrow, all magnified so that the longest is most of a cell."""
+    """The median residual in each cell as an arrow, magnified so that the longest nearly fills a cell."""
     rows, columns = 2 * CELLS[0], 2 * CELLS[1]
     row = np.clip(((x[:, 1] + 0.5) / hw[0] * rows).astype(int), 0, rows - 1)
     column = np.clip(((x[:, 0] + 0.5) / hw[1] * columns).astype(int), 0, columns - 1)
@@ -305,37 +299,29 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
             )
             axes.set(xticks=[], yticks=[])
             median = float(np.median(deviation[usable])) if usable.any() else float("nan")
-            axes.set_title(f"{_plain(beta)} of {_plain(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
+            axes.set_title(f"{_escaped(beta)} of {_escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
             figure.colorbar(shown, ax=axes, shrink=0.9)
     return figure
 
 
 def image(figure: Figure) -> str:
-    """A figure as an HTML image with the pixels inside."""
+    """A figure as an embedded HTML image."""
     FigureCanvasAgg(figure)
     data = BytesIO()
     figure.savefig(data, format="png", dpi=110)
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
 
 
-def _outline(calibration: Calibration) -> np.ndarray:
-    low, high = calibration.board.points.min(0), calibration.board.points.max(0)
-    return np.array(
-        [
-            [x, y, 0.0]
-            for x, y in ((low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1]), (low[0], low[1]))
-        ]
-    )
+def _outline(calibration: Calibration) -> Tensor:
+    (left, top, _), (right, bottom, _) = calibration.board.points.min(0), calibration.board.points.max(0)
+    corners = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
+    return torch.tensor([[*corner, 0.0] for corner in corners], dtype=torch.float64)
 
 
 def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
     return (-0.5, hw[1] - 0.5, hw[0] - 0.5, -0.5)
 
 
-def _colours() -> Iterable[str]:
-    return COLOURS * 32
-
-
-def _plain(text: str) -> str:
-    """Text that matplotlib does not take for formulas."""
+def _escaped(text: str) -> str:
+    """Text that matplotlib does not parse as formulas."""
     return text.replace("$", r"\$")

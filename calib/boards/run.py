@@ -1,4 +1,4 @@
-"""What the commands `pat calibrate` and `pat board` do."""
+"""Calibration of a folder of images to files, and files of boards to print."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from matplotlib import rc_context
 from arraygeom.atomic import write_atomically, write_text
 from arraygeom.rig import depth_range
 
-from .calibrate import Calibration, calibrate
 from .collect import Progress, collect_folder
 from .intrinsics import Lens
 from .report import coverages, report_html, rig_covariance, summary
+from .rig import calibrate
 from .target import draw_board, parse_board
 
 
-class Said(NamedTuple):
-    """What to tell the user, and which files there are now."""
+class CalibrationOutput(NamedTuple):
+    """Messages on the calibration, and the files written."""
 
-    lines: list[str]
+    messages: list[str]
     written: list[Path]
 
 
@@ -34,18 +34,18 @@ def calibrate_photos(
     lens: Lens = "brown-conrady",
     depth: tuple[float, float] | None = None,
     progress: Progress | None = None,
-) -> Said:
-    """From a folder of images to a rig file, its report and its covariance; the rig is written last.
+) -> CalibrationOutput:
+    """Calibrate from a folder of images; write the rig file, its report and its covariance, the rig last.
 
-    Raises ValueError and OSError for what is wrong with the images, and then writes nothing.
+    Raises ValueError and OSError for unusable images, and then writes nothing.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")
     if depth is not None:
         depth_range(*depth)
-    known = parse_board(board)
-    found = collect_folder(photos, known, patterns=patterns, progress=progress)
-    calibration = calibrate(found.views, known, lens=lens)
+    target = parse_board(board)
+    found = collect_folder(photos, target, patterns=patterns, progress=progress)
+    calibration = calibrate(found.views, target, lens=lens)
     rig = calibration.rig.replace(depth=depth, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
     write_text(written[0], report_html(calibration, title=f"Calibration of {out.name}", notes=found.notes))
@@ -53,19 +53,16 @@ def calibrate_photos(
     if covariance is not None:
         covariance.save(written[1])
     rig.save(out)
-    return Said(_lines(calibration, found.notes), [path for path in written if path.exists()])
+    advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
+    messages = [summary(calibration), *found.notes, *calibration.notes, *advice]
+    return CalibrationOutput(messages, [path for path in written if path.exists()])
 
 
 def write_board(board: str, out: Path) -> Path:
-    """A board as a PDF or SVG of its true size. Raises ValueError for another ending."""
+    """Write a board as a PDF or SVG of its true size. Raises ValueError for another ending."""
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")
     figure = draw_board(parse_board(board))
     with write_atomically(out) as temporary, rc_context({"svg.fonttype": "path"}):
         figure.savefig(temporary)
     return out
-
-
-def _lines(calibration: Calibration, notes: tuple[str, ...]) -> list[str]:
-    advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
-    return [summary(calibration), *notes, *calibration.notes, *advice]

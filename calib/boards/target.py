@@ -1,6 +1,6 @@
-"""Calibration boards: what they are called, where their points are, and how to print them.
+"""Calibration boards: their specification as text, their points, and how to print them.
 
-A board is named by a short text:
+A board is specified by a short text:
 
 - ``chessboard:9x6:25mm``: inner corners across x down (as OpenCV counts them), side of a square;
 - ``charuco:8x6:30mm``: squares across x down, side of a square; then, if wanted, the markers' side and their
@@ -40,30 +40,30 @@ class Board(ABC):
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """Where the points are on the board, metres, row by row."""
+        """Positions of the points on the board, metres, row by row."""
         return _grid(self.columns, self.rows) * self.spacing
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """The renumberings of the points under turns of the board, the identity first.
+        """The renumberings of the points under rotations of the board, the identity first.
 
-        A detector may have numbered the points in any of these ways: colours do not tell, as they are inverted in
-        some images (near infrared).
+        A detector may number the points in any of these ways: colours do not disambiguate them, as they are inverted
+        in some images (near infrared).
         """
         points = self.points[:, :2] - (self.points[:, :2].max(0) + self.points[:, :2].min(0)) / 2
         found = []
         for quarter_turns in range(4):
-            turned = points @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)
-            distance = np.linalg.norm(turned[:, None] - points[None], axis=-1)
+            rotated = points @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)
+            distance = np.linalg.norm(rotated[:, None] - points[None], axis=-1)
             image = distance.argmin(1)
             if distance.min(1).max() < 0.01 * self.spacing:
                 found.append(image)
         return tuple(found)
 
     @property
-    @abstractmethod
     def extent(self) -> tuple[float, float]:
-        """Width and height of what is printed without its margin, metres."""
+        """Width and height of the print without its margin, metres: the squares around the corners."""
+        return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
 
     @abstractmethod
     def _draw(self, axes: Any) -> None:
@@ -77,11 +77,6 @@ class Chessboard(Board):
     def __str__(self) -> str:
         return f"chessboard:{self.columns}x{self.rows}:{_millimetres(self.spacing)}"
 
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of what is printed without its margin, metres."""
-        return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
-
     def _draw(self, axes: Any) -> None:
         side = 1e3 * self.spacing
         for row in range(self.rows + 1):
@@ -93,7 +88,7 @@ class Chessboard(Board):
 class Charuco(Board):
     """A chessboard with markers in its white squares; `columns` x `rows` counts its inner corners.
 
-    Corners are known one by one, so a part of the board is enough and there is no doubt which way up it is.
+    Corners are identified individually: a part of the board is enough, and its orientation is unambiguous.
     """
 
     marker: float
@@ -110,7 +105,7 @@ class Charuco(Board):
 
     @property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:  # type: ignore[override]
-        """None but the identity."""
+        """The identity alone."""
         return (np.arange(len(self.points)),)
 
     def __str__(self) -> str:
@@ -118,11 +113,6 @@ class Charuco(Board):
         tail = ":legacy" if self.legacy else ""
         lengths = f"{_millimetres(self.spacing)}:{_millimetres(self.marker)}"
         return f"charuco:{squares}:{lengths}:{self.dictionary.lower()}{tail}"
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of what is printed without its margin, metres."""
-        return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
 
     def _draw(self, axes: Any) -> None:
         side, marker = 1e3 * self.spacing, 1e3 * self.marker
@@ -136,7 +126,7 @@ class Charuco(Board):
                 axes.add_patch(_black(column * side, row * side, side, side))
 
     def _draw_marker(self, axes: Any, number: int, left: float, top: float, side: float) -> None:
-        """Rows of neighbouring black bits as one rectangle each: no hairlines between bits."""
+        """Runs of black bits as one rectangle each: no hairlines between bits."""
         dictionary = marker_dictionary(self.dictionary)
         bits = dictionary.markerSize + 2
         black = np.asarray(cv2.aruco.generateImageMarker(dictionary, number, bits) == 0)
@@ -159,7 +149,7 @@ class Circles(Board):
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
-        """Where the centres are on the board, metres, row by row."""
+        """Positions of the centres on the board, metres, row by row."""
         grid = _grid(self.columns, self.rows)
         if self.asymmetric:
             grid[:, 0] = 2 * grid[:, 0] + grid[:, 1] % 2
@@ -167,12 +157,12 @@ class Circles(Board):
 
     @property
     def radius(self) -> float:
-        """Of the circles that are printed, metres."""
+        """Radius of the printed circles, metres."""
         return 0.3 * self.spacing * (2**0.5 if self.asymmetric else 1)
 
     @property
     def extent(self) -> tuple[float, float]:
-        """Width and height of what is printed without its margin, metres."""
+        """Width and height of the print without its margin, metres."""
         width, height = (float(v) + 2 * self.radius for v in self.points[:, :2].max(0))
         return width, height
 
@@ -183,17 +173,17 @@ class Circles(Board):
 
 
 def parse_board(text: str) -> Board:
-    """The board that a text names, such as ``charuco:8x6:30mm``; see the module. Raises ValueError."""
+    """The board that a text specifies, such as ``charuco:8x6:30mm``; see the module. Raises ValueError."""
     kind, _, rest = text.strip().lower().partition(":")
     parts = rest.split(":")
     if kind not in ("chessboard", "charuco", "circles", "acircles") or len(parts) < 2:
-        raise ValueError(f"board '{text}' is not understood: write it like {FORMS}")
+        raise ValueError(f"board '{text}' is not recognised: write it like {FORMS}")
     columns, rows = _counts(text, parts[0])
     spacing = _length(text, parts[1])
     if kind == "charuco":
         return _charuco(text, columns, rows, spacing, parts[2:])
     if len(parts) > 2:
-        raise ValueError(f"board '{text}': '{parts[2]}' is too much; write it like {FORMS}")
+        raise ValueError(f"board '{text}': '{parts[2]}' is unexpected; write it like {FORMS}")
     if kind == "chessboard":
         return Chessboard(columns, rows, spacing)
     return Circles(columns, rows, spacing, asymmetric=kind == "acircles")
@@ -202,7 +192,7 @@ def parse_board(text: str) -> Board:
 def draw_board(board: Board, *, margin: float = 0.012) -> Figure:
     """The board as a figure whose size in inches is its true size, with a white margin (metres) and a ruler below.
 
-    Saved as PDF or SVG it prints at true size; the ruler is there to check with.
+    Saved as PDF or SVG it prints at true size; the ruler serves to check it.
     """
     width, height = (1e3 * v for v in board.extent)
     edge, below = 1e3 * margin, 14.0
@@ -244,9 +234,9 @@ def _grid(columns: int, rows: int) -> np.ndarray:
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
     lengths = [o for o in options if re.fullmatch(r"[\d.]+ *[a-z]+", o)]
     names = [o for o in options if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")]
-    known = {*lengths[:1], *names[:1], "legacy"}
-    if rest := [o for o in options if o not in known]:
-        raise ValueError(f"board '{text}': '{rest[0]}' is not understood; write it like charuco:8x6:30mm:22mm:4x4_50")
+    recognised = {*lengths[:1], *names[:1], "legacy"}
+    if rest := [o for o in options if o not in recognised]:
+        raise ValueError(f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50")
     marker = _length(text, lengths[0]) if lengths else 0.75 * spacing
     if not marker < spacing:
         raise ValueError(
@@ -257,7 +247,7 @@ def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[s
 
 
 def _dictionary_name(text: str, name: str, markers: int) -> str:
-    """The smallest dictionary of a kind that has enough markers: its first ones are those of the larger."""
+    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers."""
     names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:

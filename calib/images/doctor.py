@@ -1,11 +1,12 @@
-"""What is wrong with a rig, from one image of each camera: the usual mistakes, told apart by matched points."""
+"""Diagnosis of the usual mistakes in a rig by points matched between one image of each camera."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import NamedTuple
 
 import torch
@@ -18,41 +19,41 @@ from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 
 from .matches import Matches, match_cameras
-from .mistakes import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
-from .residuals import lines_basis, nature, related, residuals_and_depths, stacked
+from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
+from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
 MOST = 250
-"""Matches of a pair that are used."""
-FAR_OFF = 1000.0
-"""Pixels that a match counts as off its line at most, and one whose pixels have no ray."""
-UNSEEN = 0.2
-"""A misfit, in pixels, below which a rig has nothing wrong with it."""
+"""Largest number of matches used of a pair."""
+LARGEST_DISTANCE = 1000.0
+"""Upper bound of a match's distance from its line, pixels; also for pixels without a ray."""
+HEALTHY_MISFIT = 0.2
+"""A rig with a smaller misfit than this, in pixels, is healthy."""
 TRIMMED = 0.85
-"""The part of the points, those nearest to their lines, that figures are made of."""
+"""The share of the points, those nearest to their lines, that statistics use."""
 EQUAL = (1.4, 0.03)
-"""Explanations cannot be told apart whose misfit is less than 1.4 times the best one's and 0.03 px."""
-WRONG_WAY = 100.0
-"""Pixels of misfit that points behind the cameras, or outside the depth range, count for."""
-BETTER = 0.33
-"""A mistake is named if undoing it leaves no more than this part of the misfit: a drifted rig is made somewhat better
-by many wrong remedies."""
+"""Explanations are indistinguishable whose misfit is less than 1.4 times the best one's plus 0.03 px."""
+WRONG_SIDE_PENALTY = 100.0
+"""Penalty, pixels, of points behind the cameras, outside the depth range, or mirrored."""
+LARGEST_REMAINDER = 0.33
+"""A mistake is named if its remedy leaves no more than this share of the misfit: many wrong remedies improve a drifted
+rig somewhat."""
 FEW = 10
-"""Shares of fewer points than this say nothing."""
+"""Least number of points for a share."""
 BARREL, PINCUSHION = -0.6, 0.4
 """Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
 
 Pairs = Mapping[tuple[str, str], Matches]
 
 
-class Figures(NamedTuple):
-    """What matched points say of a rig.
+class FitStatistics(NamedTuple):
+    """Statistics of matched points under a rig.
 
     off: median distance in pixels of a point from its epipolar line.
-    misfit: the part of it (root mean square, pixels) that is the rig's and not the matches' own.
-    front: share of the points that lie in front of both cameras, of those whose depth can be told.
+    misfit: the part of it (root mean square, pixels) that is due to the rig and not to the matches' noise.
+    front: share of the points in front of both cameras, of those whose depth is observable.
     inside: share of those in front that lie in the rig's depth range; NaN without one.
-    handed: share of the triangles of neighbouring points that are turned over from one image to the other, or not,
-    as they should be: mirrored images turn them over.
+    handed: share of the triangles of neighbouring points whose orientation changes between the images, or not, as the
+    rig implies: mirrored images change it.
     """
 
     off: float
@@ -62,63 +63,63 @@ class Figures(NamedTuple):
     handed: float
 
     @property
-    def badness(self) -> float:
-        """All of it in one number, pixels."""
+    def penalised_misfit(self) -> float:
+        """The misfit plus penalties, pixels."""
         wrong = (self.front < 0.5) + (self.inside < 0.5) + (self.handed < 0.5)
-        return self.misfit + WRONG_WAY * wrong
+        return self.misfit + WRONG_SIDE_PENALTY * wrong
 
     def __str__(self) -> str:
-        parts = [f"{self.off:.2f} px off the lines, {self.misfit:.2f} px of it the rig's"]
+        parts = [f"{self.off:.2f} px from the lines, {self.misfit:.2f} px of it due to the rig"]
         if not math.isnan(self.front):
             parts.append(f"{self.front:.0%} in front")
         if not math.isnan(self.inside):
             parts.append(f"{self.inside:.0%} within the depth range")
         if self.handed < 0.5:
-            parts.append("one image mirrored against the other")
+            parts.append("one image mirrored relative to the other")
         return ", ".join(parts)
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What the doctor found.
+    """The result of a diagnosis.
 
     named: the mistake, or `NOTHING`. equal: other kinds of mistake that explain the images as well.
-    before, after: figures of the rig as given and of the repaired one. tried: all explanations, best first.
-    matches: how many points were used. healthy: the rig as given fits the images.
+    before, after: statistics of the given rig and of the repaired one. tried: all explanations, best first.
+    matches: number of points used. healthy: the given rig fits the images.
     """
 
     named: Remedy
     equal: tuple[Remedy, ...]
-    before: Figures
-    after: Figures
-    tried: tuple[tuple[Remedy, Figures], ...]
+    before: FitStatistics
+    after: FitStatistics
+    tried: tuple[tuple[Remedy, FitStatistics], ...]
     matches: int
     healthy: bool
     repaired: Rig
 
     @property
     def verdict(self) -> str:
-        """In a sentence or two."""
+        """The diagnosis in a sentence or two."""
         if self.named.kind != "nothing":
             others = "".join(f"; or: {remedy.words}" for remedy in self.equal)
             return f"likely mistake: {self.named.words}{others}"
         if self.healthy:
-            return "nothing wrong: the points lie on their lines as well as they can be located"
+            return "nothing wrong: the points lie on their lines to the accuracy of their positions"
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
-            "it has drifted or was never better; `pat rig refine` may repair it"
+            "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair it"
         )
 
     def as_text(self) -> str:
-        """The verdict, and the figures before and after, as people read them."""
+        """The verdict, and the statistics before and after, as text."""
         lines = [self.verdict, f"as given: {self.before}"]
         if self.named.kind != "nothing":
             lines.append(f"repaired: {self.after}")
         return "\n".join([*lines, f"from {self.matches} points seen in two images"])
 
     def as_json(self) -> str:
-        """The same for programs, with the ten best explanations."""
-        tried = [{"kind": r.kind, "words": r.words, **_plain(f)} for r, f in self.tried[:10]]
+        """The same as JSON, with the ten best explanations."""
+        tried = [{"kind": r.kind, "words": r.words, **_rounded(f)} for r, f in self.tried[:10]]
         document = {
             "verdict": self.verdict,
             "mistake": self.named.kind,
@@ -126,22 +127,22 @@ class Diagnosis:
             "as_good": [{"mistake": remedy.kind, "words": remedy.words} for remedy in self.equal],
             "healthy": self.healthy,
             "matches": self.matches,
-            "before": _plain(self.before),
-            "after": _plain(self.after),
+            "before": _rounded(self.before),
+            "after": _rounded(self.after),
             "tried": tried,
         }
         return json.dumps(document, indent=2)
 
 
-def _plain(figures: Figures) -> dict[str, float | None]:
+def _rounded(figures: FitStatistics) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
 
 
 def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosis:
-    """Which usual mistake, if any, was made with a rig, by one image (C, H, W) of two or more of its cameras.
+    """Find the usual mistake, if any, in a rig, by one image (C, H, W) of two or more of its cameras.
 
     Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and images in
-    which too few points match; and for a rig that says nothing of how its cameras are related.
+    which too few points match; and for a rig that does not relate its cameras.
     """
     for name in images:
         rig.require(name)
@@ -150,18 +151,18 @@ def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosi
 
 
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
-    """The same of points matched already, of images of these sizes."""
-    pairs = {names: _some(matches) for names, matches in related(rig, pairs).items()}
+    """`diagnose` from matched points of images of these sizes."""
+    pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
-    figures = _examine(rig, tried, pairs)
+    figures = _evaluate(rig, tried, pairs)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
-    order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].badness)
-    least = EQUAL[0] * figures[order[0]].badness + EQUAL[1]
-    best = min(i for i in order if figures[i].badness <= least)
-    healthy = fits and figures[0].badness < UNSEEN
-    if healthy or (fits and figures[best].badness > BETTER * figures[0].badness):
+    order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].penalised_misfit)
+    least = EQUAL[0] * figures[order[0]].penalised_misfit + EQUAL[1]
+    best = min(i for i in order if figures[i].penalised_misfit <= least)
+    healthy = fits and figures[0].penalised_misfit < HEALTHY_MISFIT
+    if healthy or (fits and figures[best].penalised_misfit > LARGEST_REMAINDER * figures[0].penalised_misfit):
         best = 0
-    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].badness <= least and best}
+    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].penalised_misfit <= least and best}
     equal.pop(tried[best].kind, None)
     table = tuple((tried[i], figures[i]) for i in order)
     count = sum(len(matches.alpha) for matches in pairs.values())
@@ -169,32 +170,32 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     return Diagnosis(tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired)
 
 
-def _some(matches: Matches) -> Matches:
+def _thinned(matches: Matches) -> Matches:
     """At most `MOST` of them, evenly through the list."""
     step = max(1, -(-len(matches.alpha) // MOST))
     return Matches(matches.alpha[::step], matches.beta[::step])
 
 
-def _examine(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[Figures]:
-    """The figures of every explanation, from the same points: those that agree under the best of them."""
+def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[FitStatistics]:
+    """The statistics of every explanation, from the same points: the inliers of the best of them."""
     rigs = [remedy.repair(rig) for remedy in tried]
-    seen = _observe(rigs, pairs)
-    inliers, floor = _agreement(rig, tried, seen.off, pairs)
-    kept = [handedness(matches) for matches in pairs.values()]
+    observed = _observe(rigs, pairs)
+    inliers, floor = _inliers(rig, tried, observed.off, pairs)
+    preserved = [handedness(matches) for matches in pairs.values()]
     return [
         _figures(
-            *(part[i] for part in seen),
+            *(part[i] for part in observed),
             inliers=inliers,
             floor=floor,
             bounds=rig.depth,
-            handed=_mean(abs(share - _mirrors(repaired, names)) for share, names in zip(kept, pairs)),
+            handed=fmean(abs(share - _mirrors(repaired, names)) for share, names in zip(preserved, pairs)),
         )
         for i, repaired in enumerate(rigs)
     ]
 
 
 def handedness(matches: Matches) -> float:
-    """The share of triangles of neighbouring points (Delaunay's, in alpha) that keep their handedness in beta."""
+    """The share of Delaunay triangles of the points in alpha that keep their orientation in beta."""
     try:
         corners = Delaunay(matches.alpha.numpy()).simplices
     except QhullError:
@@ -209,20 +210,15 @@ def _area(triangles: Tensor) -> Tensor:
 
 
 def _mirrors(rig: Rig, names: tuple[str, str]) -> bool:
-    """Whether one of two cameras is that of a mirrored image."""
+    """Whether exactly one of two cameras is that of a mirrored image."""
     views = [rig[name] for name in names]
     return sum(isinstance(v, LensView) and bool(v.K[:2, :2].det() < 0) for v in views) == 1
 
 
-def _mean(shares: Iterable[float]) -> float:
-    found = list(shares)
-    return sum(found) / len(found)
+class PointObservations(NamedTuple):
+    """All points of all pairs (n) under several rigs (k): signed distance in pixels from the line, depth, in front.
 
-
-class Observed(NamedTuple):
-    """All points of all pairs (n) by several rigs (k): signed distance in pixels from the line, depth, in front.
-
-    Where the depth cannot be told it is NaN.
+    Unobservable depths are NaN.
     """
 
     off: Float[Tensor, "k n"]
@@ -230,33 +226,34 @@ class Observed(NamedTuple):
     front: Bool[Tensor, "k n"]
 
 
-def _observe(rigs: Sequence[Rig], pairs: Pairs) -> Observed:
+def _observe(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
     parts = [_observe_pair([rig.pair(*names) for rig in rigs], matches) for names, matches in pairs.items()]
-    return Observed(*(torch.cat(part, 1) for part in zip(*parts)))
+    return PointObservations(*(torch.cat(part, 1) for part in zip(*parts)))
 
 
-def _observe_pair(pairs: Sequence[Pair], matches: Matches) -> Observed:
-    """One pair of cameras by several rigs, those with the same kind of lenses at a time."""
+def _observe_pair(pairs: Sequence[Pair], matches: Matches) -> PointObservations:
+    """One pair of cameras under several rigs, batched by lens model."""
     count = len(matches.alpha)
     off, depth = torch.full((2, len(pairs), count), torch.nan, dtype=torch.float64)
     front = torch.zeros(len(pairs), count, dtype=torch.bool)
     groups: dict[object, list[int]] = {}
     for i, pair in enumerate(pairs):
-        groups.setdefault(nature(pair), []).append(i)
+        groups.setdefault(stack_key(pair), []).append(i)
     for group in groups.values():
         pair = stacked([pairs[i] for i in group])
-        (_, line, valid), seen = residuals_and_depths(pair, matches)
-        line = torch.where(valid, line.detach(), FAR_OFF)
-        off[group] = line.nan_to_num(FAR_OFF).clamp(-FAR_OFF, FAR_OFF)
-        if seen is not None:
-            depth[group], front[group] = torch.where(seen.known, seen.depth, torch.nan), seen.front
-    return Observed(off, depth, front)
+        (_, line, valid), depths = residuals_and_depths(pair, matches)
+        line = torch.where(valid, line.detach(), LARGEST_DISTANCE)
+        off[group] = line.nan_to_num(LARGEST_DISTANCE).clamp(-LARGEST_DISTANCE, LARGEST_DISTANCE)
+        if depths is not None:
+            depth[group] = torch.where(depths.observable, depths.depth, torch.nan)
+            front[group] = depths.front
+    return PointObservations(off, depth, front)
 
 
-def _agreement(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
-    """Which points agree with some pose of the cameras, and their mean square distance then, in square pixels.
+def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tuple[Tensor, float]:
+    """The points consistent with some pose of the cameras, and their mean square distance then, in square pixels.
 
-    The pose is free, so only the lens makes a difference: of the explanations that change it, the best is taken.
+    The pose is free, so only the lens matters: the best explanation that changes it is used.
     """
     fits = []
     for remedy, o in zip(tried, off):
@@ -271,22 +268,22 @@ def _agreement(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> 
 
 
 def _trimmed_square(off: Tensor) -> float:
-    """The mean square of all but the largest."""
+    """The trimmed mean square."""
     squares = off.square().sort().values
     return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
 
 
 def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
-    """What of the distances no change of F explains, to first order; robustly."""
+    """The residual of the distances after a robust first-order fit of F."""
     basis = lines_basis(pair, matches)
     weight = torch.ones_like(off)
-    left = off
+    residual = off
     for _ in range(8):
         solution = torch.linalg.lstsq(weight[:, None] * basis, (weight * off)[:, None], driver="gelsd").solution
-        left = off - (basis @ solution)[:, 0]
-        scale = left.abs().median().clamp(min=1e-3)
-        weight = 1 / (1 + (left / (2 * scale)).square())
-    return left
+        residual = off - (basis @ solution)[:, 0]
+        scale = residual.abs().median().clamp(min=1e-3)
+        weight = 1 / (1 + (residual / (2 * scale)).square())
+    return residual
 
 
 def _figures(
@@ -298,12 +295,12 @@ def _figures(
     floor: float,
     bounds: Depths | None,
     handed: float,
-) -> Figures:
+) -> FitStatistics:
     off = off[inliers]
     misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
-    told = ~depth.isnan()
-    share = float(front[told].double().mean()) if int(told.sum()) >= FEW else math.nan
-    return Figures(float(off.abs().median()), misfit, share, _inside(bounds, depth[told & front]), handed)
+    observable = ~depth.isnan()
+    share = float(front[observable].double().mean()) if int(observable.sum()) >= FEW else math.nan
+    return FitStatistics(float(off.abs().median()), misfit, share, _inside(bounds, depth[observable & front]), handed)
 
 
 def _inside(bounds: Depths | None, depth: Tensor) -> float:
@@ -315,12 +312,11 @@ def _inside(bounds: Depths | None, depth: Tensor) -> float:
 
 
 def _ignored_lens(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> list[Remedy]:
-    """The distortion that would explain the points best, in the cameras that have none."""
+    """The distortion that best explains the points, for cameras that have none."""
     bare = bare_cameras(rig, sizes)
     if not bare or any(rig[name].hw != hw for name, hw in sizes.items()):
         return []
     squared = max(_corner_radius(camera) for camera in bare.values()) ** 2
-
     lowest, highest = BARREL / squared, PINCUSHION / squared
     k1 = 0.0
     for _ in range(3):

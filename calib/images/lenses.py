@@ -1,8 +1,8 @@
-"""Lenses of cameras that nobody has calibrated: what F alone cannot fit where they bend lines.
+"""Lenses of uncalibrated cameras, which distort epipolar lines so that F alone does not fit.
 
-Such a lens has OpenCV's first four terms about the image's middle, r counting in halves of the image's longer side;
-F relates what is straight. `refine` fits both together to matched points (Fitzgibbon 2001 has one radial term, as a
-quotient).
+Such a lens has OpenCV's first four terms about the image's centre, with r in units of half the longer side of the
+image; F relates undistorted pixels. `refinement` fits both together to matched points (Fitzgibbon 2001 has one
+radial term, as a quotient).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TERMS = 4
 
 
 def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
-    """The rig with a lens, which does not bend yet, for those of the views that are linked and have none."""
+    """The rig with a lens without distortion for those of the views that are linked and have no lens."""
     linked = {name for pair in rig.links for name in pair}
     for name in names:
         view = rig[name]
@@ -35,22 +35,19 @@ def _flat(view: View) -> LensView:
     return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
 
 
-def uncalibrated_lenses(rig: Rig) -> dict[str, LensView]:
-    """The views that are not calibrated and have a lens all the same."""
-    views = {name: view for name, view in rig.cameras.items() if isinstance(view, LensView)}
-    return {name: v for name, v in views.items() if v.distortion is not None and not isinstance(v, Camera)}
+def describe_lenses(rig: Rig) -> str:
+    """A sentence on the lenses of uncalibrated views; empty if there are none."""
+    distorted = [
+        f"{name} by up to {float(largest_distortion(view)):.1f} px"
+        for name, view in rig.cameras.items()
+        if isinstance(view, LensView) and view.distortion is not None and not isinstance(view, Camera)
+    ]
+    return f"F does not fit without lens distortion: {', '.join(distorted)}" if distorted else ""
 
 
-def spoken_lenses(rig: Rig) -> str:
-    """A sentence on the lenses of views that are not calibrated; empty if there are none."""
-    lenses = uncalibrated_lenses(rig)
-    distorted = ", ".join(f"{name} by up to {float(bending(view)):.1f} px" for name, view in lenses.items())
-    return f"lenses bend lines; without them F does not fit: {distorted}" if lenses else ""
-
-
-def bending(view: LensView) -> Float[Tensor, ""]:
-    """By how much the lens bends at most: pixels, beyond what the homography does that is nearest to it."""
+def largest_distortion(view: LensView) -> Float[Tensor, ""]:
+    """The largest distortion beyond that of the nearest homography, pixels."""
     x = coarse_grid(view.hw).reshape(-1, 2)
-    straight, valid = view.to(torch.float64).undistort(x)
-    x, straight = x[valid], straight[valid]
-    return (apply_homography(fit_homography(x, straight), x).x - straight).norm(dim=-1).max()
+    undistorted, valid = view.to(torch.float64).undistort(x)
+    x, undistorted = x[valid], undistorted[valid]
+    return (apply_homography(fit_homography(x, undistorted), x).x - undistorted).norm(dim=-1).max()

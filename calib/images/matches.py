@@ -1,4 +1,4 @@
-"""Points seen in two images, and what they tell of a rig that is known only in part: a rough map, a depth range."""
+"""Points matched between two images, and the rough map and depth range of a rig that follow from them."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from torch import Tensor
 from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
 from arraygeom.pixels import shift_matrix
 
-from .patch_matching import sharpened
+from .patch_matching import refine_points
 
 RATIO = 0.75
 """The best match must be this much nearer than the second best (Lowe 2004, section 7.1)."""
 FEATURES = 6000
 ENOUGH = 20
-"""Matches that must agree before anything is concluded from them."""
-LOCATED = (0.15, 0.2, 0.3, np.inf)
-"""Points are to be known this well, one standard deviation in pixels by what patches around them leave over."""
-PLENTY = 40
-"""So many points that are located well are enough, and others are left out."""
+"""Least number of consistent matches for any conclusion."""
+LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
+"""Bounds of the standard deviation of points, pixels, estimated from the residuals of patches around them."""
+WELL_LOCALISED = 40
+"""If this many points meet a bound, the others are left out."""
 MANY = 60
-"""With fewer matches that agree, the images may be mirrored."""
+"""With fewer consistent matches, mirrored images are tried."""
 AGREE = 5.0
-"""How far from its line, in pixels, a match may be that agrees: lenses bend lines."""
+"""Largest distance, in pixels, of a consistent match from its line: lenses distort lines."""
 STILL = 0.05
-"""Images whose points move less than this are one image."""
+"""Images in which nine points in ten move less than this, in pixels, are the same image."""
 
 
 class Matches(NamedTuple):
-    """Points (x, y) of alpha, and where beta sees them."""
+    """Points (x, y) of alpha, and their positions in beta."""
 
     alpha: Float[Tensor, "n 2"]
     beta: Float[Tensor, "n 2"]
 
     def only(self, kept: Bool[Tensor, " n"]) -> Matches:
-        """Some of them."""
+        """The matches selected by a mask."""
         return Matches(self.alpha[kept], self.beta[kept])
 
 
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
-    """SIFT features of both images' luminance, contrast evened, that choose each other and pass the ratio test.
+    """Mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
-    Where patches around them are alike, beta's are moved to where those fit best.
+    Contrast is equalised (CLAHE). Where patches around them correlate, beta's points are refined by least squares.
     """
-    return _sharp(detect(alpha), detect(beta))
+    return _match(detect_features(alpha), detect_features(beta))
 
 
-class Features(NamedTuple):
+class SiftFeatures(NamedTuple):
     """SIFT features of one image: points (x, y), sizes (pixels) and directions (radians), their descriptors.
 
-    image: its luminance, contrast evened, in which they were found.
+    image: its luminance, contrast equalised, in which they were detected.
     """
 
     points: NDArray[np.float64]
@@ -68,59 +68,61 @@ class Features(NamedTuple):
     image: NDArray[np.uint8]
 
 
-def detect(image: Float[Tensor, "_ h w"]) -> Features:
-    """SIFT features of an image's luminance, its contrast evened."""
+def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
+    """SIFT features of an image's luminance, its contrast equalised."""
     grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
     even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
     points = np.array([p.pt for p in found], np.float64).reshape(-1, 2)
     sizes, angles = (np.array([getattr(p, name) for p in found], np.float64) for name in ("size", "angle"))
-    known = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
-    return Features(points, sizes, np.radians(angles), known, even)
+    described = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
+    return SiftFeatures(points, sizes, np.radians(angles), described, even)
 
 
-def _chosen(a: Features, b: Features) -> tuple[list[int], list[int]]:
-    """The features, by their numbers in both, that choose each other and pass the ratio test."""
+def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:
+    """Indices in both of the mutually nearest features that pass the ratio test."""
     if len(a.points) < 2 or len(b.points) < 2:
         return [], []
-    there, back = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
-    pairs = [(i, j) for i, j in there.items() if back.get(j) == i]
+    forward = _nearest(a.descriptors, b.descriptors)
+    backward = _nearest(b.descriptors, a.descriptors)
+    pairs = [(i, j) for i, j in forward.items() if backward.get(j) == i]
     return [i for i, _ in pairs], [j for _, j in pairs]
 
 
-def _sharp(a: Features, b: Features) -> Matches:
-    """Those features' points; beta's where patches around them fit best."""
-    i, j = _chosen(a, b)
-    ratio, turn = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
-    c, s = ratio * np.cos(turn), ratio * np.sin(turn)
+def _match(a: SiftFeatures, b: SiftFeatures) -> Matches:
+    """Points of the mutually nearest features, beta's refined by patches around them."""
+    i, j = _mutual(a, b)
+    ratio, angle = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
+    c, s = ratio * np.cos(angle), ratio * np.sin(angle)
     maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
-    y, deviation = sharpened(a.image, b.image, a.points[i], b.points[j], maps)
-    kept = torch.from_numpy(_good_enough(deviation))
+    y, deviation = refine_points(a.image, b.image, a.points[i], b.points[j], maps)
+    kept = torch.from_numpy(_well_localised(deviation))
     return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y)).only(kept)
 
 
-def _good_enough(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The points that are located best, by the first bound that leaves `PLENTY` of them; all, if none does."""
-    for bound in LOCATED:
-        if (kept := deviation < bound).sum() >= PLENTY:
+def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """The best localised points, by the first bound that leaves `WELL_LOCALISED` of them; all, if none does."""
+    for bound in LOCALISATION_BOUNDS:
+        if (kept := deviation < bound).sum() >= WELL_LOCALISED:
             return kept
     return np.ones_like(deviation, dtype=np.bool_)
 
 
 def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:
-    """Points seen in both images of every two cameras, those alone that some fundamental matrix agrees with.
+    """Matches between the images of every two cameras that are consistent with some fundamental matrix.
 
-    Where few agree, the second image is tried mirrored: features do not survive that. Pairs with fewer than 20
-    are left out. Raises ValueError, one line, if no pair is left, for fewer than two images, and for equal ones.
+    Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with fewer than
+    20 are left out. Raises ValueError, one line, if no pair is left, for fewer than two images, and for equal ones.
     """
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
-    features = {name: detect(image) for name, image in images.items()}
+    features = {name: detect_features(image) for name, image in images.items()}
     found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
-        if images[a].shape[1:] == images[b].shape[1:] and float(_movement(matches)) < STILL:
+        displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
+        if images[a].shape[1:] == images[b].shape[1:] and displacement < STILL:
             raise ValueError(f"the images of '{a}' and '{b}' are the same image: give each camera its own")
     if not kept:
         (a, b), most = max(found.items(), key=lambda item: len(item[1].alpha))
@@ -131,30 +133,26 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     return kept
 
 
-def _agreeing(a: Features, b: Features, image: Tensor) -> Matches:
-    """Matches that some F puts within `AGREE` pixels of their lines; of the mirrored image if those are more."""
-    straight = agreeing(_sharp(a, b))
-    if len(straight.alpha) >= MANY:
-        return straight
-    x, y = agreeing(_sharp(a, detect(image.flip(-1))))
+def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> Matches:
+    """The consistent matches; of the mirrored image if those are more."""
+    unmirrored = agreeing(_match(a, b))
+    if len(unmirrored.alpha) >= MANY:
+        return unmirrored
+    x, y = agreeing(_match(a, detect_features(image.flip(-1))))
     mirrored = Matches(x, torch.stack([image.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
-    return max(straight, mirrored, key=lambda m: len(m.alpha))
+    return max(unmirrored, mirrored, key=lambda m: len(m.alpha))
 
 
-def agreeing(matches: Matches, *, within: float = AGREE) -> Matches:
-    """The matches that some fundamental matrix puts within some pixels of their lines; none if there are few."""
+def agreeing(matches: Matches) -> Matches:
+    """The matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if there are few."""
+    none = matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
     if len(matches.alpha) < ENOUGH:
-        return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
+        return none
     try:
         F = fit_fundamental(matches)
     except ValueError:
-        return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
-    return near_lines(matches, F, within=within)
-
-
-def _movement(matches: Matches) -> Tensor:
-    """How far most points are from one image to the other: the 90th percentile, pixels."""
-    return (matches.alpha - matches.beta).norm(dim=-1).quantile(0.9)
+        return none
+    return near_lines(matches, F, within=AGREE)
 
 
 def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> Matches:
@@ -163,16 +161,16 @@ def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> M
 
 
 def line_distance(matches: Matches, F: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
-    """How far each match is from its epipolar line, in beta's pixels."""
+    """Distance of each match from its epipolar line, in beta's pixels."""
     return epipolar_distance(F.to(matches.alpha), *matches).abs()
 
 
 class FittedLink(NamedTuple):
-    """What matches tell of a pair known by F.
+    """A link fitted to matches.
 
-    link: F fitted to the matches, and a similarity H in the middle of where points are along their lines.
-    matches: those that agree.
-    displacement: pixels of beta to either side of H x that hold 98% of them.
+    link: F, and a similarity H that is centred on the points along their lines.
+    matches: the consistent ones.
+    displacement: pixels of beta to either side of H x that contain 98% of them.
     """
 
     link: Link
@@ -181,24 +179,33 @@ class FittedLink(NamedTuple):
 
 
 def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
-    """A better F than `F`, and a rough map, from matches that `F` puts within some pixels of their lines.
+    """Improve `F`, and fit a rough map, by the matches within some pixels of their lines.
 
-    F by MAGSAC++ (Barath et al. 2020) to 1 px; H as of `rough_map`. Raises ValueError for fewer than 20 matches that
-    agree.
+    F by MAGSAC++ (Barath et al. 2020) to 1 px; H by `rough_map`. Raises ValueError for fewer than 20 consistent
+    matches.
     """
     near = near_lines(matches, F, within=within)
     fitted = fit_fundamental(near) if len(near.alpha) >= ENOUGH else F
-    kept = near_lines(near, fitted, within=3)
-    if len(kept.alpha) < ENOUGH:
-        raise ValueError(f"only {len(kept.alpha)} points seen in both images agree with F: check that it is theirs")
-    H, displacement = rough_map(kept, fitted)
-    return FittedLink(Link(fitted, H), kept, displacement)
+    return _with_rough_map(near_lines(near, fitted, within=3), fitted)
+
+
+def with_map(pair: Pair, matches: Matches) -> FittedLink:
+    """The pair's F, unchanged, with a rough map of the points near their lines. Raises ValueError for too few."""
+    F = pair.fundamental
+    return _with_rough_map(near_lines(undistort_matches(pair, matches), F, within=3), F)
+
+
+def _with_rough_map(matches: Matches, F: Tensor) -> FittedLink:
+    if len(matches.alpha) < ENOUGH:
+        raise ValueError(f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?")
+    H, displacement = rough_map(matches, F)
+    return FittedLink(Link(F, H), matches, displacement)
 
 
 def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
-    """A similarity in the middle of where points are along their lines, and how far from it 98% of them are, pixels.
+    """A similarity centred on the points along their lines, and the distance that contains 98% of them, pixels.
 
-    By RANSAC, then moved along the lines' mean direction.
+    By RANSAC, then shifted along the mean direction of the lines.
     """
     H = similarity(matches)
     low, high = _percentiles(_along_lines(matches, F, H), 0.01)
@@ -209,33 +216,23 @@ def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, 
     return H, max(-low, high)
 
 
-def straightened(pair: Pair, matches: Matches) -> Matches:
-    """The points where cameras without lenses would see them; those that the lens models do not reach are left out."""
-    (x, seen), (y, also) = pair.alpha.undistort(matches.alpha), pair.beta.undistort(matches.beta)
-    return Matches(x, y).only(seen & also)
-
-
-def with_map(pair: Pair, matches: Matches) -> FittedLink:
-    """The pair's link with the rough map of points near their lines, its F as it is. Raises ValueError for too few."""
-    F = pair.fundamental
-    kept = near_lines(straightened(pair, matches), F, within=3)
-    if len(kept.alpha) < ENOUGH:
-        raise ValueError(f"only {len(kept.alpha)} points seen in both images agree with F: check that it is theirs")
-    H, displacement = rough_map(kept, F)
-    return FittedLink(Link(F, H), kept, displacement)
+def undistort_matches(pair: Pair, matches: Matches) -> Matches:
+    """The undistorted points, without those outside the domain of the lens models."""
+    (x, x_valid), (y, y_valid) = pair.alpha.undistort(matches.alpha), pair.beta.undistort(matches.beta)
+    return Matches(x, y).only(x_valid & y_valid)
 
 
 def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
-    """Depth bounds, metres in front of alpha, that hold what was matched: 0.9 of the nearest to 1.25 of the farthest.
+    """Depth bounds of the matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the farthest.
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
     """
-    straight = Matches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
-    near = matches.only(line_distance(straight, pair.fundamental) <= 3)
+    undistorted = Matches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
+    near = matches.only(line_distance(undistorted, pair.fundamental) <= 3)
     found = triangulate([camera.to(torch.float64) for camera in pair.cameras], torch.stack(near))
     depth = pair.cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
     if len(depth) < ENOUGH:
-        raise ValueError(f"only {len(depth)} points seen in both images fit the calibration: is it theirs?")
+        raise ValueError(f"only {len(depth)} points seen in both images fit the calibration: does it belong to them?")
     low, high = _percentiles(depth, 0.02)
     return 0.9 * low, 1.25 * high
 
@@ -253,16 +250,16 @@ def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
 
 
 def similarity(matches: Matches) -> Float[Tensor, "3 3"]:
-    """The similarity that most matches follow to 30 pixels of beta."""
+    """The similarity that most matches fit to 30 pixels of beta, by RANSAC."""
     x, y = (points.numpy() for points in matches)
     found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
     if found is None:
-        raise ValueError("the points seen in both images follow no common map")
+        raise ValueError("no similarity fits the points seen in both images")
     return torch.from_numpy(np.vstack([found, [0, 0, 1]]))
 
 
 def _along_lines(matches: Matches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
-    """How far along its line each match is from the point of the line nearest to H x, pixels of beta."""
+    """Signed position of each match along its line, from the point nearest to H x, pixels of beta."""
     line = epipolar_lines(F, matches.alpha)
     from_map = matches.beta - apply_homography(H, matches.alpha).x
     return (from_map * torch.stack([-line[:, 1], line[:, 0]], -1)).sum(-1)

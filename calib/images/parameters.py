@@ -1,4 +1,4 @@
-"""Which numbers of a rig may change, how well they are known, and the rig after changes."""
+"""Free parameters of a rig with prior standard deviations, and the rig after a change of them."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Link, Rig, rotation_from_vector
 from arraygeom.pixels import HW
 
-from ..boards.observability import NATURAL
+from ..boards.observability import TYPICAL_COEFFICIENTS
 
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
-"""Standard deviations where none are stated: radians, a part of the longest baseline, a part of the focal length,
-pixels of the principal point, and a part of what coefficients of lenses usually are at most (`NATURAL`)."""
+"""Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels of the
+principal point, and a share of `TYPICAL_COEFFICIENTS`."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
 AXES = {"rotation": "xyz", "translation": "xyz", "focal": "xy", "centre": "xy"}
 UNITS = {
@@ -28,16 +28,16 @@ UNITS = {
     "centre": ("px", 1.0),
 }
 LENS_SIGMA = 0.2
-"""The same part where a lens is not calibrated: it counts in halves of the image's longer side."""
+"""That share for uncalibrated lenses, whose unit is half the longer side of the image."""
 LINK_SIGMA = 0.1
-"""Of the seven numbers of an F in coordinates that span about -1 to 1: next to nothing is known of them."""
+"""Of the seven degrees of freedom of an F in coordinates of about -1 to 1: an uninformative prior."""
 
 
 @dataclass(frozen=True)
-class Unknown:
-    """Numbers that belong together: "camera.rotation" and so on, or "alpha > beta" for an F.
+class FreeParameter:
+    """One parameter vector: "camera.rotation" and so on, or "alpha > beta" for an F.
 
-    sigma: how well each is known before, one standard deviation. unit, factor: what people use, and how many of it.
+    sigma: prior standard deviations. unit, factor: the unit for display and the factor that converts to it.
     """
 
     name: str
@@ -45,42 +45,48 @@ class Unknown:
     unit: str
     factor: float
 
-    def spoken(self, index: int) -> str:
-        """One of the numbers, in words."""
+    def label(self, index: int) -> str:
+        """The name of one component."""
         axes = AXES.get(self.name.rpartition(".")[2])
         return f"{self.name} {axes[index]}" if axes else f"{self.name} {index + 1}"
 
 
-def unknowns(
+def free_parameters(
     rig: Rig, names: Sequence[str], *, free: Iterable[str], sigma: Mapping[str, float] | None = None
-) -> list[Unknown]:
-    """What may change in the cameras `names`, the first of which keeps its pose: only relative poses can be seen.
+) -> list[FreeParameter]:
+    """The free parameters of some cameras, the first of which keeps its pose: only relative poses are observable.
 
     `free` holds kinds ("rotation", "translation", "focal", "centre" or "principal_point", "distortion"), or patterns
-    over "camera.kind". `sigma` states standard deviations by kind, instead of `SIGMA`'s. A link between two of the
+    over "camera.kind". `sigma` overrides the standard deviations of `SIGMA` by kind. A link between two of the
     cameras has its F free, and uncalibrated lenses are free. Raises ValueError for a pattern that matches nothing.
     """
     stated = {ALIASES.get(k, k): v for k, v in (sigma or {}).items()}
     if wrong := [k for k, v in stated.items() if k not in SIGMA or not v > 0]:
         raise ValueError(f"--sigma: wanted a positive number for one of {', '.join(SIGMA)}; got '{wrong[0]}'")
     sigma = {**SIGMA, **stated}
-    known = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
-    calibrated = {name: like for name, like in known.items() if isinstance(rig.cameras.get(_camera_of(name)), Camera)}
+    parameters = rig.parameters(free=["*"]) if any(isinstance(rig[n], LensView) for n in names) else {}
+    calibrated = {
+        name: like for name, like in parameters.items() if isinstance(rig.cameras.get(_camera_of(name)), Camera)
+    }
     wanted = _matching(calibrated, free)
-    wanted += [name for name in known if name not in calibrated and not name.startswith("depth.")]
+    wanted += [name for name in parameters if name not in calibrated and not name.startswith("depth.")]
     fixed = {f"{names[0]}.rotation", f"{names[0]}.translation"}
     found = [
-        _unknown(rig, name, known[name], sigma) for name in wanted if _camera_of(name) in names and name not in fixed
+        _free_parameter(rig, name, parameters[name], sigma)
+        for name in wanted
+        if _camera_of(name) in names and name not in fixed
     ]
     links = [f"{a} > {b}" for a, b in rig.links if a in names and b in names]
-    return found + [Unknown(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
+    return found + [FreeParameter(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
 
 
-def changed(rig: Rig, given: Sequence[Unknown], z: Float[Tensor, " n"]) -> Rig:
-    """The rig after a change of z standard deviations of each number in turn; differentiable in z."""
+def apply_change(rig: Rig, given: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
+    """The rig after a change of each component by z standard deviations; differentiable in z."""
     parts = z.split([len(u.sigma) for u in given])
     values = {u.name: part * u.sigma.to(part) for u, part in zip(given, parts)}
-    links = {names: _turned_link(link, values.get(" > ".join(names)), rig, names) for names, link in rig.links.items()}
+    links = {
+        names: _perturbed_link(link, values.get(" > ".join(names)), rig, names) for names, link in rig.links.items()
+    }
     cameras = {name: value for name, value in values.items() if " > " not in name}
     return rig.perturbed(cameras).replace(links=links)
 
@@ -89,34 +95,34 @@ def _camera_of(parameter: str) -> str:
     return parameter.rpartition(".")[0]
 
 
-def _matching(known: Mapping[str, Tensor], free: Iterable[str]) -> list[str]:
-    if not known:
+def _matching(parameters: Mapping[str, Tensor], free: Iterable[str]) -> list[str]:
+    if not parameters:
         return []
     wanted: list[str] = []
     for pattern in free:
         kind = ALIASES.get(pattern, pattern)
-        names = fnmatch.filter(known, kind if "." in kind else f"*.{kind}")
+        names = fnmatch.filter(parameters, kind if "." in kind else f"*.{kind}")
         names = [n for n in names if not n.startswith("depth.")]
         if not names:
-            kinds = ", ".join(dict.fromkeys(n.rpartition(".")[2] for n in known if not n.startswith("depth.")))
+            kinds = ", ".join(dict.fromkeys(n.rpartition(".")[2] for n in parameters if not n.startswith("depth.")))
             raise ValueError(f"--free: the rig has no '{pattern}' (it has: {kinds})")
         wanted += [n for n in names if n not in wanted]
     return wanted
 
 
-def _unknown(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> Unknown:
+def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float]) -> FreeParameter:
     camera, _, kind = name.rpartition(".")
     size = torch.full((like.shape[-1],), sigma[kind], dtype=torch.float64)
     view = rig[camera]
     if kind == "focal" and isinstance(view, Camera):
         size = size * view.K[:2, :2].det().abs().sqrt()
     if kind == "distortion" and isinstance(view, LensView) and view.distortion is not None:
-        natural = torch.tensor(NATURAL[view.distortion.model][: len(size)], dtype=torch.float64)
+        natural = torch.tensor(TYPICAL_COEFFICIENTS[view.distortion.model][: len(size)], dtype=torch.float64)
         size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
     if kind == "translation":
         size = size * _longest_baseline(rig)
     unit, factor = UNITS.get(kind, ("", 1.0))
-    return Unknown(name, size, unit, factor)
+    return FreeParameter(name, size, unit, factor)
 
 
 def _longest_baseline(rig: Rig) -> float:
@@ -124,8 +130,8 @@ def _longest_baseline(rig: Rig) -> float:
     return max(float(torch.pdist(centres).max()), 1e-6) if len(centres) > 1 else 1.0
 
 
-def _turned_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
-    """F after seven small numbers: turns of its two sets of singular vectors, and a change of its second value."""
+def _perturbed_link(link: Link, value: Tensor | None, rig: Rig, names: tuple[str, str]) -> Link:
+    """F after seven small changes: rotations of both sets of singular vectors, and of its second singular value."""
     if value is None:
         return link
     A, B = (_to_unit(rig[name].hw).to(link.F) for name in names)

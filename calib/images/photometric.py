@@ -1,13 +1,14 @@
-"""The fusion's own photometric error, as a function of the rig.
+"""The photometric error of the fusion as a function of the rig.
 
-C3 attention looks along each alpha pixel's segment in beta for what is like it, and returns what it finds there: the
-error is by how much that misses alpha's own value. Attention finds the place along the segment; across it, only the
-rig can. Bilinear sampling lets the error's gradient reach the segments' ends and with them the rig.
+C3 attention samples each alpha pixel's segment in beta and returns the weighted value: the error is its difference
+from alpha's own value. Attention determines the position along the segment; the position across it depends on the rig
+alone. Bilinear sampling propagates the gradient to the segments' ends and so to the rig.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
@@ -30,47 +31,43 @@ from arraygeom import (
     pixel_grid,
 )
 
-from .matches import ENOUGH, Matches, seen_depths
+from .matches import Matches, seen_depths
 
 
 @runtime_checkable
-class Attended(Protocol):
-    """What attention returns: values (1, D, h, w) and how sure it is of one place (1, h, w)."""
+class PhotometricMatch(Protocol):
+    """The result of attention: values (1, D, h, w) and the largest weight (1, h, w) as a confidence."""
 
     @property
     def value(self) -> Tensor:
-        """What was found."""
-        ...
+        """The weighted value."""
 
     @property
     def peak(self) -> Tensor:
         """The largest weight."""
-        ...
 
 
-Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], Attended]
+Attend = Callable[[Tensor, Tensor, Tensor, Segments | Positions], PhotometricMatch]
 """Attention from queries to keys and values along a field: `pat.attention.attend_with_statistics`."""
-Describe = Callable[[Tensor], Tensor]
-"""A grey image (1, 1, H, W) to features (1, D, H, W) whose inner product says how alike two pixels are."""
 
 LARGEST = 480
 """Images are reduced to this many pixels along their longer side."""
 PIXELS = 6000
-"""Alpha pixels that are looked at, about, on a grid."""
+"""Approximate number of alpha pixels used, on a grid."""
 SHARPNESS = 20.0
 """The inner product of two equal descriptors."""
 WINDOW = 9
-"""Values are relative to the mean and the deviation in windows this wide, so that exposure and filters do not count."""
+"""Values are relative to the mean and the deviation in windows this wide, for invariance to exposure and filters."""
 EVEN = 0.02
 """Deviations below this, of images in 0..1, are noise."""
 PART = 0.06
-"""A pair known by F alone is looked at within this part of beta's size around the rough map."""
+"""Search range of a pair known by F alone around the rough map, as a share of beta's size."""
 
 
 @dataclass(frozen=True)
-class Views:
-    """One frame made ready, by camera: the reduced size, features (1, D, H, W) and values (1, 1, H, W) of each pixel,
-    and the grid (h, w, 2) of pixels that are looked at from there."""
+class PhotometricFrame:
+    """One frame prepared, by camera: the reduced size, features (1, D, H, W) and values (1, 1, H, W) of each pixel,
+    and the grid (h, w, 2) of query pixels."""
 
     hw: Mapping[str, tuple[int, int]]
     keys: Mapping[str, Tensor]
@@ -78,37 +75,37 @@ class Views:
     grid: Mapping[str, Tensor]
 
     @classmethod
-    def of(cls, images: Mapping[str, Float[Tensor, "_ _ _"]], describe: Describe | None = None) -> Views:
-        """The frame's images reduced and described; by patches, unless by something better."""
+    def of(cls, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> PhotometricFrame:
+        """The frame's images, reduced, with patches as features."""
         grey = {name: _reduced(image) for name, image in images.items()}
-        keys = {name: (describe or patches)(image) for name, image in grey.items()}
+        keys = {name: patches(image) for name, image in grey.items()}
         sizes = {name: (int(p.shape[2]), int(p.shape[3])) for name, p in grey.items()}
         grid = {name: _grid(hw) for name, hw in sizes.items()}
         return cls(sizes, keys, {name: structure(image) for name, image in grey.items()}, grid)
 
 
 def photometric_errors(
-    rig: Rig, views: Views, names: tuple[str, str], attend: Attend
+    rig: Rig, views: PhotometricFrame, names: tuple[str, str], attend: Attend
 ) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """By how much what attention finds in beta misses alpha, at the pixels of the grid, and where it looked at all.
+    """The error of attention's value against alpha's, at the pixels of the grid, and its validity.
 
-    Differentiable in the rig. Pixels count by how sure attention is of one place: errors are weighted by its peak.
+    Differentiable in the rig. Errors are weighted by the square root of attention's largest weight, its confidence.
     """
     alpha, beta = names
     for name in names:
         rig = rig.resize(name, views.hw[name])
     pair, x = rig.pair(*names).to(torch.float32), views.grid[alpha]
-    look = field_of(pair)(pair, x)
+    locations = field_of(pair)(pair, x)
     columns, rows = x[0, :, 0].long(), x[:, 0, 1].long()
     query, own = (image[alpha][:, :, rows][..., columns] for image in (views.keys, views.values))
-    found = attend(query, views.keys[beta], views.values[beta], look)
-    seen = look.mask.any(-1) if isinstance(look, Positions) else look.valid
-    sure = found.peak[0].detach().sqrt()
-    return torch.where(seen, sure * (found.value - own)[0, 0], 0.0), seen
+    found = attend(query, views.keys[beta], views.values[beta], locations)
+    valid = locations.mask.any(-1) if isinstance(locations, Positions) else locations.valid
+    confidence = found.peak[0].detach().sqrt()
+    return torch.where(valid, confidence * (found.value - own)[0, 0], 0.0), valid
 
 
 def field_of(pair: Pair) -> ReceptiveField:
-    """Where to look: the segment of calibrated pinholes, the curve through lenses, the line of a pair known by F."""
+    """The field of a pair: segments of calibrated pinholes, curves through lenses, lines of a pair known by F."""
     if pair.link is not None or not pair.calibrated:
         line = HomographyDisplacement(PART * max(pair.beta.hw))
         return ThroughLenses(line, 64) if pair.has_lens else line
@@ -116,25 +113,19 @@ def field_of(pair: Pair) -> ReceptiveField:
 
 
 def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:
-    """The rig with the depth range of what is matched, if it has none."""
+    """The rig with the depth range of the matched points, if it has none."""
     if rig.depth is not None:
         return rig
-    bounds = [_bounds(rig.pair(*names), matches) for names, matches in pairs.items()]
-    known = [b for b in bounds if b is not None]
-    return rig.replace(depth=(min(n for n, _ in known), max(f for _, f in known))) if known else rig
-
-
-def _bounds(pair: Pair, matches: Matches) -> tuple[float, float] | None:
-    if not pair.calibrated or len(matches.alpha) < ENOUGH:
-        return None
-    try:
-        return seen_depths(pair, matches)
-    except ValueError:
-        return None
+    bounds = []
+    for names, matches in pairs.items():
+        if (pair := rig.pair(*names)).calibrated:
+            with suppress(ValueError):
+                bounds.append(seen_depths(pair, matches))
+    return rig.replace(depth=(min(near for near, _ in bounds), max(far for _, far in bounds))) if bounds else rig
 
 
 def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:
-    """5 x 5 pixels around each, without their mean, of one length: the inner product is their correlation, scaled."""
+    """Patches of 5 x 5 pixels, without mean, normalised: the inner product is their scaled correlation."""
     h, w = grey.shape[-2:]
     around = unfold(pad(grey, (2, 2, 2, 2), mode="replicate"), 5).view(1, 25, h, w)
     around = around - around.mean(1, keepdim=True)
@@ -143,7 +134,7 @@ def patches(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 25 h w"]:
 
 
 def structure(grey: Float[Tensor, "1 1 h w"]) -> Float[Tensor, "1 1 h w"]:
-    """How far each pixel is from the mean around it, in deviations."""
+    """Each pixel's difference from the local mean, in local standard deviations."""
     mean, square = (_local_mean(p) for p in (grey, grey.square()))
     return (grey - mean) / (square - mean.square()).clamp(min=0).add(EVEN**2).sqrt()
 

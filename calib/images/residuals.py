@@ -1,6 +1,6 @@
-"""How far matched points are from what a rig says of them: across the lines, in front, at which depth.
+"""Residuals of matched points under a rig: epipolar distances, depths, and whether they are in front.
 
-Everything is measured in the pixels of the images as they are, through any lens, and is differentiable in the rig.
+Distances are in pixels of the distorted images, through any lens, and differentiable in the rig.
 A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
 """
 
@@ -19,10 +19,10 @@ from arraygeom.pixels import to_homogeneous
 from .matches import Matches
 
 
-class Residuals(NamedTuple):
-    """Signed distances in pixels, one a match, and where they exist.
+class EpipolarResiduals(NamedTuple):
+    """Signed distances in pixels, one per match, and their validity.
 
-    sampson: from the nearest pair of points that would fit (Hartley & Zisserman 11.4.3), in both images together.
+    sampson: from the nearest pair of points that fits (Hartley & Zisserman 11.4.3), in both images together.
     line: from the epipolar line (the curve, through a lens), in beta.
     """
 
@@ -31,35 +31,35 @@ class Residuals(NamedTuple):
     valid: Bool[Tensor, "*b n"]
 
 
-class SeenDepths(NamedTuple):
-    """Depth in alpha (metres) of matched points, which lie in front of both cameras, and whose depth can be told."""
+class MatchDepths(NamedTuple):
+    """Depth in alpha (metres) of matched points, whether they are in front of both cameras, and observable."""
 
     depth: Float[Tensor, "*b n"]
     front: Bool[Tensor, "*b n"]
-    known: Bool[Tensor, "*b n"]
+    observable: Bool[Tensor, "*b n"]
 
 
 LEAST_PARALLAX = 2.0
-"""Rays must cross at an angle worth this many pixels for their depth to be told."""
+"""Least angle between rays, in pixels, at which their depth is observable."""
 
 
-def epipolar_residuals(pair: Pair, matches: Matches) -> Residuals:
-    """What x_beta^T F x_alpha = 0 leaves over, divided by its gradient in the pixels, which counts as constant.
+def epipolar_residuals(pair: Pair, matches: Matches) -> EpipolarResiduals:
+    """The algebraic error x_beta^T F x_alpha divided by its gradient in the pixels, which counts as constant.
 
-    With cameras the rays of the pixels take the place of the pixels and E that of F, so that lenses are obeyed to
-    first order in the distance. Raises ValueError if neither cameras nor F are known.
+    With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the distance.
+    Raises ValueError if neither cameras nor F are known.
     """
     return _residuals(pair, matches)[0]
 
 
-def residuals_and_depths(pair: Pair, matches: Matches) -> tuple[Residuals, SeenDepths | None]:
-    """The residuals, and where the rays of matched points pass each other most closely: None for uncalibrated pairs."""
+def residuals_and_depths(pair: Pair, matches: Matches) -> tuple[EpipolarResiduals, MatchDepths | None]:
+    """The residuals, and the depths where the rays are closest to each other: None for uncalibrated pairs."""
     residuals, (a, b) = _residuals(pair, matches)
-    known = pair.calibrated and pair.link is None
-    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid) if known else None
+    calibrated = pair.calibrated and pair.link is None
+    return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid) if calibrated else None
 
 
-def _residuals(pair: Pair, matches: Matches) -> tuple[Residuals, tuple[Tensor, Tensor]]:
+def _residuals(pair: Pair, matches: Matches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:
     alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
     with torch.enable_grad():
         (a, b), F, valid = _rays(pair, alpha, beta)
@@ -67,11 +67,11 @@ def _residuals(pair: Pair, matches: Matches) -> tuple[Residuals, tuple[Tensor, T
         at_alpha, at_beta = torch.autograd.grad(algebraic.sum(), (alpha, beta), retain_graph=True)
     across = at_beta.square().sum(-1)
     both = (across + at_alpha.square().sum(-1)).clamp(min=1e-300)
-    return Residuals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (a, b)
+    return EpipolarResiduals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (a, b)
 
 
 def lines_basis(pair: Pair, matches: Matches) -> Float[Tensor, "n 8"]:
-    """How the distances from the lines change with the eight numbers of F (of E, for the rays) beside its scale."""
+    """Derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to scale."""
     alpha, beta = (x.detach().requires_grad_() for x in matches)
     with torch.enable_grad():
         rays, F, _ = _rays(pair, alpha, beta)
@@ -79,45 +79,40 @@ def lines_basis(pair: Pair, matches: Matches) -> Float[Tensor, "n 8"]:
     products = (rays[1][:, :, None] * rays[0][:, None, :]).flatten(1).detach()
     columns = (products / at_beta.norm(dim=-1, keepdim=True).clamp(min=1e-150)).nan_to_num()
     size = columns.norm(dim=0).clamp(min=1e-150)
-    beside = torch.linalg.svd((F.detach().flatten() * size)[None]).Vh[1:]
-    return columns / size @ beside.T
+    complement = torch.linalg.svd((F.detach().flatten() * size)[None]).Vh[1:]
+    return columns / size @ complement.T
 
 
-def _depths(pair: Pair, a: Tensor, b: Tensor, seen: Tensor) -> SeenDepths:
+def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
     """Along the rays a of alpha and b of beta, each in its camera's frame."""
     R, t = pair.beta_from_alpha.R, pair.beta_from_alpha.t[..., None, :]
-    turned = a @ R.transpose(-1, -2)
-    aa, bb, ab = (turned * turned).sum(-1), (b * b).sum(-1), (turned * b).sum(-1)
-    ta, tb = (turned * t).sum(-1), (b * t).sum(-1)
+    rotated = a @ R.transpose(-1, -2)
+    aa, bb, ab = (rotated * rotated).sum(-1), (b * b).sum(-1), (rotated * b).sum(-1)
+    ta, tb = (rotated * t).sum(-1), (b * t).sum(-1)
     sine2 = aa * bb - ab.square()
     along_a, along_b = (ab * tb - bb * ta) / sine2, (aa * tb - ab * ta) / sine2
     pixel = 1 / pair.cameras[1].K[..., :2, :2].det().abs().sqrt()[..., None]
-    known = seen & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
-    return SeenDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), known)
+    observable = valid & (sine2 / (aa * bb) > (LEAST_PARALLAX * pixel).square())
+    return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
 
 
 def related(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> dict[tuple[str, str], Matches]:
-    """Those of the pairs of which the rig says how they are related: calibrated ones and those with an F.
-
-    Raises ValueError if it says so of none.
-    """
+    """Those of the pairs that the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
     found = {names: m for names, m in pairs.items() if (pair := rig.pair(*names)).calibrated or pair.link is not None}
     if not found:
-        raise ValueError(
-            "the rig says nothing of how these cameras are related: calibrate them, or make a rig with `pat rig start`"
-        )
+        raise ValueError("the rig does not relate these cameras: calibrate them, or make a rig with `pat rig start`")
     return found
 
 
-def nature(pair: Pair) -> tuple[object, ...]:
-    """What pairs must have in common to be stacked: known by cameras or by F, and their kinds of lenses."""
+def stack_key(pair: Pair) -> tuple[object, ...]:
+    """What pairs must have in common to be stacked: calibrated or known by F, and their lens models."""
     lenses = (view.distortion if isinstance(view, LensView) else None for view in (pair.alpha, pair.beta))
     kinds = (None if lens is None else (lens.model, lens.coefficients.shape[-1]) for lens in lenses)
     return (pair.calibrated and pair.link is None, *kinds)
 
 
 def stacked(pairs: Sequence[Pair]) -> Pair:
-    """A batch of pairs of one nature; image sizes are those of the first."""
+    """A batch of pairs of one `stack_key`; image sizes are those of the first."""
     link = None
     if pairs[0].link is not None:
         link = Link(torch.stack([pair.fundamental for pair in pairs]))
@@ -126,29 +121,29 @@ def stacked(pairs: Sequence[Pair]) -> Pair:
 
 
 def _stacked(views: Sequence[View]) -> View:
-    known = [view for view in views if isinstance(view, LensView)]
-    if len(known) < len(views):
+    with_K = [view for view in views if isinstance(view, LensView)]
+    if len(with_K) < len(views):
         return views[0]
-    lenses = [view.distortion for view in known if view.distortion is not None]
+    lenses = [view.distortion for view in with_K if view.distortion is not None]
     lens = Distortion(lenses[0].model, torch.stack([lens.coefficients for lens in lenses])) if lenses else None
-    batch = known[0].replace(K=torch.stack([view.K for view in known]), distortion=lens)
-    cameras = [view for view in known if isinstance(view, Camera)]
-    if len(cameras) < len(known):
+    batch = with_K[0].replace(K=torch.stack([view.K for view in with_K]), distortion=lens)
+    cameras = [view for view in with_K if isinstance(view, Camera)]
+    if len(cameras) < len(with_K):
         return LensView(hw=batch.hw, sensor=batch.sensor, K=batch.K, distortion=lens)
     return batch.replace(cam_from_world=Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras])))
 
 
 def _for_each(pair: Pair, matches: Matches) -> tuple[Tensor, Tensor]:
-    """The points with the axes of a batch of rigs in front."""
+    """The points expanded to a batch of rigs."""
     numbers = pair.link.F if pair.link is not None else pair.cameras[0].K if pair.calibrated else pair.fundamental
     x, y = (points.expand(*numbers.shape[:-2], *points.shape[-2:]) for points in matches)
     return x, y
 
 
 def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor, Tensor]:
-    """Rays of the pixels and E; or the straightened pixels and F. And where the rays exist."""
+    """Rays of the pixels and E, or the undistorted pixels and F; and their validity."""
     if pair.link is not None or not pair.calibrated:
-        (a, seen), (b, also) = pair.alpha.undistort(x), pair.beta.undistort(y)
-        return (to_homogeneous(a), to_homogeneous(b)), pair.fundamental, seen & also
-    (a, seen), (b, also) = (camera.rays(points) for camera, points in zip(pair.cameras, (x, y)))
-    return (a, b), essential_matrix(pair.beta_from_alpha), seen & also
+        (a, a_valid), (b, b_valid) = pair.alpha.undistort(x), pair.beta.undistort(y)
+        return (to_homogeneous(a), to_homogeneous(b)), pair.fundamental, a_valid & b_valid
+    (a, a_valid), (b, b_valid) = (camera.rays(points) for camera, points in zip(pair.cameras, (x, y)))
+    return (a, b), essential_matrix(pair.beta_from_alpha), a_valid & b_valid

@@ -17,8 +17,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom.segments import sample_fractions
-from pat.attention import cpu_kernels as kernels
-from pat.attention.reference import EDGE_SLACK, Look
+from pat.attention import kernels
+from pat.attention.reference import EDGE_SLACK, SamplePositions
 from pat.support.threads import in_parallel
 
 PIECE_SAMPLES = 2**15
@@ -28,29 +28,35 @@ SCRATCH_TAPS = 2**20
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
-) -> tuple[Tensor, Tensor, Tensor]:
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    positions: SamplePositions,
+    bias: Tensor | None,
+    nearest: bool,
+    measured: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
-    the sum of exponentials (b, ha, wa)."""
+    the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest weights."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
     out = _new(b, ha, wa, value.shape[1], dtype=query.dtype)
     statistics = _new(*((b, ha, wa, 4) if measured else (0,)), dtype=counted)
     logsum = _new(b, ha, wa, dtype=counted)
-    call = _call(query, key, value, look, bias, nearest)
-    outputs = (_flat(out), _flat(statistics), _flat(logsum))
-    in_parallel([partial(kernels.forward, call, share, *outputs) for share in _shares(0, b * ha * wa, call)])
-    return out.permute(0, 3, 1, 2), statistics, logsum
+    call = _call(query, key, value, positions, bias, nearest)
+    outputs = kernels.Outputs(_flat(out), _flat(statistics), _flat(logsum), measured)
+    in_parallel([partial(kernels.forward, call, share, outputs) for share in _shares(0, b * ha * wa, call)])
+    return out.permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
 
 
 def backward(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    look: Look,
+    positions: SamplePositions,
     bias: Tensor | None,
     nearest: bool,
-    saved: tuple[Tensor, Tensor],
+    saved: tuple[Tensor, Tensor, Tensor, Tensor | None],
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
@@ -62,34 +68,47 @@ def backward(
     """
     b, d, ha, wa = query.shape
     counted = _accumulated(query)
-    call = _call(query, key, value, look, bias, nearest)
+    call = _call(query, key, value, positions, bias, nearest)
     upstream = _flat(_channels_last(cotangents[0]))
-    statistics, pulls = (t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous()))
-    found = kernels.Saved(_flat(statistics), _flat(saved[1]), upstream, _flat(pulls))
+    statistics, statistics_upstream = (
+        t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous())
+    )
+    found = kernels.Saved(
+        statistics=_flat(statistics),
+        logsum=_flat(saved[1]),
+        value_upstream=upstream,
+        statistics_upstream=_flat(statistics_upstream),
+        step=4 if saved[0].numel() else 0,
+    )
     query_out = _new(*((b, ha, wa, d) if wanted[0] else (0,)), dtype=query.dtype)
     key_out, value_out = (
         _new(*((b, *t.shape[2:], t.shape[1]) if want else (0,)), dtype=counted).zero_()
         for t, want in ((key, wanted[1]), (value, wanted[2]))
     )
-    points_out = query.new_zeros((b, *look.points.shape[1:]) if wanted[3] else 0, dtype=counted)
-    bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 0, dtype=counted)
-    gradients = kernels.Gradients(*(_flat(t) for t in (query_out, points_out, bias_out)))
-    scratch = _scratch(b * ha * wa, call)
-    step = len(scratch.counts)
+    points_out = query.new_zeros((b, *positions.points.shape[1:]) if wanted[3] else 0, dtype=counted)
+    bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 0, dtype=counted)
+    gradients = kernels.Gradients(
+        *(_flat(t) for t in (query_out, points_out, bias_out)),
+        wants_query=wanted[0],
+        wants_points=wanted[3],
+        wants_bias=wanted[4],
+    )
+    taps = _tap_list(b * ha * wa, call)
+    step = len(taps.tap_count)
     for first in range(0, b * ha * wa, step):
-        last, here = min(first + step, b * ha * wa), scratch._replace(first=first)
+        last, here = min(first + step, b * ha * wa), taps._replace(first=first)
         in_parallel([partial(kernels.backward, call, found, s, here, gradients) for s in _shares(first, last, call)])
         in_parallel(
             [
-                *_channel_tasks(here, here.by_key, last, call.query, d, key_out),
-                *_channel_tasks(here, here.by_value, last, upstream, call.value_channels, value_out),
+                *_channel_tasks(here, here.key_weight, last, call.query, d, key_out),
+                *_channel_tasks(here, here.value_weight, last, upstream, call.value_channels, value_out),
             ]
         )
     images = (
         (out.to(like.dtype).permute(0, 3, 1, 2) if want else like.new_empty(0))
         for out, like, want in zip((query_out, key_out, value_out), (query, key, value), wanted)
     )
-    points_out = points_out.sum_to_size(look.points.shape) if wanted[3] else points_out
+    points_out = points_out.sum_to_size(positions.points.shape) if wanted[3] else points_out
     return *images, points_out, bias_out
 
 
@@ -120,19 +139,19 @@ def _bias(bias: Tensor | None, counted: torch.dtype) -> Tensor:
     return torch.empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()
 
 
-def _geometry(look: Look, query: Tensor, key: Tensor, nearest: bool) -> kernels.Look:
+def _geometry(positions: SamplePositions, query: Tensor, key: Tensor, nearest: bool) -> kernels.Geometry:
     h, w = key.shape[2:]
     number = _number(query)
-    fractions = pad(sample_fractions(look.samples, like=look.points), (0, kernels.LANES))
-    return kernels.Look(
-        points=_flat(look.points.contiguous()),
-        mask=_flat(look.mask.contiguous().view(torch.uint8)),
+    fractions = pad(sample_fractions(positions.samples, like=positions.points), (0, kernels.LANES))
+    return kernels.Geometry(
+        points=_flat(positions.points.contiguous()),
+        mask=_flat(positions.mask.contiguous().view(torch.uint8)),
         fractions=_flat(fractions),
-        samples=look.samples,
-        straight=look.straight,
+        samples=positions.samples,
+        straight=positions.straight,
         nearest=nearest,
         alpha_pixels=query.shape[2] * query.shape[3],
-        shared=look.points.shape[0] == 1,
+        shared=positions.points.shape[0] == 1,
         height=h,
         width=w,
         last_x=number(w - 1),
@@ -145,40 +164,46 @@ def _number(like: Tensor) -> type:
     return np.float64 if _accumulated(like) == torch.float64 else np.float32
 
 
-def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> kernels.Call:
-    q, k, v = (_flat(_channels_last(t)) for t in (query, key, value))
+def _call(
+    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> kernels.Call:
     return kernels.Call(
-        *(q, k, v),
-        _geometry(look, query, key, nearest),
-        _flat(_bias(bias, _accumulated(query))),
-        query.shape[1],
-        value.shape[1],
+        *(_flat(_channels_last(t)) for t in (query, key, value)),
+        geometry=_geometry(positions, query, key, nearest),
+        bias=_flat(_bias(bias, _accumulated(query))),
+        biased=bias is not None,
+        channels=query.shape[1],
+        value_channels=value.shape[1],
     )
 
 
 def _shares(first: int, last: int, call: kernels.Call) -> list[kernels.Share]:
     """One for each thread that finds something to do."""
-    size, counter = max(1, PIECE_SAMPLES // call.look.samples), np.zeros(1, np.int64)
-    integers, numbers = kernels.room(call.look.samples, max(call.channels, call.value_channels))
-    number = call.look.fractions.dtype
+    samples, number = call.geometry.samples, call.geometry.fractions.dtype
+    size, counter = max(1, PIECE_SAMPLES // samples), np.zeros(1, np.int64)
+    channels = max(call.channels, call.value_channels)
     return [
-        kernels.Share(first, last, size, counter, np.empty(integers, np.int32), np.empty(numbers, number))
+        kernels.Share(first, last, size, counter, kernels.block_scratch(samples, channels, number))
         for _ in range(min(torch.get_num_threads(), -(-(last - first) // size)))
     ]
 
 
-def _scratch(pixels: int, call: kernels.Call) -> kernels.Scratch:
+def _tap_list(pixels: int, call: kernels.Call) -> kernels.TapList:
     """For as many pixels as go into `SCRATCH_TAPS`, or as there are."""
-    stride = (call.look.samples * (1 if call.look.nearest else 4) // kernels.LANES + 2) * kernels.LANES
+    geometry = call.geometry
+    stride = (geometry.samples * (1 if geometry.nearest else 4) // kernels.LANES + 2) * kernels.LANES
     pixels = min(pixels, max(64, SCRATCH_TAPS // stride))
-    taps, number = pixels * stride, call.look.fractions.dtype
-    return kernels.Scratch(
-        0, stride, np.empty(pixels, np.int32), np.empty(taps, np.int32), np.empty(taps, number), np.empty(taps, number)
+    return kernels.TapList(
+        first=0,
+        tap_count=np.empty((pixels, 1), np.int32),
+        rows=np.empty((pixels, stride), np.int32),
+        key_weight=np.empty((pixels, stride), geometry.fractions.dtype),
+        value_weight=np.empty((pixels, stride), geometry.fractions.dtype),
     )
 
 
 def _channel_tasks(
-    scratch: kernels.Scratch, weights: np.ndarray, last: int, x: np.ndarray, channels: int, out: Tensor
+    taps: kernels.TapList, weights: np.ndarray, last: int, x: np.ndarray, channels: int, out: Tensor
 ) -> list[Callable[[], None]]:
     """One task for each block of channels; how wide the blocks are changes no bit of the result."""
     if not out.numel():
@@ -187,6 +212,6 @@ def _channel_tasks(
     width = -(-channels // (lanes * torch.get_num_threads())) * lanes
     flat = _flat(out)
     return [
-        partial(kernels.scatter, scratch, weights, last, x, channels, c, min(c + width, channels), flat)
+        partial(kernels.scatter, taps, weights, last, x, channels, c, min(c + width, channels), flat)
         for c in range(0, channels, width)
     ]

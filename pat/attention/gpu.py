@@ -1,10 +1,14 @@
 """C3 attention on GPUs, in Triton: one program for a few alpha pixels, channels along its lanes.
 
-Forward walks the samples once with a running softmax. Backward walks them twice, first for the mean of the
-gradients by the weights, then for the gradients. Beta's gradients are added to with atomics: of float32, in
-no fixed order; or, if torch is asked for deterministic algorithms, of 64-bit fixed point numbers, whose sums
-do not depend on the order. `TRITON_INTERPRET=1`, set before the first import, runs the same code on the CPU,
-for tests.
+Forward walks the samples once with a running softmax, backward once more for the gradients: the mean of the
+gradients by the weights, which all of them need, follows from forward's outputs (as in FlashAttention-2; Dao 2023,
+section 3.1). With the gradients g by the value, (a, b) by the position, s by the spread and k by the peak, a sample's
+weight has the gradient g.v + a x + b y + s |(x, y) - position|^2 / (2 spread) + k [it is the best]; the mean of this
+over the weights is g.out + (a, b).position + s spread / 2 + k peak.
+
+Beta's gradients are added to with atomics: of float32, in no fixed order; or, if torch is asked for deterministic
+algorithms, of 64-bit fixed point numbers, whose sums do not depend on the order. `TRITON_INTERPRET=1`, set before the
+first import, runs the same code on the CPU, for tests.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import triton.language as tl
 from torch import Tensor
 
 from arraygeom.segments import sample_fractions
-from pat.attention.reference import EDGE_SLACK, LEAST_SPREAD, Look
+from pat.attention.reference import EDGE_SLACK, LEAST_SPREAD, SamplePositions
 
 PIXELS = 8
 """Alpha pixels of one program."""
@@ -29,31 +33,38 @@ FIXED_BITS = 61
 
 
 def forward(
-    query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool, measured: bool
-) -> tuple[Tensor, Tensor, Tensor]:
-    """As `cpu.forward`."""
+    query: Tensor,
+    key: Tensor,
+    value: Tensor,
+    positions: SamplePositions,
+    bias: Tensor | None,
+    nearest: bool,
+    measured: bool,
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """As `cpu.forward`, with the sample of the largest weight (b, ha, wa)."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
     out = query.new_empty(b, ha, wa, value.shape[1])
     statistics = query.new_empty(b, ha, wa, 4, dtype=counted)
     logsum = query.new_empty(b, ha, wa, dtype=counted)
-    inputs, options = _call(query, key, value, look, bias, nearest)
-    _forward[_programs(query)](*inputs, out, statistics, logsum, **options)
-    return out.permute(0, 3, 1, 2), statistics if measured else statistics.new_empty(0), logsum
+    best = query.new_empty(b, ha, wa, dtype=torch.int32)
+    inputs, options = _call(query, key, value, positions, bias, nearest)
+    _forward[_programs(query)](*inputs, out, statistics, logsum, best, **options)
+    return out.permute(0, 3, 1, 2), statistics if measured else statistics.new_empty(0), logsum, best
 
 
 def backward(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    look: Look,
+    positions: SamplePositions,
     bias: Tensor | None,
     nearest: bool,
-    saved: tuple[Tensor, Tensor],
+    saved: tuple[Tensor, Tensor, Tensor, Tensor],
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
-    """As `cpu.backward`."""
+    """As `cpu.backward`; `saved` are statistics, logsum, the best samples, and the values."""
     b, _, ha, wa = query.shape
     counted = _accumulated(query)
     upstream = _channels_last(cotangents[0])
@@ -65,12 +76,12 @@ def backward(
     sums = torch.int64 if fixed else counted
     images = [t.new_zeros(b, *t.shape[2:], t.shape[1], dtype=sums) for t in (key, value)]
     query_out = query.new_empty(b, ha, wa, query.shape[1])
-    points_out = query.new_zeros(b, *look.points.shape[1:], dtype=counted)
-    bias_out = query.new_zeros((b, ha, wa, look.samples) if wanted[4] else 1, dtype=counted)
-    inputs, options = _call(query, key, value, look, bias, nearest)
+    points_out = query.new_zeros(b, *positions.points.shape[1:], dtype=counted)
+    bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 1, dtype=counted)
+    inputs, options = _call(query, key, value, positions, bias, nearest)
     _backward[_programs(query)](
         *inputs,
-        *(statistics, saved[1], upstream, statistics_upstream, scales),
+        *(statistics, saved[1], saved[2], _channels_last(saved[3]), upstream, statistics_upstream, scales),
         *(query_out, *images, points_out, bias_out),
         **options,
         WANTS_BIAS=wanted[4],
@@ -83,7 +94,7 @@ def backward(
         query_out.permute(0, 3, 1, 2),
         key_out,
         value_out,
-        points_out.sum_to_size(look.points.shape),
+        points_out.sum_to_size(positions.points.shape),
         bias_out,
     )
     return tuple(t if want else t.new_empty(0) for t, want in zip(found, wanted))
@@ -116,18 +127,20 @@ def _programs(query: Tensor) -> tuple[int]:
     return (triton.cdiv(query.shape[0] * query.shape[2] * query.shape[3], PIXELS),)
 
 
-def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> tuple:
+def _call(
+    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> tuple:
     counted = _accumulated(query)
     inputs = (
         *(_channels_last(t) for t in (query, key, value)),
-        look.points.contiguous(),
-        look.mask.contiguous().view(torch.uint8),
-        sample_fractions(look.samples, like=look.points),
+        positions.points.contiguous(),
+        positions.mask.contiguous().view(torch.uint8),
+        sample_fractions(positions.samples, like=positions.points),
         query.new_zeros(1, dtype=counted) if bias is None else bias.to(counted).contiguous(),
         query.shape[0] * query.shape[2] * query.shape[3],
         query.shape[2] * query.shape[3],
         *key.shape[2:],
-        look.samples,
+        positions.samples,
     )
     options = {
         "D": query.shape[1],
@@ -135,8 +148,8 @@ def _call(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | 
         "D_BLOCK": triton.next_power_of_2(query.shape[1]),
         "DV_BLOCK": triton.next_power_of_2(value.shape[1]),
         "PIXELS": PIXELS,
-        "SHARED": look.points.shape[0] == 1,
-        "STRAIGHT": look.straight,
+        "SHARED": positions.points.shape[0] == 1,
+        "STRAIGHT": positions.straight,
         "NEAREST": nearest,
         "BIASED": bias is not None,
         "NUMBER": tl.float64 if counted == torch.float64 else tl.float32,
@@ -222,6 +235,38 @@ def _blended(image, pixel, across, below, u, v, channel, D, live, NEAREST, NUMBE
 
 
 @compiled
+def _places(pixels, alpha_pixels, height, width, PIXELS: tl.constexpr, SHARED):
+    """Some alpha pixels: their indices, which of them exist, where their geometry is, and beta's first pixel."""
+    p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
+    place = p % alpha_pixels if SHARED else p
+    return p, p < pixels, place, p // alpha_pixels * height * width
+
+
+@compiled
+def _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER):
+    """Running sums with one more sample of weight w, after the earlier ones are multiplied by `keep`: mass, mean
+    position, and squared distances from it."""
+    mass = mass * keep + w
+    share = tl.where(mass > 0, w / tl.where(mass > 0, mass, 1.0), 0.0).to(NUMBER)
+    dx, dy = x - mean_x, y - mean_y
+    mean_x += share * dx
+    mean_y += share * dy
+    return mass, mean_x, mean_y, squared * keep + w * (dx * (x - mean_x) + dy * (y - mean_y))
+
+
+@compiled
+def _store_statistics(statistics, logsum, p, alive, top, mass, mean_x, mean_y, squared, NUMBER):
+    some = mass > 0
+    whole = tl.where(some, mass, 1.0).to(NUMBER)
+    spread = tl.sqrt(tl.maximum(squared / whole, 0.0))
+    tl.store(statistics + 4 * p, tl.where(some, mean_x, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 1, tl.where(some, mean_y, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 2, tl.where(some & (spread > LEAST), spread, 0.0), mask=alive)
+    tl.store(statistics + 4 * p + 3, tl.where(some, 1.0 / whole, 0.0), mask=alive)
+    tl.store(logsum + p, tl.where(some, top + tl.log(whole), float("-inf")), mask=alive)
+
+
+@compiled
 def _forward(
     query,
     key,
@@ -238,6 +283,7 @@ def _forward(
     out,
     statistics,
     logsum,
+    best_out,
     D: tl.constexpr,
     DV: tl.constexpr,
     D_BLOCK: tl.constexpr,
@@ -249,19 +295,13 @@ def _forward(
     BIASED: tl.constexpr,
     NUMBER: tl.constexpr,
 ):
-    p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
-    alive = p < pixels
-    place = p % alpha_pixels if SHARED else p
-    first = p // alpha_pixels * height * width
+    p, alive, place, first = _places(pixels, alpha_pixels, height, width, PIXELS, SHARED)
     c, cv = tl.arange(0, D_BLOCK), tl.arange(0, DV_BLOCK)
     q = _rows(query, p, c, D, alive[:, None] & (c < D)[None, :], NUMBER)
     top = tl.full([PIXELS], float("-inf"), NUMBER)
-    mass, mean_x, mean_y, scatter = (
-        tl.zeros([PIXELS], NUMBER),
-        tl.zeros([PIXELS], NUMBER),
-        tl.zeros([PIXELS], NUMBER),
-        tl.zeros([PIXELS], NUMBER),
-    )
+    best = tl.zeros([PIXELS], tl.int32)
+    mass, squared = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
+    mean_x, mean_y = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
     seen = tl.zeros([PIXELS, DV_BLOCK], NUMBER)
     for i in range(samples):
         x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
@@ -278,23 +318,13 @@ def _forward(
         live = counts[:, None] & (cv < DV)[None, :]
         row = _blended(value, first + pixel, across, below, u, v, cv, DV, live, NEAREST, NUMBER)
         seen = seen * keep[:, None] + w[:, None] * row
-        mass = mass * keep + w
-        share = tl.where(mass > 0, w / tl.where(mass > 0, mass, 1.0), 0.0).to(NUMBER)
-        dx, dy = x - mean_x, y - mean_y
-        mean_x += share * dx
-        mean_y += share * dy
-        scatter = scatter * keep + w * (dx * (x - mean_x) + dy * (y - mean_y))
+        mass, mean_x, mean_y, squared = _update(x, y, w, keep, mass, mean_x, mean_y, squared, NUMBER)
+        best = tl.where(score > top, i, best)
         top = new_top
-    some = mass > 0
-    whole = tl.where(some, mass, 1.0).to(NUMBER)
-    spread = tl.sqrt(tl.maximum(scatter / whole, 0.0))
-    tl.store(statistics + 4 * p, tl.where(some, mean_x, 0.0), mask=alive)
-    tl.store(statistics + 4 * p + 1, tl.where(some, mean_y, 0.0), mask=alive)
-    tl.store(statistics + 4 * p + 2, tl.where(some & (spread > LEAST), spread, 0.0), mask=alive)
-    tl.store(statistics + 4 * p + 3, tl.where(some, 1.0 / whole, 0.0), mask=alive)
-    tl.store(logsum + p, tl.where(some, top + tl.log(whole), float("-inf")), mask=alive)
+    _store_statistics(statistics, logsum, p, alive, top, mass, mean_x, mean_y, squared, NUMBER)
+    tl.store(best_out + p, best, mask=alive)
     live = alive[:, None] & (cv < DV)[None, :]
-    seen = tl.where(some[:, None], seen / whole[:, None], 0.0)
+    seen = seen / tl.where(mass > 0, mass, 1.0).to(NUMBER)[:, None]
     tl.store(out + p[:, None] * DV + cv[None, :], seen.to(out.dtype.element_ty), mask=live)
 
 
@@ -323,35 +353,37 @@ def _add_around(out, pixel, across, below, u, v, weight, x, channel, D, live, sc
 
 @compiled
 def _upstream(statistics, statistics_upstream, p, alive, NUMBER):
-    """Of some pixels: mean x and y, and the gradients by them, by the peak, and by the spread over the spread."""
+    """Of some pixels: mean x and y, spread, peak, and the gradients by x, y and peak, and by the spread over it."""
     mean_x = tl.load(statistics + 4 * p, mask=alive, other=0)
     mean_y = tl.load(statistics + 4 * p + 1, mask=alive, other=0)
     spread = tl.load(statistics + 4 * p + 2, mask=alive, other=0)
+    peak = tl.load(statistics + 4 * p + 3, mask=alive, other=0)
     gx = tl.load(statistics_upstream + 4 * p, mask=alive, other=0)
     gy = tl.load(statistics_upstream + 4 * p + 1, mask=alive, other=0)
     pull = tl.load(statistics_upstream + 4 * p + 2, mask=alive, other=0)
     pull = tl.where(spread > 0, pull / tl.where(spread > 0, spread, 1.0), 0.0).to(NUMBER)
     gpeak = tl.load(statistics_upstream + 4 * p + 3, mask=alive, other=0)
-    return mean_x, mean_y, gx, gy, gpeak, pull
+    return mean_x, mean_y, spread, peak, gx, gy, gpeak, pull
 
 
 @compiled
 def _weight(q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER):
-    """Sample i's inner products with the key around, its score, and its weight."""
+    """Sample i's inner products with the key around, and its weight."""
     live = counts[:, None] & (c < D)[None, :]
     s0, s1, s2, s3 = _dots(q, key, pixel, across, below, c, D, live, NEAREST, NUMBER)
     score = _blend(s0, s1, s2, s3, u, v)
     if BIASED:
         score += tl.load(bias + p * samples + i, mask=alive, other=0)
     w = tl.where(counts, tl.exp(tl.where(counts, score - lse, 0.0)), 0.0)
-    return s0, s1, s2, s3, score, w
+    return s0, s1, s2, s3, w
 
 
 @compiled
-def _slope(v0, v1, v2, v3, u, v, x, y, mean_x, mean_y, gx, gy, pull):
-    """The gradient by a sample's weight, the peak's part left out."""
-    away = (x - mean_x) * (x - mean_x) + (y - mean_y) * (y - mean_y)
-    return _blend(v0, v1, v2, v3, u, v) + gx * x + gy * y + 0.5 * pull * away
+def _slope(v0, v1, v2, v3, u, v, x, y, is_best, mean, mean_x, mean_y, spread, peak, gx, gy, gpeak, pull):
+    """The gradient by a sample's weight, less its mean over the weights; `mean` is that of the values' part."""
+    dx, dy = x - mean_x, y - mean_y
+    slope = _blend(v0, v1, v2, v3, u, v) - mean + gx * dx + gy * dy
+    return slope + 0.5 * pull * (dx * dx + dy * dy - spread * spread) + gpeak * (tl.where(is_best, 1.0, 0.0) - peak)
 
 
 @compiled
@@ -364,34 +396,6 @@ def _by_position(s0, s1, s2, s3, v0, v1, v2, v3, u, v, x, y, w, by_score, height
     dx = tl.where((x >= 0) & (x <= width - 1), by_score * across_s + w * across_v, 0.0)
     dy = tl.where((y >= 0) & (y <= height - 1), by_score * below_s + w * below_v, 0.0)
     return dx, dy
-
-
-@compiled
-def _mean_slope(
-    q, g, key, value, points, mask, fractions, bias, statistics, statistics_upstream, p, place, first, alive, lse,
-    height, width, samples, c, cv, D, DV, PIXELS: tl.constexpr, STRAIGHT, NEAREST, BIASED, NUMBER: tl.constexpr,
-):  # fmt: skip
-    """The first walk: the mean of the gradients by the weights, and which sample weighs most."""
-    mean_x, mean_y, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
-    best = tl.zeros([PIXELS], tl.int32)
-    most = tl.full([PIXELS], float("-inf"), NUMBER)
-    at_best = tl.zeros([PIXELS], NUMBER)
-    mean = tl.zeros([PIXELS], NUMBER)
-    for i in range(samples):
-        x, y, counts = _sample(points, mask, fractions, place, alive, height, width, i, samples, STRAIGHT)
-        pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
-        pixel += first
-        _, _, _, _, score, w = _weight(
-            q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
-        )
-        live = counts[:, None] & (cv < DV)[None, :]
-        v0, v1, v2, v3 = _dots(g, value, pixel, across, below, cv, DV, live, NEAREST, NUMBER)
-        mean += w * _slope(v0, v1, v2, v3, u, v, x, y, mean_x, mean_y, gx, gy, pull)
-        better = counts & (score > most)
-        best = tl.where(better, i, best)
-        most = tl.where(better, score, most)
-        at_best = tl.where(better, w, at_best)
-    return mean + gpeak * at_best, best
 
 
 @compiled
@@ -418,6 +422,8 @@ def _backward(
     samples,
     statistics,
     logsum,
+    best,
+    out,
     upstream,
     statistics_upstream,
     scales,
@@ -439,21 +445,16 @@ def _backward(
     WANTS_BIAS: tl.constexpr,
     FIXED: tl.constexpr,
 ):
-    p = tl.program_id(0).to(tl.int64) * PIXELS + tl.arange(0, PIXELS)
-    alive = p < pixels
-    place = p % alpha_pixels if SHARED else p
-    first = p // alpha_pixels * height * width
+    p, alive, place, first = _places(pixels, alpha_pixels, height, width, PIXELS, SHARED)
     c, cv = tl.arange(0, D_BLOCK), tl.arange(0, DV_BLOCK)
     q = _rows(query, p, c, D, alive[:, None] & (c < D)[None, :], NUMBER)
     g = _rows(upstream, p, cv, DV, alive[:, None] & (cv < DV)[None, :], NUMBER)
     lse = tl.load(logsum + p, mask=alive, other=float("-inf"))
     alive = alive & (lse > float("-inf"))
     lse = tl.where(alive, lse, 0.0)
-    mean, best = _mean_slope(
-        q, g, key, value, points, mask, fractions, bias, statistics, statistics_upstream, p, place, first, alive, lse,
-        height, width, samples, c, cv, D, DV, PIXELS, STRAIGHT, NEAREST, BIASED, NUMBER,
-    )  # fmt: skip
-    mean_x, mean_y, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
+    at_best = tl.load(best + p, mask=alive, other=0)
+    mean = tl.sum(g * _rows(out, p, cv, DV, alive[:, None] & (cv < DV)[None, :], NUMBER), 1)
+    mean_x, mean_y, spread, peak, gx, gy, gpeak, pull = _upstream(statistics, statistics_upstream, p, alive, NUMBER)
     key_scale, value_scale = tl.load(scales).to(tl.float64), tl.load(scales + 1).to(tl.float64)
     by_query = tl.zeros([PIXELS, D_BLOCK], NUMBER)
     x_start, y_start = tl.zeros([PIXELS], NUMBER), tl.zeros([PIXELS], NUMBER)
@@ -463,12 +464,13 @@ def _backward(
         pixel, across, below, u, v = _cell(x, y, height, width, NEAREST)
         pixel += first
         live, live_v = counts[:, None] & (c < D)[None, :], counts[:, None] & (cv < DV)[None, :]
-        s0, s1, s2, s3, _, w = _weight(
+        s0, s1, s2, s3, w = _weight(
             q, key, bias, p, alive, pixel, across, below, u, v, counts, lse, i, samples, c, D, NEAREST, BIASED, NUMBER
         )
         v0, v1, v2, v3 = _dots(g, value, pixel, across, below, cv, DV, live_v, NEAREST, NUMBER)
-        slope = _slope(v0, v1, v2, v3, u, v, x, y, mean_x, mean_y, gx, gy, pull) + tl.where(best == i, gpeak, 0.0)
-        by_score = w * (slope - mean)
+        by_score = w * _slope(
+            v0, v1, v2, v3, u, v, x, y, at_best == i, mean, mean_x, mean_y, spread, peak, gx, gy, gpeak, pull
+        )  # fmt: skip
         by_query += by_score[:, None] * _blended(key, pixel, across, below, u, v, c, D, live, NEAREST, NUMBER)
         _add_around(key_out, pixel, across, below, u, v, by_score, q, c, D, live, key_scale, NEAREST, FIXED)
         _add_around(value_out, pixel, across, below, u, v, w, g, cv, DV, live_v, value_scale, NEAREST, FIXED)

@@ -1,5 +1,5 @@
-"""C3 attention as a formula: plain torch, any device, differentiable twice. Slow, and what the fast ones
-obey.
+"""C3 attention as a formula: plain torch, any device, differentiable any number of times. Slow; the fast backends
+are tested against it.
 
 For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that count,
 
@@ -8,7 +8,7 @@ For the alpha pixel x with the query q, and its samples x_1 .. x_L in beta that 
     output   = sum_l weight_l V(x_l)
 
 (the physics-aware transformer, eq. 3 to 5: no scale, no position code). Shapes are written on the lines with
-b images, d channels, r rows of w alpha pixels, l samples. Alpha is worked off in bands of rows, so that
+b images, d channels, r rows of w alpha pixels, l samples. Alpha is processed in bands of rows, so that
 without gradients no more than `BAND_BYTES` of gathered keys and values exist at a time.
 """
 
@@ -28,8 +28,8 @@ LEAST_SPREAD = 1e-4
 """A spread (pixels) below this reads 0: it is rounding, and its derivative noise."""
 
 
-class Look(NamedTuple):
-    """Where to look, in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
+class SamplePositions(NamedTuple):
+    """Sampling locations in one form: `points` (p, Ha, Wa, n, 2), `mask` (p, Ha, Wa, n or 1), p being 1 or the
     batch.
 
     `straight` False: the n points are the samples. True: n is 2, start and end of a segment of `samples`
@@ -41,7 +41,7 @@ class Look(NamedTuple):
     samples: int
     straight: bool
 
-    def rows(self, top: int, bottom: int) -> Look:
+    def rows(self, top: int, bottom: int) -> SamplePositions:
         """A band of rows of alpha."""
         return self._replace(points=self.points[:, top:bottom], mask=self.mask[:, top:bottom])
 
@@ -55,9 +55,9 @@ class Look(NamedTuple):
 
 
 class Attended(NamedTuple):
-    """What C3 attention says about each alpha pixel. Where no sample counts, everything is 0.
+    """The outputs of C3 attention for each alpha pixel. Where no sample counts, everything is 0.
 
-    value: (B, Dv, Ha, Wa), the values seen, weighted.
+    value: (B, Dv, Ha, Wa), the weighted mean of the values.
     position: (B, 2, Ha, Wa), the expected (x, y) of the match, in beta's pixels.
     spread: (B, Ha, Wa), root of the expected squared distance of the samples from `position`, in pixels.
     peak: (B, Ha, Wa), the largest weight.
@@ -69,7 +69,9 @@ class Attended(NamedTuple):
     peak: Tensor
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
+def attend(
+    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> Attended:
     """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
     accumulate = torch.float64 if query.dtype == torch.float64 else torch.float32
     with torch.autocast(query.device.type, enabled=False):
@@ -79,11 +81,11 @@ def attend(query: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor |
                 query[:, :, top:bottom].to(accumulate).permute(0, 2, 3, 1),
                 key,
                 value,
-                look.rows(top, bottom),
+                positions.rows(top, bottom),
                 None if bias is None else bias[:, top:bottom].to(accumulate),
                 nearest,
             )
-            for top, bottom in _bands(query, key, value, look.samples)
+            for top, bottom in _bands(query, key, value, positions.samples)
         ]
         out = Attended(*(torch.cat(part, 1) for part in zip(*bands)))
     value = out.value.to(query.dtype).permute(0, 3, 1, 2)
@@ -102,11 +104,13 @@ def pixels(image: Tensor) -> Tensor:
     return image.permute(0, 2, 3, 1).contiguous()
 
 
-def _band(q: Tensor, key: Tensor, value: Tensor, look: Look, bias: Tensor | None, nearest: bool) -> Attended:
+def _band(
+    q: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
+) -> Attended:
     b, r, w, _ = q.shape
-    xy = look.positions().to(q.dtype)  # p r w l 2
-    counts = look.mask & on_image(xy, hw=key.shape[1:3])  # p r w l
-    xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, look.samples, 2)
+    xy = positions.positions().to(q.dtype)  # p r w l 2
+    counts = positions.mask & on_image(xy, hw=key.shape[1:3])  # p r w l
+    xy = torch.where(counts[..., None], xy, 0).expand(b, r, w, positions.samples, 2)
     at = _nearest if nearest else _bilinear
 
     score = torch.einsum("brwd,brwld->brwl", q, at(key, xy))

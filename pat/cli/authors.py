@@ -44,7 +44,8 @@ class Evaluate:
     def run(self) -> None:
         from arraygeom.atomic import write_text
 
-        from ..evaluation import stereo
+        from ..evaluation import protocols, stereo
+        from ..evaluation.tables import write_csv
         from ..networks.weights import load_weights
 
         folders = {name: getattr(self, name) for name in stereo.DATA_SETS if getattr(self, name) is not None}
@@ -52,15 +53,15 @@ class Evaluate:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
-        network, bands = load_weights(self.weights), stereo.PROTOCOLS[self.protocol]
-        wrong = stereo.controls(network, bands=bands) if self.controls else {}
-        methods = {**stereo.BASELINES, "fusion": stereo.rectified_fusion(network, bands=bands), **wrong}
+        network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
+        wrong = protocols.controls(network, bands=bands) if self.controls else {}
+        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}
         rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out)
         every = [row for found in rows.values() for row in found]
         text = stereo.sets_markdown(rows, protocol=self.protocol)
         text += "\n" + stereo.falls(every, names=wrong) if wrong else ""
         write_text(self.out / "scores.md", text)
-        stereo.write_csv(self.out / "scores.csv", every)
+        write_csv(self.out / "scores.csv", stereo.StereoRow._fields, every)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
 
@@ -197,7 +198,7 @@ class DataShow:
 
         from ..data import ScenePatches
         from ..data.show import draw_patches
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
         from ..sensors import generator_for, read_chains
         from ..support.schema import read_yaml
 

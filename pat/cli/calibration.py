@@ -53,7 +53,7 @@ class Calibrate:
             depth=self.depth,
             progress=options.progress("detecting the board"),
         )
-        print("\n".join(found.lines))
+        print("\n".join(found.messages))
         say(f"written: {', '.join(map(str, found.written))}")
 
 

@@ -175,7 +175,7 @@ class Demo:
         from ..evaluation.baseline import classical
         from ..evaluation.metrics import score
         from ..fusion.results import save_frame
-        from ..systems.demo import report_figure
+        from ..systems.demo import save_demo_figure
 
         sample = load_sample()
         say("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
@@ -183,7 +183,7 @@ class Demo:
         say(f"fusion with the weights '{self.weights}'")
         frame = fuse_with_progress(self.weights, sample.rig, sample.images, alpha=ALPHA)
         written = save_frame(frame, self.out)
-        report_figure(sample, baseline, frame, self.out / "demo.png")
+        save_demo_figure(sample, baseline, frame, self.out / "demo.png")
         rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
         scores = {name: score(image.clamp(0, 1), sample.ground_truth) for name, image in rows.items()}
         lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]

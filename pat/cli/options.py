@@ -24,17 +24,7 @@ T = TypeVar("T")
 SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
 WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
-FIELDS = {
-    "epipolar": "Epipolar",
-    "line": "EpipolarLine",
-    "homography": "HomographyDisplacement",
-    "rectified": "Rectified",
-    "nearest": "NearestVoxels",
-    "local": "Local",
-    "dense": "Dense",
-}
-"""Classes of `arraygeom` by the name of the receptive field."""
-FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
+FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved"]
 FIELD_NAMES = get_args(FieldName)[1:]
 
 
@@ -83,9 +73,9 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
 
 def field_named(name: str) -> ReceptiveField | None:
     """The receptive field of that name; None for "auto"."""
-    import arraygeom
+    from arraygeom.fields.default import FIELDS
 
-    return None if name == "auto" else getattr(arraygeom, FIELDS[name])()
+    return None if name == "auto" else FIELDS[name]()
 
 
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:

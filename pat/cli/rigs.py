@@ -34,7 +34,7 @@ class Show:
         from arraygeom import Camera
         from arraygeom.viz import draw_fields, draw_rig
 
-        from ..fusion.results import save_figure
+        from ..media.figures import save_figure
 
         rig = load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
@@ -202,7 +202,7 @@ class Refine:
     """Also minimise the fusion's own error, after that of the points."""
 
     def run(self) -> None:
-        from calib.images.refine import refine
+        from calib.images.refinement import refine
 
         from ..attention import attend_with_statistics
 
@@ -237,12 +237,12 @@ class RigFromImages:
     """Rough focal lengths in pixels, if known; used where they help."""
 
     def run(self) -> None:
-        from calib.images.from_images import start
+        from calib.images.from_images import rig_from_images
 
         from ..media.images import read_image
 
         images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
-        found = start(images, focal=options.numbers_by_name(self.focal, "--focal"))
+        found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
         print(found.as_text())
         found.rig.save(self.out)
         say(f"written: {self.out}")

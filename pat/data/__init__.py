@@ -3,42 +3,30 @@
 from pat.data.indices import agreement, index_files, read_indices, write_indices
 from pat.data.pairs import (
     PAPER_DISPARITY,
-    Calibration,
     Disparity,
     StereoPair,
-    flickr_pairs,
     folder_pairs,
-    kitti_pairs,
     middlebury_pairs,
-    syntim_pairs,
 )
-from pat.data.patches import Patches, scene_folders
-from pat.data.scenes import Patch, RenderedScenes, ScenePatches, SceneShuffle, collate, default_chains
-from pat.evaluation.protocols import MonoColourTask, mono_colour_task, reduce_by
+from pat.data.patches import PatchGrid
+from pat.data.scenes import Patch, ScenePatches, SceneShuffle, collate, default_chains
+from pat.data.windows import scene_folders
 
 __all__ = [
     "PAPER_DISPARITY",
-    "Calibration",
     "Disparity",
-    "MonoColourTask",
     "Patch",
-    "Patches",
-    "RenderedScenes",
+    "PatchGrid",
     "ScenePatches",
     "SceneShuffle",
     "StereoPair",
     "agreement",
     "collate",
     "default_chains",
-    "flickr_pairs",
     "folder_pairs",
     "index_files",
-    "kitti_pairs",
     "middlebury_pairs",
-    "mono_colour_task",
     "read_indices",
-    "reduce_by",
     "scene_folders",
-    "syntim_pairs",
     "write_indices",
 ]

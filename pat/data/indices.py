@@ -1,4 +1,4 @@
-"""The paper's own index files: for every alpha pixel, the beta pixels it looks at, made ahead and kept on disk.
+"""The paper's own index files: for every alpha pixel, the beta pixels that it attends to, precomputed on disk.
 
 `xxs_ID.npy` holds rows and `yys_ID.npy` columns, or `xxs_ID_k.npy` and `yys_ID_k.npy` for the k-th of several betas:
 whole numbers (int16), counted from 0, one line for each alpha pixel, row by row, with n entries each, (h w, n).
@@ -43,7 +43,7 @@ def read_indices(folder: str | Path, name: str, hw: HW, *, beta: int | None = No
 
 
 def write_indices(folder: str | Path, name: str, positions: Positions, *, beta: int | None = None) -> list[Path]:
-    """Write both files, each whole or not at all; returns their paths.
+    """Write both files, each atomically; returns their paths.
 
     Raises ValueError for positions (h, w, n, 2) that are not whole pixels, or beyond what int16 holds.
     """

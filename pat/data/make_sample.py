@@ -32,13 +32,13 @@ IMAGE_SUFFIXES = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")
 
 
 def sample_cameras() -> dict[str, Camera]:
-    """A mono alpha and, 12 cm to its right and a little above, a wider colour camera, turned and toed in."""
-    turned = rotation_from_vector(torch.tensor([0.6, -1.5, 2.0], dtype=torch.float64) * math.pi / 180)
+    """A mono alpha and, 12 cm to its right and a little above, a wider colour camera, rotated and toed in."""
+    rotation = rotation_from_vector(torch.tensor([0.6, -1.5, 2.0], dtype=torch.float64) * math.pi / 180)
     centre = torch.tensor([0.12, -0.03, 0.01], dtype=torch.float64)
     mono = Camera(K=intrinsics(820.0, HW), cam_from_world=Pose.identity(), hw=HW, sensor=Sensor(response="mono"))
     colour = Camera(
         K=intrinsics((460.0, 460.0), (360, 560), (284.0, 172.0)),
-        cam_from_world=Pose.from_centre(turned, centre),
+        cam_from_world=Pose.from_centre(rotation, centre),
         hw=(360, 560),
         sensor=Sensor(response="rgb"),
     )
@@ -51,7 +51,7 @@ def photographs() -> list[np.ndarray]:
 
 
 def main(out: Path = SAMPLE, seed: int = 2) -> None:
-    """Render a layered scene with the sample rig, record it, and write rig, images and truth."""
+    """Render a layered scene with the sample rig, record it, and write rig, images and ground truth."""
     cameras = sample_cameras()
     rig = Rig(cameras, depth=depth_range(1.4, 20.0), name="sample: mono + colour")
     generator = torch.Generator().manual_seed(seed)

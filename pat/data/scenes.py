@@ -1,4 +1,4 @@
-"""Rendered scenes as a data set of torch, and as a source of training scenes."""
+"""Patches of rendered scenes as a torch dataset."""
 
 from __future__ import annotations
 
@@ -9,41 +9,40 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 from torch.utils.data import Dataset, Sampler
 
-from arraygeom.camera import Camera
 from arraygeom.fields import ReceptiveField
+from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.rig import Rig
 from arraygeom.sensor import Band, Curve, Sensor
-from pat.networks.protocol import Look
+from pat.media.colour import srgb_image
 from pat.sensors import (
-    Case,
     Clip,
-    Coded,
+    DegradationCase,
+    EncodeSRGB,
     Noise,
     Quantise,
     Spectral,
     Step,
     generator_for,
-    record,
     record_array,
     seed_for,
 )
-from pat.synthesis.layered import ArrayBatch
 
-from .patches import Patches, Stack, cut, same_cameras, scene_folders, scene_rig, select, stacked
+from .patches import PatchGrid, PatchStack, cut
+from .windows import same_cameras, scene_folders, scene_rig, select, stacked
 
 LOADED = 64
-"""Scenes whose patches are kept in memory by each process."""
+"""Scenes whose patches each process caches in memory."""
 
 
 @dataclass(frozen=True)
 class Patch:
-    """What the cameras record of a patch, and the truth; one, or a batch of them.
+    """The recorded images of a patch and their ground truth; one, or a batch of them.
 
-    `images` are coded as the chains leave them (sRGB by default), by camera, alpha first; `rig` is that of those
-    images. `truth` is alpha's ideal view in colour (sRGB, 0..1), and `depth` its depth in metres, both on the
+    `images` are encoded as the chains leave them (sRGB by default), by camera, alpha first; `rig` is that of those
+    images. `ground_truth` is alpha's ideal view in colour (sRGB, 0..1), and `depth` its depth in metres, both on the
     grid that alpha had before its chain.
     """
 
@@ -53,18 +52,18 @@ class Patch:
     rig: Rig
     alpha: str
 
-    def looks(self, field: ReceptiveField) -> list[Look]:
-        """Where to look in every beta."""
-        return [Look.along(field, self.rig.pair(self.alpha, beta)) for beta in self.rig.betas(self.alpha)]
+    def on_grid(self, field: ReceptiveField) -> list[FieldOnGrid]:
+        """The field of every beta, on alpha's pixels."""
+        return [FieldOnGrid.of(field, self.rig.pair(self.alpha, beta)) for beta in self.rig.betas(self.alpha)]
 
 
 class ScenePatches(Dataset[Patch]):
     """All patches of all scenes of a folder, degraded on the fly.
 
-    `chains` say how each camera records (see `default_chains`), `cases` are degradations of alpha and of all betas
-    on top, all equally likely. What is drawn depends on `seed`, `epoch` and the patch alone. Scenes are cut when
-    they are first asked for and some stay in memory: shuffle with `SceneShuffle`. Raises ValueError for a folder
-    without scenes; for a scene that is not whole, or of other sizes than the first, when it comes up.
+    `chains` simulate each camera (see `default_chains`), `cases` are further degradations of alpha and of all betas,
+    all equally likely. Random numbers depend on `seed`, `epoch` and the patch alone. Scenes are cut on first use and
+    the latest are cached: shuffle with `SceneShuffle`. Raises ValueError for a folder without scenes; for a scene
+    that is incomplete, or of other sizes than the first, when it is read.
     """
 
     def __init__(
@@ -72,9 +71,9 @@ class ScenePatches(Dataset[Patch]):
         root: str | Path,
         *,
         alpha: str | None = None,
-        patches: Patches | None = None,
+        patches: PatchGrid | None = None,
         chains: Mapping[str, Sequence[Step]] | None = None,
-        cases: Sequence[Case] = (),
+        cases: Sequence[DegradationCase] = (),
         seed: int = 0,
     ):
         self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
@@ -93,10 +92,10 @@ class ScenePatches(Dataset[Patch]):
         return self._recorded(self.scenes[scene], number, seed_for(self.seed, self.epoch, index))
 
     def set_epoch(self, epoch: int) -> None:
-        """Draw anew: noise and cases of every epoch differ."""
+        """Draw other noise and cases."""
         self.epoch = epoch
 
-    def _recorded(self, stack: Stack, number: int, seed: int) -> Patch:
+    def _recorded(self, stack: PatchStack, number: int, seed: int) -> Patch:
         alpha = self.scenes.alpha
         one = slice(number, number + 1)
         rig, rgb = select(stack.rig, number), {name: views[one] for name, views in stack.rgb.items()}
@@ -104,7 +103,7 @@ class ScenePatches(Dataset[Patch]):
         recorded = record_array(rgb, rig, self._chains(alpha, seed), seed=seed, depth=depth)
         return Patch(
             images={name: recorded.images[name][0] for name in (alpha, *rig.betas(alpha))},
-            ground_truth=coded(rgb[alpha])[0],
+            ground_truth=srgb_image(rgb[alpha])[0],
             depth=depth[alpha][0],
             rig=recorded.rig,
             alpha=alpha,
@@ -120,45 +119,45 @@ class ScenePatches(Dataset[Patch]):
 
 
 class SceneStacks:
-    """The scenes of a folder, cut into patches when asked for; the latest `LOADED` stay in memory."""
+    """The scenes of a folder, cut into patches on first use; the latest `LOADED` are cached."""
 
-    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: Patches | None = None):
+    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: PatchGrid | None = None):
         self.folders = scene_folders(root)
-        self._kept: OrderedDict[int, Stack] = OrderedDict()
+        self._cache: OrderedDict[int, PatchStack] = OrderedDict()
         self.rig = scene_rig(self.folders[0])
         self.alpha = self.rig.require(alpha or self.rig.names[0])
-        self.patches = patches or Patches.like_the_papers(self.rig[self.alpha].hw)
+        self.patches = patches or PatchGrid.like_the_papers(self.rig[self.alpha].hw)
 
     def __len__(self) -> int:
         return len(self.folders)
 
-    def __getitem__(self, index: int) -> Stack:
-        if index in self._kept:
-            self._kept.move_to_end(index)
-            return self._kept[index]
+    def __getitem__(self, index: int) -> PatchStack:
+        if index in self._cache:
+            self._cache.move_to_end(index)
+            return self._cache[index]
         folder = self.folders[index]
         try:
             same_cameras(self.rig, scene_rig(folder))
         except ValueError as error:
             raise ValueError(f"{folder}: {error}") from None
         stack = cut(folder, self.patches, alpha=self.alpha)
-        self._kept[index] = stack
-        if len(self._kept) > LOADED:
-            self._kept.popitem(last=False)
+        self._cache[index] = stack
+        if len(self._cache) > LOADED:
+            self._cache.popitem(last=False)
         return stack
 
 
 class SceneShuffle(Sampler[int]):
     """A random order that reads each scene once: `mixed` scenes at a time, their patches shuffled together."""
 
-    def __init__(self, data: ScenePatches, *, mixed: int = 16, seed: int = 0):
-        self.data, self.mixed, self.seed = data, mixed, seed
+    def __init__(self, data: ScenePatches, *, mixed: int = 16):
+        self.data, self.mixed = data, mixed
 
     def __len__(self) -> int:
         return len(self.data)
 
     def __iter__(self) -> Iterator[int]:
-        g = generator_for(self.seed, "order", self.data.epoch)
+        g = generator_for(self.data.seed, "order", self.data.epoch)
         count = self.data.scenes.patches.count
         for scenes in torch.randperm(len(self.data.scenes), generator=g).split(self.mixed):
             patches = (scenes[:, None] * count + torch.arange(count)).flatten()
@@ -177,64 +176,11 @@ def collate(patches: Sequence[Patch]) -> Patch:
     )
 
 
-class RenderedScenes:
-    """Patches of rendered scenes where layered ones are expected: `sample` is that of `LayeredScenes`.
-
-    A batch mixes patches of several scenes that are in memory; `mixed` of them are, and one is exchanged about
-    every time that as many patches as it has were given. Raises ValueError for cameras with a lens model.
-    """
-
-    def __init__(self, root: str | Path, *, alpha: str | None = None, patches: Patches | None = None, mixed: int = 16):
-        self.scenes = SceneStacks(root, alpha=alpha, patches=patches)
-        for name, camera in self.scenes.rig.cameras.items():
-            if isinstance(camera, Camera) and camera.distortion is not None:
-                raise ValueError(f"camera '{name}' has a lens model, training scenes are of pinholes: use ScenePatches")
-        self.mixed = min(mixed, len(self.scenes))
-        self._pool: list[int] = []
-
-    def sample(self, batch: int, generator: Generator) -> ArrayBatch:
-        """Ideal images (sRGB) of alpha and betas with their truth; all cameras are pinholes."""
-        self._exchange(batch, generator)
-        count = self.scenes.patches.count
-        drawn = [(self._pool[_draw(len(self._pool), generator)], _draw(count, generator)) for _ in range(batch)]
-        stacks = [(self.scenes[scene], number) for scene, number in drawn]
-        rig = stacked([select(stack.rig, number) for stack, number in stacks])
-        names = (self.scenes.alpha, *rig.betas(self.scenes.alpha))
-        images = [coded(torch.stack([stack.rgb[n][i] for stack, i in stacks])) for n in names]
-        depth = [torch.stack([stack.depth[n][i] for stack, i in stacks]) for n in names]
-        cameras = [rig[n].to(torch.float32) for n in names]
-        K, R, t, hw = ([getattr(c, key) for c in cameras] for key in ("K", "R", "t", "hw"))
-        return ArrayBatch(images, depth, K, R, t, hw, _bounds(depth[0]))
-
-    def _exchange(self, batch: int, generator: Generator) -> None:
-        while len(self._pool) < self.mixed:
-            self._pool.append(_draw(len(self.scenes), generator))
-        chance = batch / self.scenes.patches.count
-        if float(torch.rand((), generator=generator)) < chance:
-            self._pool[_draw(self.mixed, generator)] = _draw(len(self.scenes), generator)
-
-
-def _bounds(depth: Float[Tensor, "b h w"]) -> Float[Tensor, "b 2"]:
-    """The nearest and the farthest of what is there; what is infinitely far, or not seen by a lens, does not count."""
-    there = depth.isfinite()
-    near = torch.where(there, depth, torch.inf).flatten(1).amin(1)
-    far = torch.where(there, depth, 0.0).flatten(1).amax(1)
-    return torch.stack([near, torch.maximum(near, far)], -1)
-
-
-def _draw(below: int, generator: Generator) -> int:
-    return int(torch.randint(below, (), generator=generator))
-
-
-def coded(rgb: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-    """Linear light as an sRGB image."""
-    return record(rgb, [Clip(), Coded()], Generator()).image
-
-
 def default_chains(rig: Rig) -> dict[str, tuple[Step, ...]]:
-    """What each camera's response says, a little noise, 8 bits, sRGB coding."""
+    """Each camera's spectral response, a little noise, sRGB encoding, 8 bits."""
     return {
-        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), Coded(), Quantise(8)) for name, c in rig.cameras.items()
+        name: (_spectral(c.sensor), Noise(8000, 3), Clip(), EncodeSRGB(), Quantise(8))
+        for name, c in rig.cameras.items()
     }
 
 

@@ -1,4 +1,4 @@
-"""Drawings of samples: what cameras record of a patch, where some pixels look, the truth and its depth."""
+"""Figures of samples: recorded images of a patch, search segments of some pixels, ground truth and depth."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from torch import Tensor
 
 from arraygeom.fields import ReceptiveField
 from arraygeom.viz import COLOURS, draw_look, numpy, show_image, suitable_field
-from pat.fusion.results import colour_depth
+from pat.media.figures import colour_depth
 
 from .scenes import Patch
 
-LOOKS = 6
+SHOWN = 6
 """Pixels of alpha whose fields are drawn."""
 
 
 def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = None) -> Figure:
-    """One line for each patch: alpha and betas as recorded with a few pixels' fields, truth, depth."""
+    """One line for each patch: alpha and betas as recorded with a few pixels' fields, ground truth, depth."""
     columns = len(patches[0].images) + 2
     h, w = patches[0].ground_truth.shape[-2:]
     figure = Figure(figsize=(3.2 * columns, (3.2 * h / w + 0.35) * len(patches)), layout="constrained")
     for row, patch in enumerate(patches):
-        x = _spots(patch.rig[patch.alpha].hw)
+        x = _pixels(patch.rig[patch.alpha].hw)
         for column, (name, image) in enumerate(patch.images.items()):
             axes = figure.add_subplot(len(patches), columns, row * columns + column + 1)
             show_image(axes, patch.rig[name].hw, image.expand(3, -1, -1).clamp(0, 1))
@@ -36,7 +36,7 @@ def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = Non
                 pair = patch.rig.pair(patch.alpha, name)
                 draw_look(axes, field or suitable_field(pair), pair, x)
         for column, (title, image) in enumerate(
-            {"truth": patch.ground_truth, "depth": colour_depth(patch.depth)}.items()
+            {"ground truth": patch.ground_truth, "depth": colour_depth(patch.depth)}.items()
         ):
             axes = figure.add_subplot(len(patches), columns, row * columns + columns - 1 + column)
             show_image(axes, (image.shape[-2], image.shape[-1]), image)
@@ -44,8 +44,8 @@ def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = Non
     return figure
 
 
-def _spots(hw: tuple[int, int]) -> Float[Tensor, "n 2"]:
-    """A few pixels spread over an image, in a zigzag."""
-    across = (torch.arange(LOOKS) + 0.5) / LOOKS * hw[1]
-    down = torch.tensor([0.25, 0.75]).repeat(LOOKS)[:LOOKS] * hw[0]
+def _pixels(hw: tuple[int, int]) -> Float[Tensor, "n 2"]:
+    """A few pixels all over an image, in a zigzag."""
+    across = (torch.arange(SHOWN) + 0.5) / SHOWN * hw[1]
+    down = torch.tensor([0.25, 0.75]).repeat(SHOWN)[:SHOWN] * hw[0]
     return torch.stack([across, down], -1).floor()

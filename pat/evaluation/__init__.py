@@ -1,1 +1,1 @@
-"""TODO."""
+"""Scores, baselines and ablations of fusions: the paper's protocols, tables and figures."""

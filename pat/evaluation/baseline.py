@@ -1,17 +1,17 @@
-"""Mono + colour fusion without learning: the peer that every evaluation reports.
+"""Mono + colour fusion without learning: the baseline that every evaluation reports.
 
 Semi-global matching (Hirschmüller 2008) of luminances, a left-right check, beta's colour differences warped
-to alpha, corrected by guided regression (He et al. 2013) on alpha's luminance, and spread from pixels that
-can be trusted to those that cannot by edge-aware smoothing guided by alpha (Min et al. 2014). The result has
-alpha's luminance.
+to alpha, corrected by guided regression (He et al. 2013) on alpha's luminance, and diffused from pixels of high
+weight to those of low weight by edge-aware smoothing guided by alpha (Min et al. 2014). The result has alpha's
+luminance.
 
-The numbers below were chosen for the mean PSNR of real pairs with beta reduced 2x and 4x. There the usual
-last step, a guided filter over all warped colours, did worse: it spreads colour over edges that luminance
-does not show.
+The constants were tuned for the mean PSNR of real pairs with beta reduced 2x and 4x. There the usual last step,
+a guided filter over all warped colours, did worse: it diffuses colour over edges that luminance does not show.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import cv2
@@ -21,19 +21,20 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Rig
-from pat.media.colour import from_luma_chroma, luminance, luminance_of
+from arraygeom import Pair, Rig
+
+from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
 
 Image = NDArray[Any]
 
 BLOCK = 5
 """Side of the matched block in pixels."""
 CHECK = 1.0
-"""Disparities of the two images that differ by more than this many pixels are not trusted."""
+"""A match fails the left-right check if the two disparities differ by more than this many pixels."""
 LIKENESS = 0.08
-"""Difference of luminances at which the trust in a match falls to 1 / e."""
-DOUBT = 0.5
-"""Trust in the colour of a pixel that fails the left-right check, before the likeness of luminances."""
+"""Difference of luminances at which the weight of a match falls to 1 / e."""
+INCONSISTENT = 0.5
+"""Weight of the colour of a pixel that fails the left-right check, before the likeness of luminances."""
 REGRESSION_RADIUS, REGRESSION_FLOOR = 3, 3e-3
 """Window and regulariser (variance of luminance) of the regression of colour on luminance."""
 
@@ -51,15 +52,21 @@ COLOUR_FILL = _Smoothing(300, 3)
 UNRECTIFIABLE = "the cameras look along the line between them: such a pair cannot be rectified"
 
 
-class _Match(NamedTuple):
-    """Disparity of alpha in pixels, >= 0, and where the left-right check holds."""
+def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "_ h w"]:
+    """`classical` with the one colour beta, or with each of the betas that record one band, bands concatenated."""
+    betas = [name for name in rig.betas(alpha) if name in images]
+    if images[betas[0]].shape[0] == 3:
+        return classical(rig, images, alpha, betas[0])
+    return torch.cat([classical(rig, images, alpha, name) for name in betas])
 
-    disparity: Image
-    consistent: NDArray[np.bool_]
+
+def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "_ h w"]:
+    """The classical fusion of two calibrated pinhole cameras of a rig; see `classical_calibrated`."""
+    return classical_calibrated(luminance_of(images[alpha]), images[beta], rig.pair(alpha, beta))
 
 
 def classical_fusion(
-    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "3 hb wb"], *, max_disparity: float
+    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "3 hb wb"], max_disparity: float
 ) -> Float[Tensor, "3 h w"]:
     """Alpha in beta's colours, for a (near-)rectified pair with alpha on the left.
 
@@ -71,51 +78,35 @@ def classical_fusion(
         raise ValueError(f"max_disparity must be positive, got {max_disparity}")
     mono, colours = _planes(alpha)[..., 0], _resized(_planes(beta), alpha.shape[1:])
     sharpness = beta.shape[2] / alpha.shape[2]
-    chroma = _carried_chroma(mono, colours, np.ones_like(mono), max_disparity, sharpness)
+    chroma = _warped_chroma(mono, colours, np.ones_like(mono), max_disparity, sharpness)
     return _recoloured(alpha, chroma)
 
 
-def classical_fusion_calibrated(
-    alpha: Float[Tensor, "1 h w"],
-    beta: Float[Tensor, "3 hb wb"],
-    K_alpha: Float[Tensor, "3 3"],
-    K_beta: Float[Tensor, "3 3"],
-    R: Float[Tensor, "3 3"],
-    t: Float[Tensor, " 3"],
-    *,
-    depth: tuple[float, float],
-) -> Float[Tensor, "3 h w"]:
-    """Alpha in beta's colours, for two pinhole cameras anywhere: X_beta = R X_alpha + t, in units of `depth`.
+def classical_calibrated(
+    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "_ hb wb"], pair: Pair
+) -> Float[Tensor, "_ h w"]:
+    """Beta's colours, or its one band, at alpha's view, for two pinhole cameras with any pose and a depth range.
 
-    Both are rectified to one image plane with about alpha's resolution, fused there for depths near to far,
-    and the colours taken back to alpha. Raises ValueError if 0 < near < far does not hold, and for cameras
-    that look along the line between them (nothing rectifies those).
+    Both are rectified to one image plane with about alpha's resolution and matched there for depths near to far; the
+    colour differences (for one band: what beta has more than alpha) are warped back to alpha. Values 0..1. Raises
+    ValueError if 0 < near < far does not hold, and for cameras that look along the line between them.
     """
-    plane, mono, colours, inside = _on_one_plane(alpha, beta, (K_alpha, K_beta, R, t), depth)
-    sharpness = float(K_beta[0, 0] / K_alpha[0, 0])
-    chroma = _carried_chroma(mono, colours, inside, plane.max_disparity, sharpness)
-    back = _warped(chroma, np.linalg.inv(plane.from_alpha), (alpha.shape[2], alpha.shape[1]))
-    return _recoloured(alpha, back)
-
-
-def classical_band_calibrated(
-    alpha: Float[Tensor, "1 h w"],
-    beta: Float[Tensor, "1 hb wb"],
-    K_alpha: Float[Tensor, "3 3"],
-    K_beta: Float[Tensor, "3 3"],
-    R: Float[Tensor, "3 3"],
-    t: Float[Tensor, " 3"],
-    *,
-    depth: tuple[float, float],
-) -> Float[Tensor, "1 h w"]:
-    """Beta's band at alpha's view, for a beta that sees one band: the same pipeline, what alpha has less is carried.
-
-    Arguments and errors are as of `classical_fusion_calibrated`.
-    """
-    plane, mono, band, inside = _on_one_plane(alpha, beta, (K_alpha, K_beta, R, t), depth)
-    difference = _carried_band(mono, band, inside, plane.max_disparity, float(K_beta[0, 0] / K_alpha[0, 0]))
-    back = _warped(difference, np.linalg.inv(plane.from_alpha), (alpha.shape[2], alpha.shape[1]))
-    return (alpha + torch.from_numpy(back)[None].to(alpha)).clamp(0, 1)
+    near, far = (float(d) for d in pair.depth_range)
+    if not 0 < near < far:
+        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
+    plane = _rectified_plane(pair, (near, far))
+    mono = _warped(_planes(alpha), plane.from_alpha, plane.wh)
+    other = _warped(_planes(beta), plane.from_beta, plane.wh)
+    inside = _covered(pair.beta.hw, plane.from_beta, plane.wh)
+    cameras = pair.cameras
+    sharpness = float(cameras[1].K[0, 0] / cameras[0].K[0, 0])
+    to_alpha = np.linalg.inv(plane.from_alpha)
+    wh = (alpha.shape[2], alpha.shape[1])
+    if beta.shape[0] == 3:
+        chroma = _warped_chroma(mono, other, inside, plane.max_disparity, sharpness)
+        return _recoloured(alpha, _warped(chroma, to_alpha, wh))
+    difference = _warped_band(mono, other, inside, plane.max_disparity, sharpness)
+    return (alpha + torch.from_numpy(_warped(difference, to_alpha, wh))[None].to(alpha)).clamp(0, 1)
 
 
 class _Plane(NamedTuple):
@@ -127,39 +118,30 @@ class _Plane(NamedTuple):
     max_disparity: float
 
 
-def _on_one_plane(
-    alpha: Tensor, beta: Tensor, cameras: tuple[Tensor, ...], depth: tuple[float, float]
-) -> tuple[_Plane, Image, Image, Image]:
-    """The common plane of two cameras (K_alpha, K_beta, R, t), both images on it, and where beta has content."""
-    near, far = depth
-    if not 0 < near < far:
-        raise ValueError(f"depth must be 0 < near < far, got {near} to {far}")
-    matrices = (x.detach().cpu().double().numpy() for x in cameras)
-    plane = _rectified_plane(*matrices, hw=(alpha.shape[1], alpha.shape[2]), depth=depth)
-    inside = _covered((beta.shape[1], beta.shape[2]), plane.from_beta, plane.wh)
-    mono, other = _warped(_planes(alpha), plane.from_alpha, plane.wh), _warped(_planes(beta), plane.from_beta, plane.wh)
-    return plane, mono, other, inside
+def _rectified_plane(pair: Pair, depth: tuple[float, float]) -> _Plane:
+    """Both cameras rotated so that x runs along the baseline (Fusiello et al. 2000).
 
-
-def _rectified_plane(K_alpha, K_beta, R, t, *, hw: tuple[int, int], depth: tuple[float, float]) -> _Plane:
-    """Both cameras turned so that x runs along the baseline (Fusiello et al. 2000).
-
-    cv2.stereoRectify takes one size for both images, hence this. beta's principal point is moved so that
-    disparities start at 0 whichever camera is on the left.
+    `arraygeom.rectify` rotates each camera half way (Bouguet) and keeps one image size: other pixels, and the figures
+    reported so far would change. Here the plane holds all of alpha at about its own resolution, and beta's principal
+    point is shifted so that disparities start at 0 whichever camera is on the left.
     """
-    turn = _rectifying_rotation(R, t)
+    pose = pair.beta_from_alpha
+    K_alpha, K_beta, R, t = (x.detach().cpu().double().numpy() for x in (*(c.K for c in pair.cameras), pose.R, pose.t))
+    hw = pair.alpha.hw
+    rotation = _rectifying_rotation(R, t)
     focal = (K_alpha[0, 0] + K_alpha[1, 1]) / 2
     K = np.diag([focal, focal, 1.0])
-    corners, z = _project(K @ turn @ np.linalg.inv(K_alpha), _corners(hw))
-    shift = -(turn @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
+    corners, z = _project(K @ rotation @ np.linalg.inv(K_alpha), _corners(hw))
+    shift = -(rotation @ R.T @ t)[0] * focal / (np.array(depth) * [z.min(), z.max()])
     max_disparity = float(np.ptp(shift))
     K[:2, 2] = -corners.min(0) + [max_disparity, 0]
     width, height = (int(side) for side in np.ceil(np.ptp(corners, axis=0) + np.array([max_disparity + 1, 1])))
     if width * height > 8 * hw[0] * (hw[1] + max_disparity):
         raise ValueError(UNRECTIFIABLE)
-    K_moved = K.copy()
-    K_moved[0, 2] += shift.min()
-    from_alpha, from_beta = K @ turn @ np.linalg.inv(K_alpha), K_moved @ turn @ R.T @ np.linalg.inv(K_beta)
+    K_shifted = K.copy()
+    K_shifted[0, 2] += shift.min()
+    from_alpha = K @ rotation @ np.linalg.inv(K_alpha)
+    from_beta = K_shifted @ rotation @ R.T @ np.linalg.inv(K_beta)
     return _Plane(from_alpha, from_beta, (width, height), max_disparity)
 
 
@@ -167,7 +149,7 @@ def _rectifying_rotation(R: NDArray, t: NDArray) -> NDArray[np.float64]:
     """From alpha's axes to axes with x along the baseline and z near the mean of both optical axes."""
     baseline = R.T @ t
     if not np.linalg.norm(baseline) > 0:
-        raise ValueError("the cameras are at one place (t is zero): there is no depth to match")
+        raise ValueError("both cameras have the same centre (t is zero): there is no depth to match")
     x = baseline / np.linalg.norm(baseline)
     y = np.cross(np.array([0, 0, 1.0]) + R[2], x)
     y /= max(np.linalg.norm(y), 1e-12)
@@ -186,38 +168,54 @@ def _project(H: NDArray, points: NDArray) -> tuple[NDArray[np.float64], NDArray[
     return transformed[:, :2] / transformed[:, 2:], transformed[:, 2]
 
 
-def _carried_chroma(mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
+class _Correspondence(NamedTuple):
+    """Where the pixels of `mono` are in the other image, and whether and how consistently they are found there."""
+
+    columns: Image
+    rows: Image
+    seen: Image
+    weight: Image
+
+
+def _correspondence(
+    soft: Image, other: Image, guide: NDArray[np.uint8], inside: Image, max_disparity: float
+) -> _Correspondence:
+    """`other` is luminance normalised to mono's, `inside` is 1 where it has content."""
+    ours = _disparity(to_bytes(soft), to_bytes(other), max_disparity)
+    # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
+    theirs = _disparity(to_bytes(other[:, ::-1]), to_bytes(soft[:, ::-1]), max_disparity)[:, ::-1]
+    columns, rows = _grid(soft.shape)
+    back = _sampled(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
+    consistent = (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5)
+    filled = _diffused(ours, consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
+    columns = columns - np.where(consistent, ours, filled)
+    seen = _sampled(inside, columns, rows) * (columns >= -0.5)
+    return _Correspondence(columns, rows, seen, np.maximum(consistent, INCONSISTENT) * seen)
+
+
+def _warped_chroma(mono: Image, colours: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
     """Colour differences (R - Y, B - Y) of `colours` at `mono`'s pixels; both (h, w) on one rectified grid.
 
     `inside` is 1 where `colours` has content; `sharpness` is their resolution over mono's.
     """
-    soft = _softened(mono, sharpness)
-    match = _matched(soft, _normalised(_luma(colours), mono, inside), max_disparity)
-    guide = _bytes(mono)
-    disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
-    columns, rows = _grid(mono.shape)
-    columns = columns - np.where(match.consistent, match.disparity, disparity)
-    warped = _looked_up(colours, columns, rows)
-    seen = _looked_up(inside, columns, rows) * (columns >= -0.5)
+    soft, guide = _softened(mono, sharpness), to_bytes(mono)
+    match = _correspondence(soft, _normalised(_luma(colours), mono, inside), guide, inside, max_disparity)
+    warped = _sampled(colours, match.columns, match.rows)
     warped_luma = _luma(warped)
-    normalised = _normalised(warped_luma, mono, seen)
+    normalised = _normalised(warped_luma, mono, match.seen)
     chroma = _regressed(warped[..., [0, 2]] - warped_luma[..., None], warped_luma, mono - normalised)
     likeness = np.exp(-np.square(cv2.GaussianBlur(np.abs(soft - normalised), (0, 0), 1) / LIKENESS))
-    trust = np.maximum(match.consistent, DOUBT) * seen * likeness
-    return _blended(chroma, _filled(chroma, trust + 1e-4, guide, COLOUR_FILL), trust)
+    weight = match.weight * likeness
+    return _blended(chroma, _diffused(chroma, weight + 1e-4, guide, COLOUR_FILL), weight)
 
 
-def _carried_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
+def _warped_band(mono: Image, band: Image, inside: Image, max_disparity: float, sharpness: float) -> Image:
     """What `band` has more than `mono`, at `mono`'s pixels; both (h, w) on one rectified grid."""
-    soft, guide = _softened(mono, sharpness), _bytes(mono)
-    match = _matched(soft, _normalised(band, mono, inside), max_disparity)
-    disparity = _filled(match.disparity, match.consistent.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
-    columns, rows = _grid(mono.shape)
-    columns = columns - np.where(match.consistent, match.disparity, disparity)
-    warped, seen = _looked_up(band, columns, rows), _looked_up(inside, columns, rows) * (columns >= -0.5)
-    trust = np.maximum(match.consistent, DOUBT) * seen
-    difference = (warped - soft)[..., None]
-    return _blended(difference, _filled(difference, trust + 1e-4, guide, COLOUR_FILL), trust)[..., 0]
+    soft, guide = _softened(mono, sharpness), to_bytes(mono)
+    match = _correspondence(soft, _normalised(band, mono, inside), guide, inside, max_disparity)
+    difference = (_sampled(band, match.columns, match.rows) - soft)[..., None]
+    filled = _diffused(difference, match.weight + 1e-4, guide, COLOUR_FILL)
+    return _blended(difference, filled, match.weight)[..., 0]
 
 
 def _softened(mono: Image, sharpness: float) -> Image:
@@ -227,15 +225,6 @@ def _softened(mono: Image, sharpness: float) -> Image:
     height, width = (max(1, round(side * sharpness)) for side in mono.shape)
     small = cv2.resize(mono, (width, height), interpolation=cv2.INTER_AREA)
     return cv2.resize(small, mono.shape[::-1], interpolation=cv2.INTER_CUBIC)
-
-
-def _matched(mono: Image, luma: Image, max_disparity: float) -> _Match:
-    columns, rows = _grid(mono.shape)
-    ours = _disparity(_bytes(mono), _bytes(luma), max_disparity)
-    # Seen from beta, alpha's points lie to the right: mirrored, to the left again.
-    theirs = _disparity(_bytes(luma[:, ::-1]), _bytes(mono[:, ::-1]), max_disparity)[:, ::-1]
-    back = _looked_up(np.ascontiguousarray(theirs), columns - ours, rows, how=cv2.INTER_NEAREST)
-    return _Match(ours, (np.abs(back - ours) <= CHECK) & (ours >= 0) & (columns - ours >= -0.5))
 
 
 def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity: float) -> Image:
@@ -255,21 +244,21 @@ def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity:
 
 
 def _normalised(luma: Image, mono: Image, weight: Image) -> Image:
-    """`luma` with mono's mean and spread, so that cameras of unlike exposure can be compared."""
-    mean, spread = _mean_and_spread(luma, weight)
-    wanted_mean, wanted_spread = _mean_and_spread(mono, weight)
-    gain = wanted_spread / spread if spread > 1e-3 else 1.0
+    """`luma` with mono's mean and standard deviation, so that cameras of unlike exposure can be compared."""
+    mean, deviation = _mean_and_deviation(luma, weight)
+    wanted_mean, wanted_deviation = _mean_and_deviation(mono, weight)
+    gain = wanted_deviation / deviation if deviation > 1e-3 else 1.0
     return ((luma - mean) * gain + wanted_mean).astype(np.float32)
 
 
-def _mean_and_spread(plane: Image, weight: Image) -> tuple[float, float]:
+def _mean_and_deviation(plane: Image, weight: Image) -> tuple[float, float]:
     total = max(float(weight.sum()), 1.0)
     mean = float((plane * weight).sum()) / total
     return mean, float((np.square(plane - mean) * weight).sum() / total) ** 0.5
 
 
 def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
-    """Chroma moved along its local regression on luminance by what alpha's luminance has beyond beta's.
+    """Chroma corrected along its local regression on luminance by the detail of alpha's luminance that beta's lacks.
 
     This is the guided filter's linear model; it gives back the detail that beta lost by its resolution.
     """
@@ -280,7 +269,7 @@ def _regressed(chroma: Image, luma: Image, residual: Image) -> Image:
     return chroma + slope * np.clip(residual, -0.2, 0.2)[..., None]
 
 
-def _filled(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
+def _diffused(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smoothing) -> Image:
     """The weighted mean of `values` over what is connected in `guide`. Weights must be positive."""
 
     def smooth(plane: Image) -> Image:
@@ -291,8 +280,8 @@ def _filled(values: Image, weight: Image, guide: NDArray[np.uint8], how: _Smooth
     return np.stack([smooth(plane * weight) / total for plane in planes], -1).reshape(values.shape)
 
 
-def _blended(values: Image, filled: Image, trust: Image) -> Image:
-    return (trust[..., None] * values + (1 - trust[..., None]) * filled).astype(np.float32)
+def _blended(values: Image, filled: Image, weight: Image) -> Image:
+    return (weight[..., None] * values + (1 - weight[..., None]) * filled).astype(np.float32)
 
 
 def _recoloured(alpha: Float[Tensor, "1 h w"], chroma: Image) -> Float[Tensor, "3 h w"]:
@@ -309,10 +298,6 @@ def _luma(colours: Image) -> Image:
     return luminance(torch.from_numpy(colours).permute(2, 0, 1))[0].numpy()
 
 
-def _bytes(plane: Image) -> NDArray[np.uint8]:
-    return np.rint(np.clip(plane, 0, 1) * 255).astype(np.uint8)
-
-
 def _grid(shape: tuple[int, ...]) -> tuple[Image, Image]:
     rows, columns = np.mgrid[: shape[0], : shape[1]].astype(np.float32)
     return columns, rows
@@ -324,30 +309,19 @@ def _resized(colours: Image, hw: torch.Size) -> Image:
     return cv2.resize(colours, (hw[1], hw[0]), interpolation=cv2.INTER_AREA if smaller else cv2.INTER_CUBIC)
 
 
-def _looked_up(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUBIC) -> Image:
+def _sampled(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUBIC) -> Image:
     return cv2.remap(image, columns, rows, how, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _warped(image: Image, H: NDArray, wh: tuple[int, int]) -> Image:
-    """The image moved by x' ~ H x; beyond its border it repeats the border."""
+    """The image warped by x' ~ H x; its border is repeated beyond."""
     return cv2.warpPerspective(image, H, wh, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
 
 
 def _covered(hw: tuple[int, int], H: NDArray, wh: tuple[int, int]) -> Image:
-    """1 where an image of height and width `hw`, moved by H, has content."""
+    """1 where an image of height and width `hw`, warped by H, has content."""
     return cv2.warpPerspective(np.ones(hw, np.float32), H, wh, flags=cv2.INTER_NEAREST)
 
 
 def _box(planes: Image) -> Image:
     return cv2.boxFilter(planes, -1, (2 * REGRESSION_RADIUS + 1,) * 2, borderType=cv2.BORDER_REFLECT)
-
-
-def classical(rig: Rig, images: dict[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "3 h w"]:
-    """The classical baseline on a calibrated pair of a rig, both cameras pinholes."""
-    pair = rig.pair(alpha, beta)
-    a, b = pair.cameras
-    pose = pair.beta_from_alpha
-    near, far = (float(d) for d in pair.depth_range)
-    return classical_fusion_calibrated(
-        luminance_of(images[alpha]), images[beta], a.K, b.K, pose.R, pose.t, depth=(near, far)
-    )

@@ -1,20 +1,29 @@
-"""The explorer: click a pixel of alpha and see where every beta looks, what it finds, and what moves.
+"""The explorer: click a pixel of alpha and see its segment, samples and match in every beta, and vary the rig.
 
 `explorer(rig, images)` is for a cell of a notebook, `pat explore rig.yaml --image ...` for a page of its own. Both need
-the extra `explore`; `look_at` works it all out and needs none.
+the extra `explore`; `inspect_pixel` does the computation and needs no extra.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from .seen import FAMILIES, Scene, Seen, SeenInBeta, State, look_at
+from .pixel import FAMILIES, BetaReport, ExplorerScene, ExplorerState, PixelReport, inspect_pixel
 
-__all__ = ["FAMILIES", "Scene", "Seen", "SeenInBeta", "State", "explorer", "look_at", "serve"]
+__all__ = [
+    "FAMILIES",
+    "BetaReport",
+    "ExplorerScene",
+    "ExplorerState",
+    "PixelReport",
+    "explorer",
+    "inspect_pixel",
+    "serve",
+]
 
 
 def __getattr__(name: str) -> Any:
-    """`explorer` and `serve`, which load the page's libraries when first asked for."""
+    """`explorer` and `serve`, which load the page's libraries on first use."""
     if name not in ("explorer", "serve"):
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     try:

@@ -1,4 +1,4 @@
-"""The explorer's page: images, the rig and controls, drawn from `seen`. The same in a browser and in Jupyter."""
+"""The explorer's page: images, the rig and controls, for a browser and for Jupyter."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import html
 import math
 import socket
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import panel as pn
@@ -21,7 +21,16 @@ from torch.nn.functional import interpolate
 from arraygeom import Camera, Rig
 from arraygeom.viz import COLOURS, calibrated, extent_of, frustum_size, interactive_rig
 
-from .seen import FAMILIES, Scene, Seen, SeenInBeta, State, image_pixel, look_at, numbers_of
+from .pixel import (
+    FAMILIES,
+    BetaReport,
+    ExplorerScene,
+    ExplorerState,
+    PixelReport,
+    image_pixel,
+    inspect_pixel,
+    parameter_lengths,
+)
 
 UNITS = {
     "rotation": (180 / math.pi, "xyz", 3.0, 0.05, "deg"),
@@ -30,22 +39,22 @@ UNITS = {
     "centre": (1.0, "xy", 30.0, 0.5, "px"),
     "distortion": (1.0, "", 0.2, 0.002, ""),
 }
-"""For each kind of number: shown units to one of the rig's, names of its parts, reach and step of the slider, unit."""
+"""By kind of parameter: shown units per unit of the rig, names of its parts, range and step of the slider, unit."""
 
-RESTED = 150
-"""Milliseconds without a change after which the rig in space is drawn anew."""
+SETTLED = 150
+"""Milliseconds without a change after which the rig in space is redrawn."""
 
 SHOWN_PIXELS = 2_000_000
-"""Larger images are drawn reduced; what is worked out uses them as they are."""
+"""Larger images are drawn reduced; computations use them as they are."""
 
 
 class Explorer:
-    """Widgets and figures over a `State`; `seen` is what is drawn. `panel()` is what to serve or show in a cell."""
+    """Widgets and figures of an `ExplorerState`; `report` is what is drawn, `panel()` is for a page or a cell."""
 
-    def __init__(self, scene: Scene, alpha: str) -> None:
+    def __init__(self, scene: ExplorerScene, alpha: str) -> None:
         hw = scene.rig[alpha].hw
         self.scene = scene
-        self.state = State(alpha, image_pixel(hw[1] / 2, hw[0] / 2, hw))
+        self.state = ExplorerState(alpha, image_pixel(hw[1] / 2, hw[0] / 2, hw))
         self.betas = [n for n in scene.rig.betas(alpha) if n in scene.images]
         self.marker = ColumnDataSource({"x": [], "y": []}, name="pixel")
         self.sources = {name: beta_sources(name) for name in self.betas}
@@ -54,41 +63,41 @@ class Explorer:
         self.drawn: tuple[object, dict[str, Any]] = None, {}
         self.pointed: tuple[float, float] | None = None
         self.waiting: Any = None
-        self.controls = Controls(scene.rig, self.state, self.moved)
+        self.controls = Controls(scene.rig, self.state, self.update)
         self.alpha_figure = self._alpha_figure()
         self.figures = [self._beta_figure(i, name) for i, name in enumerate(self.betas)]
         self.depth_figure = self._depth_figure()
-        self.seen: Seen | None = None
+        self.report: PixelReport | None = None
         self.show(self.state)
 
-    def moved(self, **changes: object) -> None:
-        """Draw what the controls now say."""
+    def update(self, **changes: object) -> None:
+        """Redraw for changed values of the controls."""
         self.show(self.state.replace(**changes))
 
-    def tapped(self, event: Any) -> None:
-        """Go to the alpha pixel that was clicked."""
+    def select_pixel(self, event: Any) -> None:
+        """Select the alpha pixel that was clicked."""
         hw = self.scene.rig[self.state.alpha].hw
-        self.moved(x=image_pixel(event.x, event.y, hw))
+        self.update(x=image_pixel(event.x, event.y, hw))
 
-    def show(self, state: State) -> Seen | None:
-        """Work out a state and draw it. A state that is impossible is told, and what was drawn stays."""
+    def show(self, state: ExplorerState) -> PixelReport | None:
+        """Compute a state and draw it. For an impossible state the error is shown and the drawing stays."""
         self.state = state
         try:
-            seen = look_at(self.scene, state)
+            report = inspect_pixel(self.scene, state)
         except ValueError as error:
             self.facts.object = f"<b>{html.escape(str(error))}</b>"
             return None
-        self.seen = seen
+        self.report = report
         self.marker.data = {"x": [state.x[0]], "y": [state.x[1]]}
         for name, sources in self.sources.items():
-            for source, data in zip(sources, beta_data(seen.betas.get(name))):
+            for source, data in zip(sources, beta_data(report.betas.get(name))):
                 source.data = data
-        self.facts.object = facts(state, seen)
+        self.facts.object = facts(state, report)
         self._once_settled()
-        return seen
+        return report
 
     def _once_settled(self) -> None:
-        """Draw space when the controls have rested: it takes a browser longer than all the rest together.
+        """Draw the rig in space once the controls have settled: it takes a browser longer than all else together.
 
         At once the first time, and in a notebook, where no server can call back.
         """
@@ -98,22 +107,22 @@ class Explorer:
             return
         if self.waiting is not None:
             document.remove_timeout_callback(self.waiting)
-        self.waiting = document.add_timeout_callback(self._show_space, RESTED)
+        self.waiting = document.add_timeout_callback(self._show_space, SETTLED)
 
     def _show_space(self) -> None:
-        """The cameras, drawn anew only when the rig has changed, and the ray, only when the pixel has."""
+        """Redraw the cameras only if the rig has changed, and the ray only if the pixel has."""
         self.waiting = None
-        state, seen = self.state, self.seen
-        if seen is None:
+        state, report = self.state, self.report
+        if report is None:
             return
         key = (state.near, state.far, tuple(state.changes.items()))
         if key != self.drawn[0]:
-            self.drawn = key, space(seen.rig, state.alpha)
+            self.drawn = key, space(report.rig, state.alpha)
         elif state.x == self.pointed:
             return
         self.pointed = state.x
         rig = self.drawn[1]
-        self.space.object = {**rig, "data": [*rig["data"], *ray_trace(seen.rig, state)]}
+        self.space.object = {**rig, "data": [*rig["data"], *ray_trace(report.rig, state)]}
 
     def panel(self) -> pn.viewable.Viewable:
         """The page."""
@@ -127,7 +136,7 @@ class Explorer:
         drawn.scatter("x", "y", source=self.marker, marker="cross", size=18, color="black", line_width=4)
         drawn.scatter("x", "y", source=self.marker, marker="cross", size=16, color="yellow", line_width=2)
         drawn.name = "alpha"
-        drawn.on_event(Tap, self.tapped)
+        drawn.on_event(Tap, self.select_pixel)
         return drawn
 
     def _beta_figure(self, index: int, name: str) -> Any:
@@ -146,7 +155,7 @@ class Explorer:
             height=340,
             title="weight against depth (m), the highest being 1",
             x_axis_type="log",
-            y_range=Range1d(start=0, end=1.05),  # labels that change size lay the whole page out anew
+            y_range=Range1d(start=0, end=1.05),  # labels of changing size would lay out the whole page again
             tools="pan,wheel_zoom,reset",
             output_backend="canvas",
         )
@@ -161,18 +170,18 @@ class Explorer:
 
 
 class Controls:
-    """Sliders that call `moved` with what changed of the state."""
+    """Sliders that call `update` with the changed part of the state."""
 
-    def __init__(self, rig: Rig, state: State, moved: Any) -> None:
-        self.moved = moved
-        self.changes: dict[str, list[float]] = {name: [0.0] * n for name, n in numbers_of(rig).items()}
+    def __init__(self, rig: Rig, state: ExplorerState, update: Any) -> None:
+        self.update = update
+        self.changes: dict[str, list[float]] = {name: [0.0] * n for name, n in parameter_lengths(rig).items()}
         self.family = pn.widgets.Select(label="field", options=list(FAMILIES), value=state.family)
-        self.family.param.watch(lambda e: moved(family=e.new), "value")
-        self.sliders = [*depth_sliders(rig, moved), *field_sliders(moved)]
+        self.family.param.watch(lambda e: update(family=e.new), "value")
+        self.sliders = [*depth_sliders(rig, update), *field_sliders(update)]
         self.numbers = {name: self._sliders_of(name) for name in self.changes}
 
     def panel(self) -> pn.viewable.Viewable:
-        """Field and depth above, the numbers of each camera below."""
+        """Field and depth above, the parameters of each camera below."""
         cameras = dict.fromkeys(name.rpartition(".")[0] for name in self.numbers)
         groups = [
             (
@@ -185,16 +194,16 @@ class Controls:
 
     def _sliders_of(self, name: str) -> list[Any]:
         kind = name.rpartition(".")[2]
-        scale, parts, disparity, step, unit = UNITS[kind]
+        scale, parts, extent, step, unit = UNITS[kind]
 
         def changed(index: int, shown: float) -> None:
             self.changes[name][index] = shown / scale
-            self.moved(changes={n: tuple(v) for n, v in self.changes.items() if any(v)})
+            self.update(changes={n: tuple(v) for n, v in self.changes.items() if any(v)})
 
         return [
             slider(
                 f"{name} {parts[i] if parts else i} ({unit})" if unit else f"{name} {i}",
-                (-disparity, disparity, step),
+                (-extent, extent, step),
                 0.0,
                 lambda value, i=i: changed(i, value),
             )
@@ -202,38 +211,36 @@ class Controls:
         ]
 
 
-class BetaSources(tuple):
-    """Segment, samples and match of one beta, as Bokeh's data sources."""
+class BetaSources(NamedTuple):
+    """Bokeh's data sources of one beta; the samples have depth and weight."""
 
-    @property
-    def samples(self) -> ColumnDataSource:
-        """The samples, with depth and weight."""
-        return self[1]
+    segment: ColumnDataSource
+    samples: ColumnDataSource
+    match: ColumnDataSource
 
 
 def beta_sources(name: str) -> BetaSources:
     """Empty ones, named so that a page's script can find them."""
-    kinds = ("segment", "samples", "match")
-    return BetaSources(ColumnDataSource(d, name=f"{k}:{name}") for k, d in zip(kinds, beta_data(None)))
+    return BetaSources(*(ColumnDataSource(d, name=f"{k}:{name}") for k, d in zip(BetaSources._fields, beta_data(None))))
 
 
-def beta_data(seen: SeenInBeta | None) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Columns of the segment's ends (near, far), of the samples, and of where the match is expected."""
-    if seen is None:
+def beta_data(report: BetaReport | None) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
+    """Columns of the segment's ends (near, far), of the samples, and of the expected match."""
+    if report is None:
         return (
             {"x": [], "y": []},
             {"x": [], "y": [], "weight": [], "share": [], "depth": [], "size": []},
             {"x": [], "y": []},
         )
-    ends = np.empty((0, 2)) if seen.ends is None else seen.ends.numpy()
-    counts = seen.counts
-    x, y = seen.xy[counts].numpy().T
-    weight = seen.weight[counts].numpy()
+    ends = np.empty((0, 2)) if report.ends is None else report.ends.numpy()
+    valid = report.valid
+    x, y = report.xy[valid].numpy().T
+    weight = report.weight[valid].numpy()
     share = weight / max(float(weight.max(initial=0.0)), 1e-9)
-    size, depth = 2 + 12 * np.sqrt(share), seen.depth[counts].numpy()
+    size, depth = 2 + 12 * np.sqrt(share), report.depth[valid].numpy()
     samples = {"x": x, "y": y, "weight": weight, "share": share, "depth": depth, "size": size}
-    where = [[float(v)] if bool(counts.any()) else [] for v in seen.position]
-    return {"x": ends[:, 0], "y": ends[:, 1]}, samples, {"x": where[0], "y": where[1]}
+    match = [[float(v)] if bool(valid.any()) else [] for v in report.position]
+    return {"x": ends[:, 0], "y": ends[:, 1]}, samples, {"x": match[0], "y": match[1]}
 
 
 def image_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"]) -> Any:
@@ -250,7 +257,7 @@ def image_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"])
         active_scroll="wheel_zoom",
     )
     drawn.image_rgba([rgba(image)], x=-0.5, y=-0.5, dw=w, dh=h)
-    drawn.grid.visible = drawn.axis.visible = False  # measuring labels is a third of the time that painting takes
+    drawn.grid.visible = drawn.axis.visible = False  # measuring labels takes a third of the painting time
     return drawn
 
 
@@ -266,19 +273,19 @@ def rgba(image: Float[Tensor, "c h w"]) -> np.ndarray:
 
 
 class Slider(pn.widgets.FloatSlider):
-    """Panel's, but answered at once: its sliders wait 50 ms for more changes, which is half of what we allow."""
+    """Panel's slider with a shorter debounce: the default of 50 ms is half of the time that we allow."""
 
     _debounce: ClassVar[int] = 5
 
 
-def depth_sliders(rig: Rig, moved: Any) -> list[Any]:
-    """Near and far on logarithmic scales, if the rig has them; an infinite far stands at 1000 m until it is moved."""
+def depth_sliders(rig: Rig, update: Any) -> list[Any]:
+    """Near and far on logarithmic scales, if the rig has them; an infinite far is shown as 1000 m until changed."""
     if rig.depth is None:
         return []
     near, far = (min(float(d), 1000.0) for d in rig.depth)
     return [
-        logarithmic("near (m)", near, (near / 4, far), lambda v: moved(near=v)),
-        logarithmic("far (m)", far, (near, max(4 * far, 1000.0)), lambda v: moved(far=v)),
+        logarithmic("near (m)", near, (near / 4, far), lambda v: update(near=v)),
+        logarithmic("far (m)", far, (near, max(4 * far, 1000.0)), lambda v: update(far=v)),
     ]
 
 
@@ -291,12 +298,12 @@ def logarithmic(name: str, value: float, ends: tuple[float, float], changed: Any
     return made
 
 
-def field_sliders(moved: Any) -> list[Any]:
-    """Displacement, width, sharpness. The displacement covers the depth range until it is moved from 0."""
+def field_sliders(update: Any) -> list[Any]:
+    """Displacement, width, sharpness. A displacement of 0 covers the depth range."""
     return [
-        slider("displacement (px; 0: what covers the depths)", (0, 200, 1), 0, lambda v: moved(displacement=v or None)),
-        slider("widened by (px)", (0, 10, 0.5), 0, lambda v: moved(across=v)),
-        slider("sharpness of the weights", (1, 100, 1), 30, lambda v: moved(sharpness=v)),
+        slider("displacement (px; 0: the depth range)", (0, 200, 1), 0, lambda v: update(displacement=v or None)),
+        slider("widened by (px)", (0, 10, 0.5), 0, lambda v: update(across=v)),
+        slider("sharpness of the weights", (1, 100, 1), 30, lambda v: update(sharpness=v)),
     ]
 
 
@@ -308,17 +315,17 @@ def slider(name: str, bounds: tuple[float, float, float], value: float, changed:
     return made
 
 
-def facts(state: State, seen: Seen) -> str:
+def facts(state: ExplorerState, report: PixelReport) -> str:
     """A line of HTML for the pixel, and one for each beta."""
-    depth = f"depth {seen.depth:.3g} m" if math.isfinite(seen.depth) else "depth not told"
-    lines = [f"<b>pixel ({state.x[0]:.0f}, {state.x[1]:.0f})</b> {depth} fused colour {swatch(seen.colour)}"]
-    for name, beta in seen.betas.items():
-        told = f"length {float((beta.ends[1] - beta.ends[0]).norm()):.1f} px, " if beta.ends is not None else ""
+    depth = f"depth {report.depth:.3g} m" if math.isfinite(report.depth) else "no depth"
+    lines = [f"<b>pixel ({state.x[0]:.0f}, {state.x[1]:.0f})</b> {depth}, fused colour {swatch(report.colour)}"]
+    for name, beta in report.betas.items():
+        length = f"length {float((beta.ends[1] - beta.ends[0]).norm()):.1f} px, " if beta.ends is not None else ""
         lines.append(
-            f"<b>{html.escape(name)}</b> {told}{int(beta.counts.sum())} samples, peak {beta.peak:.2f}, "
-            f"spread {beta.spread:.1f} px, sees {swatch(beta.value)}"
+            f"<b>{html.escape(name)}</b> {length}{int(beta.valid.sum())} samples, peak {beta.peak:.2f}, "
+            f"deviation {beta.deviation:.1f} px, colour {swatch(beta.value)}"
         )
-    lines += [f"<b>{html.escape(n)}</b> {html.escape(problem)}" for n, problem in seen.problems.items()]
+    lines += [f"<b>{html.escape(n)}</b> {html.escape(problem)}" for n, problem in report.problems.items()]
     return "<br>".join(lines)
 
 
@@ -341,7 +348,7 @@ def space(rig: Rig, alpha: str) -> dict[str, Any]:
 
 
 def around_cameras(rig: Rig) -> dict[str, Any]:
-    """Ranges of plotly's axes (x, z, -y) in which the cameras are large; what lies farther is cut off."""
+    """Ranges of plotly's axes (x, z, -y) in which the cameras are large; farther parts are cut off."""
     cameras = calibrated(rig)
     centres = np.stack([camera.centre.detach().double().numpy() for camera in cameras.values()])
     room = max(extent_of(cameras), 1.5 * frustum_size(cameras))
@@ -350,8 +357,8 @@ def around_cameras(rig: Rig) -> dict[str, Any]:
     return {f"{axis}_range": [float(v) for v in ends] for axis, ends in ranges.items()}
 
 
-def ray_trace(rig: Rig, state: State) -> list[dict[str, Any]]:
-    """The pixel's ray from near to far as a trace of plotly's, if it can be told."""
+def ray_trace(rig: Rig, state: ExplorerState) -> list[dict[str, Any]]:
+    """The pixel's ray from near to far as a trace of plotly's; empty if alpha is not calibrated."""
     ray = pixel_ray(rig, state)
     if ray is None:
         return []
@@ -360,7 +367,7 @@ def ray_trace(rig: Rig, state: State) -> list[dict[str, Any]]:
     return [{"type": "scatter3d", "x": x, "y": z, "z": -y, "mode": "lines", "line": line, "name": "the pixel"}]
 
 
-def pixel_ray(rig: Rig, state: State) -> np.ndarray | None:
+def pixel_ray(rig: Rig, state: ExplorerState) -> np.ndarray | None:
     """World points on the pixel's ray: alpha's centre, near, far (at most 40 m), (3, 3); None if they are not known."""
     camera = rig[state.alpha]
     if rig.depth is None or not isinstance(camera, Camera):
@@ -382,7 +389,7 @@ def explorer(
     return Explorer(*prepared(rig, images, alpha)).panel()
 
 
-def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple[Scene, str]:
+def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple[ExplorerScene, str]:
     """The checked scene and alpha's name."""
     for name in images:
         rig.require(name)
@@ -392,7 +399,7 @@ def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple
     if alpha not in images:
         raise ValueError(f"no image of alpha, '{alpha}': give one, or choose another alpha")
     pn.extension("plotly")
-    return Scene(rig, images), alpha
+    return ExplorerScene(rig, images), alpha
 
 
 def serve(

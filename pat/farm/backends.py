@@ -12,18 +12,17 @@ from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
-from pat.sensors import Linear, record
+from pat.media.colour import linear_from_srgb
 from pat.support.schema import from_document
 from pat.synthesis.blender.lens import lens_for
 from pat.synthesis.blender.settings import RenderSettings
 from pat.synthesis.blender.task import fitted, render_here, shots
-from pat.synthesis.check import Limits, Report, check_views
+from pat.synthesis.check import CheckLimits, SceneCheck, check_views
 from pat.synthesis.generators import GENERATORS
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns
@@ -39,7 +38,7 @@ FARTHEST = 50.0
 class Renderer(Protocol):
     """Renders scenes of one job."""
 
-    def render(self, seed: int, out: Path) -> Report:
+    def render(self, seed: int, out: Path) -> SceneCheck:
         """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises ValueError."""
         ...
 
@@ -65,7 +64,7 @@ class LayeredSettings:
         """The sizes of the images of a scene."""
         return [camera.hw for camera in rig.cameras.values()]
 
-    def renderer(self, rig: Rig, limits: Limits) -> Renderer:
+    def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
         """A renderer that is ready."""
         return LayeredRenderer(rig, self, limits)
 
@@ -104,7 +103,7 @@ class BlenderSettings:
         rig = fitted(rig, settings)
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
 
-    def renderer(self, rig: Rig, limits: Limits) -> Renderer:
+    def renderer(self, rig: Rig, limits: CheckLimits) -> Renderer:
         """A renderer that is ready. Raises ValueError without Blender."""
         return BlenderRenderer(rig, self, limits)
 
@@ -112,14 +111,14 @@ class BlenderSettings:
 class LayeredRenderer:
     """Layered scenes seen by a rig of pinholes."""
 
-    def __init__(self, rig: Rig, settings: LayeredSettings, limits: Limits):
+    def __init__(self, rig: Rig, settings: LayeredSettings, limits: CheckLimits):
         self.rig, self.settings, self.limits = rig, settings, limits
         self.seen = rig_from_alpha(rig)
         self.scenes = LayeredScenes(
             _bank(settings), RigDistribution(), hw=self.seen.cameras[0].hw, layers=settings.layers
         )
 
-    def render(self, seed: int, out: Path) -> Report:
+    def render(self, seed: int, out: Path) -> SceneCheck:
         """Render, write and check."""
         started = time.monotonic()
         batch = self.scenes.render(
@@ -174,30 +173,26 @@ def _bank(settings: LayeredSettings) -> PhotoBank:
 
 def _frames(batch: ArrayBatch) -> list[RenderedFrame]:
     return [
-        RenderedFrame(time=0.0, rgb=_linear(image)[0], depth=depth[0], index=index[0])
+        RenderedFrame(time=0.0, rgb=linear_from_srgb(image)[0], depth=depth[0], index=index[0])
         for image, depth, index in zip(batch.images, batch.depth, batch.index)
     ]
-
-
-def _linear(image: Tensor) -> Tensor:
-    return record(image, [Linear()], torch.Generator()).image
 
 
 class BlenderRenderer:
     """Blender's scenes seen by any calibrated rig. This process imports bpy."""
 
-    def __init__(self, rig: Rig, settings: BlenderSettings, limits: Limits):
+    def __init__(self, rig: Rig, settings: BlenderSettings, limits: CheckLimits):
         from pat.synthesis.blender import compat
 
         compat.load()
         self.rig, self.settings = rig, settings
         self.render_settings = replace(settings.render_settings(), limits=limits)
 
-    def render(self, seed: int, out: Path) -> Report:
+    def render(self, seed: int, out: Path) -> SceneCheck:
         """Render, write and check."""
         further = {} if self.settings.photos is None else {"folder": self.settings.photos}
         moving = self.render_settings.duration
         scene = GENERATORS[self.settings.generator](seed, self.rig, moving=moving, **further)
         rendered = render_here(scene, self.rig, out, settings=self.render_settings)
         check = dict(rendered.about["check"])
-        return Report(views=check["views"], pairs=check["pairs"], reasons=tuple(check["reasons"]))
+        return SceneCheck(views=check["views"], pairs=check["pairs"], reasons=tuple(check["reasons"]))

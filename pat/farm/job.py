@@ -15,7 +15,7 @@ from arraygeom.atomic import write_text
 from arraygeom.rig import Rig
 from pat.sensors import seed_for
 from pat.support.schema import from_document, read_yaml, to_document
-from pat.synthesis.check import Limits
+from pat.synthesis.check import CheckLimits
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
 from .folders import JobFolder
@@ -44,7 +44,7 @@ class RenderConfig:
     backend: Literal["layered", "blender"] = "layered"
     layered: LayeredSettings = field(default_factory=LayeredSettings)
     blender: BlenderSettings = field(default_factory=BlenderSettings)
-    check: Limits = field(default_factory=Limits)
+    check: CheckLimits = field(default_factory=CheckLimits)
     limits: RetryLimits = field(default_factory=RetryLimits)
 
     @classmethod

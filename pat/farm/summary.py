@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pat.data.patches import scene_folders, scene_rig
+from pat.data.windows import scene_folders, scene_rig
 
 from .folders import JobFolder
 from .worker import FACTS

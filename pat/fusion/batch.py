@@ -7,6 +7,7 @@ until all frames are there.
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import pickle
 import re
@@ -61,7 +62,7 @@ class Batch:
     bits: int = 8
     kind: ImageFormat = "png"
     alone: bool = False
-    """Of a sequence: fuse each frame by itself, without carrying colour; for comparison."""
+    """Of a sequence: fuse each frame by itself, without warping colour; for comparison."""
 
     def __post_init__(self) -> None:
         for name in self.files:
@@ -120,7 +121,7 @@ class Batch:
         options: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
         if self.sequence and not self.alone:
             missing = [i for i in many if not (resume and self.fused_file(i).exists())]
-            keys = self._fusion().keys_of(missing)
+            keys = self.fusion.keys_of(missing)
             run_tasks([Task(self._key_file(k), fuse_key, (plan, k)) for k in keys], title="key frames", **options)
         tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
         report = run_tasks(tasks, title="frames", **options)
@@ -146,7 +147,12 @@ class Batch:
         with write_atomically(self.out / KEYS / PLAN) as temporary:
             temporary.write_bytes(pickle.dumps(self))
 
-    def _fusion(self) -> SequenceFusion:
+    def __getstate__(self) -> dict[str, Any]:
+        return {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+
+    @cached_property
+    def fusion(self) -> SequenceFusion:
+        """The sequence, with the images that its frames have in common."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
         options = {"max_memory": self.max_memory}
         return SequenceFusion(
@@ -172,7 +178,7 @@ class Batch:
 
     def fuse_key(self, key: KeyFrame) -> None:
         """Write the colour of a key frame."""
-        colour = self._fusion().colour(key)
+        colour = self.fusion.colour(key)
         with write_atomically(self._key_file(key)) as temporary:
             save_file({name: part.contiguous() for name, part in colour._asdict().items()}, temporary)
 
@@ -190,7 +196,7 @@ class Batch:
                 match_levels=self.match_levels,
             )
         else:
-            fusion = self._fusion()
+            fusion = self.fusion
             frame = fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
         view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
         save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])

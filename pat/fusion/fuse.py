@@ -37,31 +37,28 @@ def fuse(
 ) -> Frame:
     """Fuse one frame at the view of camera `alpha`.
 
-    Lenses: unless `field` is `Curved` or `ThroughLenses`, images that a lens bends are taken across to pinhole views
-    first (up to 62 degrees off axis). The answer is at alpha's own pixels all the same: what the fusion adds to alpha
-    is bent back, alpha's own detail stays as it was, and what the pinhole view leaves out has confidence 0. A beta
-    turned by about a quarter or half a turn against alpha is turned upright. Where alpha is known to measure the
-    luminance of linear light and one beta the colours, the result is as bright in that sense
-    (`pat.media.raw.as_bright`).
+    Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every beta that its
+    segments touch, and a halo: equal to the whole to 1e-5. Distorted images are first resampled to pinhole views
+    (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's angular resolution; the
+    result is at alpha's own pixels all the same. Where alpha is known to measure the luminance of linear light and one
+    beta the colours, the result is as bright in that sense (`pat.media.raw.as_bright`).
 
     Args:
-        network: `load_weights("mono-colour")`, say.
+        network: for instance `load_weights("mono-colour")`.
         rig: the cameras. Those without an image in `images` are left out.
         images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping that reads
             them when asked saves memory (`pat.fusion.views.ViewFiles`).
         alpha: the camera whose view is wanted.
         depth: (near, far) in metres, instead of the rig's.
-        field: where to look; by default the depth-bounded epipolar segment of calibrated cameras, the run of the
-            epipolar line around H x of those known by F, and a row of beta of those known only by size. Or a field for
-            each of some betas, by name.
+        field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s `default_field`.
         max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if there
             is nothing else in it. Default: no limit.
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
         progress: shows the tiles as they are done.
-        store: a folder in which finished tiles of a frame of several are kept, so that one that was stopped goes on;
+        store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
-        announce: is told the plan before the work begins; the time of a large frame is estimated by fusing a piece.
+        announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap.

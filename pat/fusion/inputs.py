@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from arraygeom import Moved, Pair, depth_from_track, pixel_grid
 from arraygeom.fields import pinhole_track
 from arraygeom.fields.default import default_field
-from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
 
 from ..networks.protocol import Beta, FusionNetwork, FusionOutput, Inputs
@@ -52,7 +52,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
     for name in views.betas:
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
-        on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=network.equal_resolution)
+        on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
         _check_overlap(on_grid, pair, name)
         betas.append(Beta(padded(views.images[name][None], m), on_grid))
         placements.append(Placement(pair, field.points if isinstance(field, Moved) else lambda x: x))

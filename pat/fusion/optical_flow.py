@@ -1,4 +1,4 @@
-"""Motion between frames of one camera: optical flow, how far it can be trusted, and images carried along it."""
+"""Motion between frames of one camera: optical flow, its reliability, and images warped along it."""
 
 from __future__ import annotations
 
@@ -12,8 +12,10 @@ from torch import Tensor
 
 from arraygeom import pixel_grid, sample
 
+from ..media.colour import to_bytes
+
 ASTRAY = 1.0
-"""Flow that does not lead back to within this many pixels is trusted less than 1 / e."""
+"""Flow that does not lead back to within this many pixels has a weight below 1 / e."""
 UNLIKE = 0.08
 """So is flow between pixels whose values differ by this."""
 STILL = 0.5
@@ -21,27 +23,27 @@ STILL = 0.5
 
 
 class Flow(NamedTuple):
-    """Where each pixel of one frame is in another: (2, H, W) pixels in x and y, and trust (H, W) in that, 0 to 1."""
+    """Where each pixel of one frame is in another: (2, H, W) pixels in x and y, and the weight (H, W) of that, 0 to 1."""
 
     step: Float[Tensor, "2 h w"]
-    trust: Float[Tensor, "h w"]
+    weight: Float[Tensor, "h w"]
 
 
 def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
-    """Dense inverse search (Kroeger et al. 2016) from frame a to b; trusted where it leads back and values agree.
+    """Dense inverse search (Kroeger et al. 2016) from frame a to b; its weight is high where it leads back and values agree.
 
     Values of b are first brought to a's mean: light that flickers is no motion.
     """
     b = b * (a.mean() / b.mean().clamp(min=1e-6))
     there, back = _steps(a, b), _steps(b, a)
-    returned = there + carried(back, there)
-    likeness = _smooth((carried(b, there) - a).abs()[0])
-    trust = torch.exp(-returned.square().sum(0) / ASTRAY**2 - (likeness / UNLIKE).square())
-    return Flow(there, trust * _inside(there))
+    returned = there + warped(back, there)
+    likeness = _smooth((warped(b, there) - a).abs()[0])
+    weight = torch.exp(-returned.square().sum(0) / ASTRAY**2 - (likeness / UNLIKE).square())
+    return Flow(there, weight * _inside(there))
 
 
-def carried(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
-    """The image looked up where each pixel goes, bilinearly; outside the frame its nearest pixel."""
+def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float[Tensor, "c h w"]:
+    """The image sampled where each pixel goes, bilinearly; outside the frame its nearest pixel."""
     h, w = image.shape[-2:]
     x = pixel_grid((h, w)) + step.movedim(0, -1)
     x = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
@@ -56,12 +58,8 @@ def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, 
 
 def _steps(a: Tensor, b: Tensor) -> Float[Tensor, "2 h w"]:
     engine = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    flow = engine.calc(_bytes(a), _bytes(b), np.empty(0, np.float32))
+    flow = engine.calc(to_bytes(a[0]), to_bytes(b[0]), np.empty(0, np.float32))
     return torch.from_numpy(np.ascontiguousarray(flow.transpose(2, 0, 1)))
-
-
-def _bytes(image: Tensor) -> np.ndarray:
-    return np.rint(image[0].clamp(0, 1).numpy() * 255).astype(np.uint8)
 
 
 def _inside(step: Tensor) -> Tensor:

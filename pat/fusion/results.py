@@ -3,24 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
-import torch
 from jaxtyping import Float
-from matplotlib import colormaps
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from torch import Tensor
 
-from arraygeom import (
-    Rig,
-)
-from arraygeom.atomic import write_atomically
+from arraygeom import Rig
 
 from ..media.colour import linear_from_srgb
+from ..media.figures import colour_depth
 from ..media.images import write_image
 from ..media.raw import developed
 
@@ -40,7 +32,7 @@ def save_frame(
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The image
-    is written last: where it is, the others are. Each appears whole or not at all. Without any known depth there are
+    is written last: where it is, the others are. Each is written atomically. Without any known depth there are
     no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on, their mean to fused.png.
     Returns what was written.
     """
@@ -74,49 +66,12 @@ def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
     return Rig({alpha: rig[alpha].replace(sensor=sensor)}, depth=rig.depth, name=rig.name)
 
 
-def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
-    """Inverse depth in colours, from its 1st to its 99th percentile; unknown depth is black."""
-    known = depth.isfinite()
-    inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
-    low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
-    colours = torch.zeros(3, *depth.shape)
-    for rows, found, seen in zip(colours.split(256, 1), inverse.split(256), known.split(256)):
-        scaled = ((found - low) / max(high - low, 1e-12)).clamp(0, 1).numpy()
-        rows[:, seen] = torch.from_numpy(colormaps["turbo"](scaled)[..., :3].astype(np.float32)).movedim(-1, 0)[:, seen]
-    return colours
-
-
-def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:
-    """Write a figure, whole or not at all; returns where."""
-    FigureCanvasAgg(figure)
-    with write_atomically(path) as temporary:
-        figure.savefig(temporary, dpi=dpi)
-    return path
-
-
-def draw_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], *, columns: int, width: float = 10.0) -> Figure:
-    """One figure, `width` inches wide, of images by title, row by row."""
-    rows = -(-len(panels) // columns)
-    h, w = next(iter(panels.values())).shape[-2:]
-    figure = Figure(figsize=(width, (width / columns * h / w + 0.3) * rows), layout="constrained")
-    for i, (title, image) in enumerate(panels.items()):
-        axes = figure.add_subplot(rows, columns, i + 1, title=title)
-        axes.imshow(image.detach().expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy())
-        axes.set_axis_off()
-    return figure
-
-
-def save_panels(panels: Mapping[str, Float[Tensor, "_ _ _"]], path: Path, *, columns: int) -> None:
-    """`draw_panels`, 16 inches wide, as a file that appears whole or not at all."""
-    save_figure(draw_panels(panels, columns=columns, width=16), path)
-
-
 class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
     image: (C, H, W), in alpha's coding, not cut to 0..1.
-    depth: (H, W), metres along alpha's axis; NaN where no calibrated beta tells it.
-    confidence: (H, W), 0 to 1: that every band's beta sees the point, and that it is known where.
+    depth: (H, W), metres along alpha's axis; NaN where no calibrated beta sees the point.
+    confidence: (H, W), 0 to 1: that every band's beta sees the point and its position is right.
     """
 
     image: Float[Tensor, "c h w"]

@@ -1,16 +1,18 @@
 """Sequences: every frame of alpha in the colours of betas with clocks of their own.
 
-Colour is fused at key frames, those of alpha nearest in time to what a beta recorded, where each beta is looked at
-where the points of alpha were at its own time (`Moved`), with room for what is not known of that (`Widened`). From
-the key frames before and after, it is carried to each frame along the motion between alpha's own frames, and mixed
-by time, confidence, and trust in the motion. So colour does not flicker from frame to frame as single fusions do,
+Colour is fused at key frames, those of alpha nearest in time to what a beta recorded, where each beta is searched
+where the points of alpha were at its own time (`Moved`), with a margin for the uncertainty of that (`Widened`). From
+the key frames before and after, it is warped to each frame along the motion between alpha's own frames, and mixed
+by time, confidence, and the weight of the motion. So colour does not flicker from frame to frame as single fusions do,
 and a frame depends on nothing but images: any one can be made alone, in any order, with the same result.
 """
 
 from __future__ import annotations
 
+import dataclasses
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
@@ -24,12 +26,11 @@ from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields.default import default_field
 
 from ..media.colour import luminance, to_luma_chroma
-from ..media.images import check_size, read_image
-from ..media.raw import develop
 from ..networks.protocol import FusionNetwork
 from .fuse import fuse
-from .optical_flow import carried, flow_between, still
+from .optical_flow import flow_between, still, warped
 from .results import Frame
+from .views import read_view
 
 
 @runtime_checkable
@@ -50,30 +51,48 @@ SYNCHRONOUS = 0.05
 UNKNOWN_MOTION = 0.25
 """The part of the motion in a gap that fields leave room for if no speed is given."""
 REACH = 2.0
-"""Colour is carried from key frames up to this many intervals of theirs away."""
+"""Colour is warped from key frames up to this many intervals of theirs away."""
 NEIGHBOURS = 4
-"""Levels are matched over this many key frames before and after."""
+"""Radiometry is normalised over this many key frames before and after."""
+CACHED = 96 * 2**20
+"""Bytes of images cached of each camera: 25 grey frames of 1280x800."""
 
 
 class ImageFiles:
     """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
 
-    `like` is the sensor of alpha, whose scale of light the images are brought to.
+    `alpha` names the camera to whose scale of light the images are brought.
     """
 
     def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
         self.paths, self.name = list(paths), name
-        self.view, self.like = rig[name], rig[alpha].sensor
+        self.rig, self.like = rig, rig[alpha].sensor
 
     def __len__(self) -> int:
         return len(self.paths)
 
     def __getitem__(self, i: int, /) -> Tensor:
         """Raises FileNotFoundError or ValueError naming camera and file."""
-        path = self.paths[i]
-        image = read_image(path, name=self.name, bits=self.view.sensor.bits)
-        check_size(image, self.view.hw, f"{self.name}: {path}")
-        return develop(image, self.view.sensor, like=self.like)
+        return read_view(self.rig, self.name, self.paths[i], like=self.like)
+
+
+class CachedFrames:
+    """Frames, of which those asked for last are cached, up to `CACHED` bytes: neighbours in time need them again."""
+
+    def __init__(self, frames: Frames) -> None:
+        self.frames = frames
+        self.cached: OrderedDict[int, Tensor] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        if i not in self.cached:
+            self.cached[i] = self.frames[i]
+        self.cached.move_to_end(i)
+        while len(self.cached) > 1 and sum(image.nbytes for image in self.cached.values()) > CACHED:
+            self.cached.popitem(last=False)
+        return self.cached[i]
 
 
 class KeyFrame(NamedTuple):
@@ -162,7 +181,7 @@ class Timeline:
 class SequenceFusion:
     """A sequence to fuse: `colour` of its key frames, and any `frame`.
 
-    What it is made of is as `fuse_sequence` has it; `looks` is the field, `options` go to `fuse`.
+    What it is made of is as `fuse_sequence` has it; `options` go to `fuse`.
     """
 
     network: FusionNetwork
@@ -170,9 +189,13 @@ class SequenceFusion:
     frames: Mapping[str, Frames]
     alpha: str
     speed: float | None = None
-    looks: ReceptiveField | None = None
+    field: ReceptiveField | None = None
     match_levels: bool = False
-    options: Mapping[str, Any] = field(default_factory=dict)
+    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        cached = {n: f if isinstance(f, CachedFrames) else CachedFrames(f) for n, f in self.frames.items()}
+        object.__setattr__(self, "frames", cached)
 
     @property
     def timeline(self) -> Timeline:
@@ -185,26 +208,26 @@ class SequenceFusion:
         return luminance(image) if image.shape[0] == 3 else image
 
     def alone(self, i: int) -> Frame:
-        """The frame fused by itself with the betas nearest in time, motion or not: what carrying is compared with."""
+        """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared with."""
         return self._fused(i, self.timeline.at(i), {}, self.match_levels)
 
     def colour(self, key: KeyFrame) -> KeyColour:
-        """Fuse a key frame, each beta looked at where alpha's points are at its time."""
-        fields, trust = {}, torch.ones(self.rig[self.alpha].hw)
+        """Fuse a key frame, each beta searched where alpha's points are at its time."""
+        fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
         for name, i in key.betas.items():
-            fields[name], sure = self._field(name, key.alpha, self.timeline.time(name, i))
-            trust = torch.minimum(trust, sure)
+            fields[name], weight = self._field(name, key.alpha, self.timeline.time(name, i))
+            weight = torch.minimum(weight, weight)
         frame = self._fused(key.alpha, key.betas, fields, False)
         inverse = (1 / frame.depth).nan_to_num(0.0)
-        return KeyColour(frame.image - self.grey(key.alpha), frame.confidence * trust, inverse)
+        return KeyColour(frame.image - self.grey(key.alpha), frame.confidence * weight, inverse)
 
     def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> Frame:
-        """Any frame, its colour carried from the key frames around it.
+        """Any frame, its colour warped from the key frames around it.
 
         `fetch` gives a key frame's colour, or None for one that could not be fused. Raises ValueError if none could.
         """
         own = self.grey(i)
-        sources = [self._carried(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))]
+        sources = [self._warped(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")
         return mixed(own, sources)
@@ -221,31 +244,31 @@ class SequenceFusion:
         disparity = max(REACH * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
         return [k for k in keys if gaps[k.alpha] <= disparity]
 
-    def _carried(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> Source:
+    def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> KeyContribution:
         gap = abs(self._time(key.alpha) - self._time(i))
         nearness = max(1 - gap / (REACH * self.timeline.interval), 1e-3)
         if key.alpha == i:
-            return Source(nearness, *colour)
+            return KeyContribution(nearness, *colour)
         flow = flow_between(own, self.grey(key.alpha))
-        moved = carried(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth[None]]), flow.step)
-        return Source(nearness, moved[:-2], moved[-2] * flow.trust, moved[-1])
+        moved = warped(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth[None]]), flow.step)
+        return KeyContribution(nearness, moved[:-2], moved[-2] * flow.weight, moved[-1])
 
     def _time(self, i: int) -> float:
         return self.timeline.time(self.alpha, i)
 
     def _field(self, name: str, index: int, time: float) -> tuple[ReceptiveField, Tensor]:
-        """Where to look in a beta that records at `time`, and how far the motion until then can be trusted."""
-        looks = self.looks or default_field(self.rig.pair(self.alpha, name))
-        sure = torch.ones(self.rig[self.alpha].hw)
+        """The field of a beta that records at `time`, and the weight of the motion until then."""
+        field = self.field or default_field(self.rig.pair(self.alpha, name))
+        weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])
         if abs(steps) < SYNCHRONOUS or count < 2:
-            return looks, sure
+            return field, weight
         other = min(max(index + (round(steps) or (1 if steps > 0 else -1)), 0), count - 1)
         other = other if other != index else index - (1 if steps > 0 else -1)
         flow = flow_between(self.grey(index), self.grey(other))
         step = flow.step * (steps / (other - index))
-        return Moved(Widened(looks, along=self._room(step, time - self._time(index))), step), flow.trust
+        return Moved(Widened(field, along=self._room(step, time - self._time(index))), step), flow.weight
 
     def _room(self, step: Tensor, gap: float) -> float:
         if self.speed is not None:
@@ -256,29 +279,29 @@ class SequenceFusion:
         images = {name: self.frames[name][j] for name, j in betas.items()}
         if self.match_levels and not alone:
             images = {name: self._normalised(name, image, i) for name, image in images.items()}
-        looks = dict.fromkeys(betas, self.looks) if self.looks else {}
+        common = dict.fromkeys(betas, self.field) if self.field else {}
         return fuse(
             self.network,
             self.rig,
             {self.alpha: self.grey(i), **images},
             alpha=self.alpha,
-            field={**looks, **fields},
+            field={**common, **fields},
             match_levels=alone,
             **self.options,
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
-        """Beta's image with alpha's mean and spread, both over several key frames so that they do not flicker."""
+        """Beta's image with alpha's mean and standard deviation, both over several key frames so that they do not flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - NEIGHBOURS, 0) : nearest + NEIGHBOURS + 1]
         wanted = torch.tensor([_levels(self.grey(k.alpha)) for k in around]).mean(0)
-        mean, spread = torch.tensor([_levels(self.frames[name][k.betas[name]]) for k in around]).mean(0)
-        return (image - mean) / spread.clamp(min=1e-6) * wanted[1] + wanted[0]
+        mean, deviation = torch.tensor([_levels(self.frames[name][k.betas[name]]) for k in around]).mean(0)
+        return (image - mean) / deviation.clamp(min=1e-6) * wanted[1] + wanted[0]
 
 
-class Source(NamedTuple):
-    """What one key frame says of a frame: how near it is in time (0 to 1), and its colour carried there."""
+class KeyContribution(NamedTuple):
+    """One key frame's contribution to a frame: how near it is in time (0 to 1), and its colour warped there."""
 
     nearness: float
     added: Tensor
@@ -292,7 +315,7 @@ DISAGREEMENT = 0.1
 """Where sources' colours are this far apart, confidence falls to 1 / e."""
 
 
-def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[Source]) -> Frame:
+def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Frame:
     """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
 
     Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same disagree.
@@ -348,7 +371,7 @@ def fuse_sequence(
 def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tensor, "1 h w"]]) -> float:
     """Mean change of chroma (R - Y, B - Y) from frame to frame where nothing moves, 0..1.
 
-    `greys` are alpha's frames, which tell what moves. Raises ValueError for fewer than two frames.
+    `greys` are alpha's frames, which show what moves. Raises ValueError for fewer than two frames.
     """
     if len(images) < 2:
         raise ValueError("flicker is of two frames or more")

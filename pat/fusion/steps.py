@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float
@@ -53,7 +53,8 @@ class Done(NamedTuple):
     undo: Undo
 
 
-class Step(Protocol):
+@runtime_checkable
+class FusionStep(Protocol):
     """One step."""
 
     def do(self, views: Views) -> Done:
@@ -61,7 +62,7 @@ class Step(Protocol):
         ...
 
 
-def steps_for(network: FusionNetwork, *, normalise: bool) -> list[Step]:
+def steps_for(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
     """The steps that a network needs, in order."""
     resize = [EqualResolution(network)] if network.equal_resolution else []
     radiometry = [Radiometry()] if normalise else []
@@ -116,7 +117,7 @@ class Upright:
             k = quarter_turns(views.pair(name))
             if k:
                 rotated = views.images[name].rot90(k, (-2, -1))
-                views = views.replace(rig=views.rig.turn(name, k), **{name: rotated})
+                views = views.replace({name: rotated}, rig=views.rig.turn(name, k))
         return Done(views, _as_it_is)
 
 
@@ -133,7 +134,7 @@ class EqualResolution:
         return Done(views, _as_it_is)
 
     def _cropped(self, views: Views, name: str) -> Views:
-        """A calibrated beta without what no search segment reaches, if that is much: it would be enlarged for nothing.
+        """A calibrated beta without what no search segment touches, if that is much: it would be enlarged for nothing.
 
         Not where the field may depend on the images' sizes.
         """
@@ -147,7 +148,7 @@ class EqualResolution:
         if (bottom - top) * (right - left) > 0.75 * h * w:
             return views
         rig = views.rig.transformed(name, shift_matrix(left, top), (bottom - top, right - left))
-        return views.replace(rig=rig, **{name: views.images[name][..., top:bottom, left:right]})
+        return views.replace({name: views.images[name][..., top:bottom, left:right]}, rig=rig)
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,7 @@ class Radiometry:
 
     def do(self, views: Views) -> Done:
         """Normalise the betas."""
-        return Done(views.replace(**{n: normalised(views.images[n], views.own) for n in views.betas}), _as_it_is)
+        return Done(views.replace({n: normalised(views.images[n], views.own) for n in views.betas}), _as_it_is)
 
 
 @dataclass(frozen=True)
@@ -274,7 +275,7 @@ def _resized(views: Views, name: str) -> Views:
         return views
     hw = (max(round(h / scale), 16), max(round(w / scale), 16))
     image = interpolate(views.images[name][None], size=hw, mode="bicubic", align_corners=False, antialias=True)
-    return views.replace(rig=views.rig.resize(name, hw), **{name: image[0].clamp(0, 1)})
+    return views.replace({name: image[0].clamp(0, 1)}, rig=views.rig.resize(name, hw))
 
 
 def resolution_ratio(pair: Pair) -> float:

@@ -26,7 +26,7 @@ from .results import Frame
 
 REACH = 224
 """The widest halo, pixels: what is farther off changes images by at most 2.2e-6 with trained weights (at 192 pixels
-3e-5, at 160 2e-4; measured on three scenes), whatever their convolutions could carry."""
+3e-5, at 160 2e-4; measured on three scenes), however far their convolutions reach."""
 LIBRARIES = 0.56 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured, and what small things add)."""
 SLACK = 1.08
@@ -66,7 +66,7 @@ def plan_frame(
 ) -> Plan:
     """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a piece.
 
-    `stored` says that finished tiles are kept on disk until all are there. Raises ValueError as `tiles_within`.
+    `stored` says that finished tiles are stored on disk until all are there. Raises ValueError as `tiles_within`.
     """
     pieces = matching_pieces(frame.hw, network.multiple)
     large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
@@ -250,7 +250,7 @@ class TileStore(NamedTuple):
 
 
 def _sparse(field: Any, hw: HW) -> list[Tensor]:
-    """A few segments or positions of a field, by which fields are told apart."""
+    """A few segments or positions of a field, which distinguish fields."""
     if field.pixels is not None:
         return [t[:, ::64, ::64] for t in vars(field.pixels).values()]
     return list(vars(field.at(pixel_grid(hw, dtype=torch.float64)[::64, ::64].reshape(-1, 2))).values())

@@ -72,8 +72,8 @@ class Views:
         """Alpha and a beta."""
         return self.rig.pair(self.alpha, beta)
 
-    def replace(self, *, rig: Rig | None = None, **images: Tensor) -> Views:
-        """The same with another rig and other images of some cameras."""
+    def replace(self, images: Mapping[str, Tensor], *, rig: Rig | None = None) -> Views:
+        """The same with other images of some cameras, and another rig."""
         return dataclasses.replace(self, rig=rig or self.rig, images={**self.images, **images})
 
 

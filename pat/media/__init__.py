@@ -1,1 +1,1 @@
-"""TODO."""
+"""Images, raw counts, colour, video and figures: reading, writing, conversions."""

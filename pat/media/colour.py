@@ -1,4 +1,4 @@
-"""Luminance, chroma and the sRGB transfer function: the one place for each."""
+"""Luminance, chroma and the sRGB transfer function: one definition of each."""
 
 from __future__ import annotations
 
@@ -9,13 +9,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 REC601 = (0.299, 0.587, 0.114)
-"""Weights of red, green and blue in luminance, on coded values (ITU-R BT.601)."""
+"""Weights of red, green and blue in luma, on sRGB-encoded values (ITU-R BT.601)."""
+REC709 = (0.2126, 0.7152, 0.0722)
+"""Weights of red, green and blue in luminance, on linear values (ITU-R BT.709)."""
 
 
-def luminance(rgb: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 1 h w"]:
-    """Rec. 601 luma of coded values, 0.299 R + 0.587 G + 0.114 B: MATLAB's rgb2gray, and OpenCV's."""
-    weights = rgb.new_tensor(REC601)
-    return (rgb * weights[:, None, None]).sum(-3, keepdim=True)
+def luminance(
+    rgb: Float[Tensor, "*b 3 h w"], weights: tuple[float, float, float] = REC601
+) -> Float[Tensor, "*b 1 h w"]:
+    """Rec. 601 luma of sRGB values, 0.299 R + 0.587 G + 0.114 B, as MATLAB's rgb2gray and OpenCV; or other weights."""
+    return (rgb * rgb.new_tensor(weights)[:, None, None]).sum(-3, keepdim=True)
 
 
 def to_luma_chroma(
@@ -27,7 +30,7 @@ def to_luma_chroma(
 
 
 def from_luma_chroma(luma: Float[Tensor, "*b 1 h w"], chroma: Float[Tensor, "*b 2 h w"]) -> Float[Tensor, "*b 3 h w"]:
-    """The inverse of `to_luma_chroma`; not cut to 0..1. Its luminance is `luma`, whatever the chroma."""
+    """The inverse of `to_luma_chroma`; not clipped to 0..1. Its luminance is `luma`, whatever the chroma."""
     red_weight, green_weight, blue_weight = REC601
     red, blue = chroma[..., 0:1, :, :], chroma[..., 1:2, :, :]
     green = -(red_weight * red + blue_weight * blue) / green_weight
@@ -40,7 +43,7 @@ def luminance_of(image: Float[Tensor, "_ h w"]) -> Float[Tensor, "_ h w"]:
 
 
 def linear_from_srgb(values: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light of sRGB-encoded values (IEC 61966-2-1); the straight part of the curve continues below zero."""
+    """Linear light of sRGB-encoded values (IEC 61966-2-1); the linear part of the curve continues below zero."""
     toe = values <= 0.04045
     return torch.where(toe, values / 12.92, ((torch.where(toe, 0.5, values) + 0.055) / 1.055) ** 2.4)
 
@@ -51,6 +54,12 @@ def srgb_from_linear(light: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
     return torch.where(toe, 12.92 * light, 1.055 * torch.where(toe, 0.5, light) ** (1 / 2.4) - 0.055)
 
 
-def to_bytes(values: Float[Tensor, "*b"]) -> NDArray[np.uint8]:
-    """Values 0..1, clipped, as 8-bit counts, rounded to nearest even."""
-    return np.rint(np.clip(np.asarray(values.detach().cpu().numpy(), np.float32), 0, 1) * 255).astype(np.uint8)
+def srgb_image(light: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
+    """Linear light as an ordinary image: clipped to 0..1, sRGB-encoded."""
+    return srgb_from_linear(light.clamp(0, 1))
+
+
+def to_bytes(values: Float[Tensor, "*b"] | Float[NDArray, "*b"]) -> NDArray[np.uint8]:
+    """Values 0..1, clipped, as 8-bit counts, rounded to nearest (halves to even)."""
+    array = values.detach().cpu().numpy() if isinstance(values, Tensor) else values
+    return np.rint(np.clip(np.asarray(array, np.float32), 0, 1) * 255).astype(np.uint8)

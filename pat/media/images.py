@@ -1,7 +1,7 @@
-"""Images on disk and their colours.
+"""Image files.
 
-An image in memory is a float tensor (C, H, W), 0..1, in the coding the file has (sRGB for ordinary
-images), colours in the order red, green, blue. Files appear whole or not at all.
+An image in memory is a float tensor (C, H, W), 0..1, with the encoding of the file (sRGB for ordinary
+images), colours in the order red, green, blue. Files are written atomically.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from torch import Tensor
 from arraygeom.atomic import write_atomically
 
 _ROWS = 256
-"""Worked off at once, where copies of a whole image would take much memory."""
+"""Rows processed at once, to limit memory."""
 
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
@@ -63,28 +63,39 @@ def read_image(path: str | Path, *, name: str | None = None, bits: int | None = 
     """
     path = Path(path)
     label = f"{name}: {path}" if name else f"{path}"
-    coded, packed = _decode(path, label)
-    coded = _opaque(coded, label)
-    planes = coded[None] if coded.ndim == 2 else coded[..., ::-1].transpose(2, 0, 1)
+    values, packed = _decode(path, label)
+    values = _opaque(values, label)
+    planes = values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
 
 
-def write_image(path: str | Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
-    """Write a grey or RGB image, whole or not at all, in the format its name ends in (.png, .tif, .jpg, .exr).
+def write_image(
+    path: str | Path,
+    image: Float[Tensor, "c h w"],
+    *,
+    bits: int = 8,
+    coverage: Float[Tensor, "1 h w"] | None = None,
+) -> None:
+    """Write a grey or RGB image atomically, in the format its name ends in (.png, .tif, .jpg, .exr).
 
-    8 and 16 bits are rounded, after values outside 0..1 are cut to that range; 32 bits (.tif and .exr only) keep
-    floats as they are. An .exr file needs the extra `synthesis`. Raises ValueError for an image with NaN or another
-    number of channels, and for a format that cannot hold it.
+    8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
+    `coverage` makes the image RGBA (.png and .exr). An .exr file needs the extra `synthesis`. Raises ValueError for
+    an image with NaN or another number of channels, and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
     if planes.shape[0] not in (1, 3):
         raise ValueError(f"{path}: an image has 1 or 3 channels, got {planes.shape[0]}: write channels one by one")
+    if coverage is not None:
+        if path.suffix.lower() not in (".png", ".exr"):
+            raise ValueError(f"{path}: only PNG and EXR hold coverage (rgba)")
+        planes = np.concatenate([planes, coverage.detach().cpu().numpy()])
     if not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
-    content = _encode(path, np.ascontiguousarray(planes.transpose(1, 2, 0)[..., ::-1]), bits)
+    order = [2, 1, 0, 3] if coverage is not None else slice(None, None, -1)
+    content = _encode(path, np.ascontiguousarray(planes[order].transpose(1, 2, 0)), bits)
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
 
@@ -94,10 +105,10 @@ def _decode(path: Path, label: str) -> tuple[NDArray, int]:
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = np.frombuffer(path.read_bytes(), np.uint8)
-    coded = _decode_bytes(content)
-    if coded is None:
+    values = _decode_bytes(content)
+    if values is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
-    return coded, _packed_bits(path) if coded.dtype == np.uint16 and path.suffix.lower() in (".tif", ".tiff") else 0
+    return values, _packed_bits(path) if values.dtype == np.uint16 and path.suffix.lower() in (".tif", ".tiff") else 0
 
 
 def _packed_bits(path: Path) -> int:
@@ -109,7 +120,7 @@ def _packed_bits(path: Path) -> int:
 
 
 def _log_level(level: int) -> int:
-    """Set how much OpenCV says; what it was before. OpenCV 5 has the function in another place."""
+    """Set OpenCV's log level; returns the former one. OpenCV 5 has the function in another module."""
     logging = cv2 if hasattr(cv2, "setLogLevel") else getattr(cv2.utils, "logging")  # noqa: B009
     return int(logging.setLogLevel(level))
 
@@ -124,15 +135,15 @@ def _decode_bytes(content: NDArray) -> NDArray | None:
         _log_level(level)
 
 
-def _opaque(coded: NDArray, label: str) -> NDArray:
-    if coded.ndim == 2 or coded.shape[2] == 3:
-        return coded
-    if coded.shape[2] != 4:
-        raise ValueError(f"{label}: has {coded.shape[2]} channels: give a grey (1) or RGB (3) image")
-    full = np.iinfo(coded.dtype).max if np.issubdtype(coded.dtype, np.integer) else 1.0
-    if (coded[..., 3] != full).any():
+def _opaque(values: NDArray, label: str) -> NDArray:
+    if values.ndim == 2 or values.shape[2] == 3:
+        return values
+    if values.shape[2] != 4:
+        raise ValueError(f"{label}: has {values.shape[2]} channels: give a grey (1) or RGB (3) image")
+    full = np.iinfo(values.dtype).max if np.issubdtype(values.dtype, np.integer) else 1.0
+    if (values[..., 3] != full).any():
         raise ValueError(f"{label}: has an alpha channel with transparent pixels: flatten it and save it without alpha")
-    return coded[..., :3]
+    return values[..., :3]
 
 
 def _unit_range(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArray[np.float32]:
@@ -173,7 +184,7 @@ def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
         raise ValueError(
             f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
         ) from None
-    names = "Y" if planes.shape[0] == 1 else "RGB"
+    names = {1: "Y", 3: "RGB", 4: "RGBA"}[len(planes)]
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with write_atomically(path) as temporary:

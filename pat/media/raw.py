@@ -1,7 +1,7 @@
-"""Images as cameras record them -> images to fuse: what the rig says of counts, filters, exposure and coding.
+"""Raw camera images -> images to fuse, by the rig's counts, filter pattern, exposure and encoding.
 
-Images to fuse are coded as sRGB, on alpha's scale of light: where exposures and gains are known, a surface has one
-value in all of them. Ordinary images, of which the rig says nothing, pass as they are.
+Images to fuse are sRGB-encoded, on alpha's scale of light: where exposures and gains are known, a surface has one
+value in all of them. Ordinary images, which the rig describes no further, are unchanged.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from arraygeom import Rig, Sensor
 from .colour import linear_from_srgb, luminance, srgb_from_linear
 
 _ROWS = 256
-"""Worked off at once, where copies of a whole image would take much memory."""
+"""Rows processed at once, to limit memory."""
 
 
 def develop(image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None) -> Float[Tensor, "c2 h w"]:
-    """The image coded as sRGB: black level off, colours from the filter pattern, light on `like`'s scale.
+    """The image sRGB-encoded: black level subtracted, demosaiced, light on `like`'s scale.
 
-    `image` holds counts over 2^bits - 1. Values stay above 0, and exceed 1 where `sensor` saw more light than white
-    is on `like`'s scale. The exposure counts only where both are known.
+    `image` holds counts over 2^bits - 1. Values are at least 0, and exceed 1 where the light is
+    above white on `like`'s scale. Exposures are used only where both are known.
     """
     factor = _light(sensor, like or sensor)
     if sensor.black_level:
@@ -43,31 +43,30 @@ def develop(image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | Non
 
 
 LIGHT = "luminance of light"
-"""The response of developed images of which it is known that they are the luminance of linear light, coded as sRGB.
+"""The response of developed images known to be the sRGB-encoded luminance of linear light.
 
-Of ordinary grey images it is not known: many are the luminance of coded values, which is another where colours are
-strong."""
+Ordinary grey images may be the luma of sRGB values instead, which differs where colours are saturated."""
 
 
 def developed(sensor: Sensor) -> Sensor:
-    """What is true of a camera's images once they are developed: values are sRGB, counts and filters are gone."""
+    """The sensor of developed images: sRGB values, no counts, no filter pattern."""
     measured = sensor.response == "mono" and sensor.coding == "linear"
     plain = dataclasses.replace(sensor, coding="srgb", bayer=None, bits=None, black_level=0.0, gain=1.0)
     return dataclasses.replace(plain, response=LIGHT) if measured else plain
 
 
 def developed_rig(rig: Rig, names: Iterable[str]) -> Rig:
-    """The rig that says of the developed images of these cameras what they are."""
+    """The rig of the developed images of these cameras."""
     for name in names:
         rig = rig.with_camera(name, rig[name].replace(sensor=developed(rig[name].sensor)))
     return rig
 
 
 def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sensor: Sensor) -> Float[Tensor, "3 h w"]:
-    """The fused image as bright as alpha's camera saw it, if that measured the luminance of light (`LIGHT`).
+    """The fused image with alpha's luminance of light, if alpha's camera measured that (`LIGHT`).
 
-    Fusion gives an image whose coded values have alpha's as their luminance. Here all three are moved by the same
-    amount until the luminance of their light is that of alpha's: by 0.045 for saturated purple of middle brightness.
+    Fusion gives an image whose sRGB values have alpha's as their luma. Here all three are shifted by the same
+    amount until the luminance of their light is alpha's: by 0.045 for saturated purple of middle brightness.
     """
     if sensor.response != LIGHT:
         return image
@@ -76,7 +75,7 @@ def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sens
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:
-    """What to add to coded values for that luminance of light; Newton's method on a convex function, from above."""
+    """The shift of sRGB values that gives this luminance of light; Newton's method on a convex function, from above."""
     shift = torch.zeros_like(light)
     for _ in range(4):
         value = image + shift
@@ -89,10 +88,10 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
     """Colours of a raw image behind a colour filter mosaic, interpolated along edges (OpenCV, in 16 bits).
 
     Red and blue are green plus the median of their differences from it over 3x3 pixels (Freeman, US patent 4,724,395):
-    fringes of false colour at fine detail would be carried to where alpha sees it sharp.
+    false-colour fringes at fine detail would otherwise be propagated to alpha.
     """
     code = getattr(cv2, f"COLOR_Bayer{pattern}2RGB_EA")
-    counts = np.rint(raw[0].clamp(0, 1).numpy().astype(np.float64) * 65535).astype(np.uint16)
+    counts = np.rint(raw[0].clamp(0, 1).cpu().numpy().astype(np.float64) * 65535).astype(np.uint16)
     colours = cv2.demosaicing(counts, code).astype(np.float32) / np.float32(65535)
     green = colours[..., 1]
     for i in (0, 2):
@@ -101,12 +100,12 @@ def demosaiced(raw: Float[Tensor, "1 h w"], pattern: str) -> Float[Tensor, "3 h 
 
 
 def light_of(sensor: Sensor, like: Sensor) -> float:
-    """The value (0..1 is up to white) that `sensor` gives to light that is 1 on `like`'s scale, in grey or green."""
+    """The value (1 is white) that `sensor` records, in grey or green, of light that is 1 on `like`'s scale."""
     return 1 / _light(sensor, like)[1]
 
 
 def _light(sensor: Sensor, like: Sensor) -> tuple[float, float, float]:
-    """What to multiply linear red, green and blue with; a grey image takes the middle one."""
+    """Factors of linear red, green and blue; a grey image takes the middle one."""
     both = sensor.exposure is not None and like.exposure is not None
     exposure = like.exposure / sensor.exposure if both and like.exposure and sensor.exposure else 1.0
     wanted = _gains(like)[1]

@@ -13,12 +13,14 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 
+from .colour import to_bytes
+
 
 def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, rate: float = 25.0) -> None:
-    """Write images (grey or RGB, sRGB values, cut to 0..1) as H.264, which players and browsers show (.mp4, .mkv).
+    """Write images (grey or RGB, sRGB values, clipped to 0..1) as H.264 (.mp4, .mkv), atomically.
 
-    The file appears whole or not at all. An odd last row or column is left out: 4:2:0 has none. Raises ValueError for
-    no frames, frames of unlike sizes, and names that end otherwise.
+    An odd last row or column is left out: 4:2:0 has none. Raises ValueError for no frames, frames of different sizes,
+    and other suffixes.
     """
     path = Path(path)
     if path.suffix.lower() not in (".mp4", ".mkv"):
@@ -26,7 +28,8 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
     with write_atomically(path) as temporary, av.open(str(temporary), "w") as file:
         stream = None
         for frame in frames:
-            pixels = _bytes(frame)
+            h, w = (n // 2 * 2 for n in frame.shape[-2:])
+            pixels = np.ascontiguousarray(to_bytes(frame[..., :h, :w].expand(3, -1, -1)).transpose(1, 2, 0))
             if stream is None:
                 stream = file.add_stream("libx264", rate=Fraction(rate).limit_denominator(1000))
                 stream.height, stream.width = pixels.shape[:2]
@@ -37,9 +40,3 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
         if stream is None:
             raise ValueError(f"{path}: a video needs at least one frame")
         file.mux(stream.encode())
-
-
-def _bytes(frame: Tensor) -> np.ndarray:
-    h, w = (n // 2 * 2 for n in frame.shape[-2:])
-    planes = frame[..., :h, :w].expand(3, -1, -1).clamp(0, 1).movedim(0, -1).numpy()
-    return np.ascontiguousarray(np.rint(planes * 255).astype(np.uint8))

@@ -1,6 +1,6 @@
 """BandwisePAT: any number of bands, each treated alike, so that the order of the betas cannot matter.
 
-GuidedPAT mixes its bands in the order in which they come. Here the bands of a beta are looked for and judged
+GuidedPAT mixes its bands in the order in which they come. Here the bands of a beta are matched and judged
 together, by the combination of them that is most like alpha (`pat.networks.spectral_mix`); then one GuidedPAT of a single band
 finishes each with the same weights. Permuting bands or betas permutes the output's bands and does nothing else.
 """
@@ -86,7 +86,7 @@ class BandwisePAT(nn.Module):
         """One beta's bands at alpha's view.
 
         The network's result for each is counted from its local regression on alpha: where a band is unlike alpha,
-        its difference from alpha is not alike in places that look alike.
+        its difference from alpha differs even between similar pixels.
         """
         estimate = self.single.estimate(own, alpha, beta, found, guide=mix.of)
         base = found.colour[:, 0]

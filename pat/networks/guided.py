@@ -1,9 +1,9 @@
 """GuidedPAT: C3 attention from coarse to fine, colour guided by alpha.
 
-Our own network, for one alpha whose detail is to be kept and betas that know the colours. Neighbouring pixels
-first agree on where along their segments they look (`pat.networks.semi_global`); attention looks there at full size in a
-short window. The network judges whether what it found is the point that alpha sees, carries colour from pixels
-that are certain to those that are not, and adds it to alpha.
+Our own network, for one alpha whose detail is to be preserved and betas that have colour. Semi-global matching
+(`pat.networks.semi_global`) finds each pixel's position along its segment; attention samples a short window around it
+at full size. The network estimates the confidence that the match is the point that alpha sees, propagates colour from
+pixels of high confidence to the others, and adds it to alpha.
 """
 
 from __future__ import annotations
@@ -27,20 +27,20 @@ from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import FILLS, FINE, Normalisations, SemiGlobalMatches, along, matches, semi_global_matching
 
 COARSE = 4
-"""Context is worked out at a quarter of the size."""
-UNSURE = 1e-3
-"""The certainty that every pixel has at least."""
+"""Context is computed at a quarter of the size."""
+LEAST_WEIGHT = 1e-3
+"""The least weight of a pixel in propagation."""
 NOWHERE = -10.0
-"""The logit of the confidence where there is nowhere to look."""
+"""The logit of the confidence where there is no valid segment."""
 
 
 @dataclass(frozen=True)
 class GuidedPATConfig:
     """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
 
-    Attention reaches `window` pixels to either side of the consensus, with `taps` samples. Colour is carried
-    within alpha in one round for each of `carry_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
-    nothing is added to what was found and carried. `keep_luminance` lets
+    Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
+    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim` (0)
+    nothing is added to what was matched and propagated. `keep_luminance` lets
     the network add colour to alpha, and never luminance.
     """
 
@@ -49,33 +49,33 @@ class GuidedPATConfig:
     window: float = 3.0
     taps: int = 13
     judge_dim: int = 16
-    trust_dim: int = 24
-    carry_dim: int = 8
-    carry_steps: tuple[int, ...] = (1, 3, 8)
+    confidence_dim: int = 24
+    propagation_dim: int = 8
+    propagation_steps: tuple[int, ...] = (1, 3, 8)
     head_dim: int = 32
     bands: int = 3
     keep_luminance: bool = True
 
 
 class BetaEstimate(NamedTuple):
-    """What one beta tells of alpha's view.
+    """The colour of alpha's view according to one beta.
 
-    colour: (B, C, H, W), its bands minus alpha, where attention and the consensus found them, mixed.
-    spread: (B, fills, C, H, W), the same spread by the consensus from pixels with trust.
+    colour: (B, C, H, W), its bands minus alpha, attended and matched, mixed.
+    diffused: (B, fills, C, H, W), the same diffused within alpha from pixels of high weight.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
-    choice: (B, 1 + fills, H, W), logits of taking, where it is not, what is carried within alpha or each `spread`.
+    choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated within alpha, or each of `diffused`.
     """
 
     attended: Attended
     colour: Tensor
-    spread: Tensor
+    diffused: Tensor
     logit: Tensor
     choice: Tensor
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
         of = slice(band, band + 1)
-        return self._replace(colour=(self.colour - base)[:, of], spread=(self.spread - base[:, None])[:, :, of])
+        return self._replace(colour=(self.colour - base)[:, of], diffused=(self.diffused - base[:, None])[:, :, of])
 
 
 class Encoded(NamedTuple):
@@ -96,7 +96,7 @@ class GuidedPAT(nn.Module):
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
     halo = 640
-    """Encoder 85, judge 176, trust 8, carrying 148, propagation 180 and head 16: the sum, rounded up."""
+    """Encoder 85, judge 176, trust 8, propagation within alpha 148, context, propagation 180 and head 16: the sum, rounded up."""
     beta_halo = 96
     bytes_per_pixel = 320.0
 
@@ -107,8 +107,8 @@ class GuidedPAT(nn.Module):
         self.encoder = Encoder(c.widths)
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
         self.judge = UNet(w4 + 9, c.widths[1:], c.judge_dim)
-        self.trust = Trust(c.judge_dim + w2 + 4 + 12, c.trust_dim)
-        self.carry = nn.ModuleList(Carry(w4, c.carry_dim, step) for step in c.carry_steps)
+        self.confidence = ConfidenceHead(c.judge_dim + w2 + 4 + 12, c.confidence_dim)
+        self.propagation = nn.ModuleList(Propagation(w4, c.propagation_dim, spacing) for spacing in c.propagation_steps)
         if c.head_dim:
             self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
@@ -138,29 +138,29 @@ class GuidedPAT(nn.Module):
         return output_of(alpha + residual, estimates), estimates
 
     def blended(
-        self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], seen: Sequence[BetaEstimate]
+        self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
     ) -> Float[Tensor, "b c h w"]:
         """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
-        certain = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in seen], 1)
-        colour = torch.cat([s.colour for s in seen], 1)
-        rest = torch.cat([self._unseen(own, s) for s in seen], 1)
-        blend = torch.lerp(rest, colour, certain)
+        confidence = torch.cat([s.logit.sigmoid().expand_as(s.colour) for s in estimates], 1)
+        colour = torch.cat([s.colour for s in estimates], 1)
+        rest = torch.cat([self._unseen(own, s) for s in estimates], 1)
+        blend = torch.lerp(rest, colour, confidence)
         if not self.config.head_dim:
             return blend
-        rough = avg_pool2d(torch.cat([colour * certain, certain], 1), COARSE)
+        rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), COARSE)
         context = self.propagate(torch.cat([own.quarter, rough], 1))
-        return blend + self.head(torch.cat([alpha, blend, colour, certain], 1), own.half, context)
+        return blend + self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
 
-    def _unseen(self, own: Encoded, seen: BetaEstimate) -> Tensor:
-        """Colour for where beta does not see the point: carried at 1/4 of the size from certain pixels to others
-        that look alike in alpha, or as the consensus spread it."""
-        certain = seen.logit.sigmoid()
-        known = avg_pool2d(certain, COARSE)
-        colour = avg_pool2d(seen.colour * certain, COARSE) / (known + UNSURE)
-        for carry in self.carry:
-            colour, known = carry(own.quarter, colour, known)
-        choices = torch.cat([enlarge(colour, COARSE)[:, None], seen.spread], 1)
-        return (seen.choice.softmax(1)[:, :, None] * choices).sum(1)
+    def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
+        """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are similar in
+        alpha, or diffused."""
+        confidence = estimate.logit.sigmoid()
+        weight = avg_pool2d(confidence, COARSE)
+        colour = avg_pool2d(estimate.colour * confidence, COARSE) / (weight + LEAST_WEIGHT)
+        for step in self.propagation:
+            colour, weight = step(own.quarter, colour, weight)
+        choices = torch.cat([enlarge(colour, COARSE)[:, None], estimate.diffused], 1)
+        return (estimate.choice.softmax(1)[:, :, None] * choices).sum(1)
 
     def estimate(
         self,
@@ -186,26 +186,26 @@ class GuidedPAT(nn.Module):
         colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
         return BetaEstimate(attended, colour, found.colour, logit, choice)
 
-    def _judged(self, own: Encoded, known: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
-        """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the consensus's match."""
-        agreed = torch.cat([known.disparity / 64, known.facts], 1)
-        told = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
-        rough = torch.cat([avg_pool2d(agreed, 2), avg_pool2d(told, COARSE)], 1)
+    def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
+        """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
+        matched = torch.cat([found.disparity / 64, found.facts], 1)
+        samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
+        rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, COARSE)], 1)
         context = self.judge(torch.cat([own.quarter, rough], 1))
-        return self.trust(torch.cat([enlarge(context), own.half, agreed, pixel_unshuffle(facts, 2)], 1))
+        return self.confidence(torch.cat([enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)], 1))
 
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
         return x if self.training else x.double()
 
 
-def output_of(image: Float[Tensor, "b c h w"], seen: Sequence[BetaEstimate]) -> FusionOutput:
-    """The image with where each beta was looked at, and with what confidence."""
+def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
+    """The image with the position in each beta, its deviation, and its confidence."""
     return FusionOutput(
         image,
-        [s.attended.position for s in seen],
-        [s.attended.spread for s in seen],
-        [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in seen],
+        [s.attended.position for s in estimates],
+        [s.attended.spread for s in estimates],
+        [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in estimates],
     )
 
 
@@ -219,8 +219,8 @@ def hw_of(image: Tensor) -> tuple[int, int]:
     return image.shape[-2], image.shape[-1]
 
 
-class Trust(nn.Sequential):
-    """The logits of confidence, choices and the better match at full size, worked out at half of it."""
+class ConfidenceHead(nn.Sequential):
+    """The logits of confidence, choices and the better match at full size, computed at half of it."""
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__(
@@ -231,11 +231,11 @@ class Trust(nn.Sequential):
         )
 
 
-class Carry(nn.Module):
-    """C3 attention of alpha to itself: each pixel takes colour from 7 x 7 around it that are certain and look alike.
+class Propagation(nn.Module):
+    """C3 attention of alpha to itself: each pixel takes colour from similar pixels of high weight in 7 x 7 around it.
 
-    The logarithm of the certainty is added to the scores as one more channel of the keys. Without training all
-    look alike, and this is a normalised convolution.
+    The logarithm of the weight is added to the scores as one more channel of the keys. Without training all pixels are
+    equally similar, and this is a normalised convolution.
     """
 
     def __init__(self, width: int, dim: int, step: int) -> None:
@@ -245,19 +245,19 @@ class Carry(nn.Module):
         nn.init.zeros_(self.query.weight)
 
     def forward(
-        self, features: Float[Tensor, "b d h w"], colour: Float[Tensor, "b c h w"], sure: Float[Tensor, "b 1 h w"]
+        self, features: Float[Tensor, "b d h w"], colour: Float[Tensor, "b c h w"], weight: Float[Tensor, "b 1 h w"]
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-        """Colour and certainty after one round."""
+        """Colour and weight after one round."""
         view = View(hw=(features.shape[-2], features.shape[-1]))
-        query = torch.cat([self.query(features), torch.ones_like(sure)], 1)
-        key = torch.cat([self.key(features), (sure + UNSURE).log()], 1)
+        query = torch.cat([self.query(features), torch.ones_like(weight)], 1)
+        key = torch.cat([self.key(features), (weight + LEAST_WEIGHT).log()], 1)
         look = lazily(self.field, Pair(view, view))
-        found = attend(query, key, torch.cat([colour, sure], 1), look, interpolation="nearest")
+        found = attend(query, key, torch.cat([colour, weight], 1), look, interpolation="nearest")
         return found[:, :-1], found[:, -1:]
 
 
 def window_around(disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
-    """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `reach` from their end."""
+    """Pieces of segments (B or 1, 2 h, 2 w), `window` pixels to either side of the match at `disparity` from their end."""
     middle, step = matches(segments, disparity), window * along(segments)
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
@@ -322,7 +322,7 @@ class UNet(nn.Module):
 
 
 class Head(nn.Module):
-    """What to add to the blend, at full size, worked out on blocks of 2x2 pixels."""
+    """What to add to the blend, at full size, computed on blocks of 2x2 pixels."""
 
     def __init__(self, inputs: int, width: int, bands: int) -> None:
         super().__init__()

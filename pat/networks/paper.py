@@ -27,7 +27,7 @@ class PATConfig:
 
     `betas` is their number, `in_channels` that of each image (an image with fewer is repeated), `dim` the
     width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
-    of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is looked up.
+    of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is sampled.
     """
 
     betas: int = 1

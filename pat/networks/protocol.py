@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -37,6 +38,11 @@ class Inputs:
     betas: tuple[Beta, ...]
     multiple: int = 1
     beta_halo: int = 0
+
+    @classmethod
+    def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
+        """Alpha with each beta's image and field, in order."""
+        return cls(alpha, tuple(Beta(image, field) for image, field in zip(images, fields, strict=True)))
 
     @property
     def hw(self) -> HW:
@@ -99,6 +105,7 @@ def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
     return ends_of(Segments(field.pixels.start[some], field.pixels.end[some], field.pixels.valid[some]))
 
 
+@runtime_checkable
 class State(Protocol):
     """What a network has found out about whole images before parts of them are fused; opaque to the fusion."""
 
@@ -118,7 +125,7 @@ class FusionOutput(NamedTuple):
     image: (B, C, s H, s W), the fused image.
     position: one (B, 2, H, W) for each beta, where its pixels were found, in beta's pixels.
     deviation: one (B, H, W) for each beta, the standard deviation of that position, in beta's pixels.
-    confidence: one (B, H, W) for each beta, 0 to 1: whether beta sees the point and its position is certain.
+    confidence: one (B, H, W) for each beta, 0 to 1: that beta sees the point and that its position is right.
     """
 
     image: Tensor

@@ -1,9 +1,9 @@
-"""Consensus: what neighbours along the segments agree on, before attention looks closely.
+"""Semi-global matching along the search segments, before attention samples around the matches.
 
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
 semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
-are places along each pixel's own segment, so it works for any rig with straight fields, rectified or not. It is
-worked out on images of half the size, as a whole frame and without gradients.
+are positions along each pixel's own segment, so it works for any rig with straight fields, rectified or not. It is
+computed on images of half the size, as a whole frame and without gradients.
 """
 
 from __future__ import annotations
@@ -23,28 +23,29 @@ from torch.nn.functional import avg_pool2d, interpolate
 from arraygeom import Segments
 from arraygeom.sampling import on_image, sample
 
+from ..media.colour import to_bytes
 from ..support.threads import in_parallel
 from . import semi_global_kernels as kernels
 
 FINE = 2
-"""The consensus is found on images this many times smaller."""
+"""Matching is done on images this many times smaller."""
 BLOCK = 320
-"""Side of the squares that are worked off at a time, in pixels of the reduced images."""
+"""Side of the squares processed at a time, in pixels of the reduced images."""
 MOST_MARGIN = 192
 CONSISTENT = 0.2
-"""The views agree on a match if the look back is less than this (times 8 pixels) from it."""
+"""A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
 LIKENESS = 0.08
-"""Difference of brightness at which the trust in a match falls to 1 / e."""
+"""Difference of brightness at which the weight of a match falls to 1 / e."""
 DOUBT = 0.25
-"""Trust in a match on which the two views do not agree, before the likeness."""
-REACH_FILL = (50.0, 4.0)
+"""Weight of a match that is not consistent, before the likeness."""
+DISPARITY_FILL = (50.0, 4.0)
 """Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
 COLOUR_FILL = (300.0, 3.0)
 """The same of colour."""
 FLOOR = 1e-3
-"""Regulariser (variance of brightness) of the regression of colour on brightness where colour is spread."""
+"""Regulariser (variance of brightness) of the regression of colour on brightness where colour is diffused."""
 FILLS = 2
-"""Ways in which colour is spread: along its regression on brightness, and as it is."""
+"""Ways in which colour is diffused: along its regression on brightness, and as it is."""
 DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
 """Window and regulariser of the regression that gives matched colour the detail that beta lost."""
 MOST_DETAIL = 0.2
@@ -54,14 +55,14 @@ BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 
 
 class SemiGlobalMatches(NamedTuple):
-    """What neighbours agree on, for images of H x W.
+    """The matches of images of H x W.
 
-    reach: (B, 1, H / 2, W / 2), how far from its segment's end the match is, pixels of beta; where the match is
-        not trusted, spread from where it is.
-    facts: (B, 3, H / 2, W / 2), how far a look back from beta disagrees, by how much the match is better than
+    disparity: (B, 1, H / 2, W / 2), how far from its segment's end the match is, pixels of beta; where the match is
+        not consistent, diffused from where it is.
+    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
         others, and its cost; each 0 to 1.
     matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
-    colour: (B, fills, C, H, W), the same from pixels with trust spread to those without.
+    colour: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     """
 
     disparity: Tensor
@@ -78,7 +79,7 @@ class SemiGlobalMatches(NamedTuple):
 
 
 class Normalisation(NamedTuple):
-    """How beta's brightness is levelled to alpha's, and with what either is then blurred, for each of a batch.
+    """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
 
     level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
     blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
@@ -90,8 +91,8 @@ class Normalisation(NamedTuple):
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
         """What makes the means and standard deviations the same, and then the sharpness."""
-        (spread, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
-        level = torch.stack([mean, (wanted / spread.clamp(min=1e-3)).clamp(max=4), middle])
+        (deviation, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
+        level = torch.stack([mean, (wanted / deviation.clamp(min=1e-3)).clamp(max=4), middle])
         return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
 
     def normalised(self, beta: Tensor) -> Tensor:
@@ -148,41 +149,41 @@ def semi_global_matching(
     parts. On the CPU, with as many threads as torch may use; the same whatever their number.
     """
     normalisations = normalisations or Normalisations.of(alpha, guide)
-    disparity, facts = agreement(alpha, guide, blocks, normalisations.half)
+    disparity, facts = matched_at_half_size(alpha, guide, blocks, normalisations.half)
     return SemiGlobalMatches(
         disparity, facts, *_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
     )
 
 
-def agreement(
+def matched_at_half_size(
     alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, normalisation: Normalisation
 ) -> tuple[Float[Tensor, "b 1 h2 w2"], Float[Tensor, "b 3 h2 w2"]]:
-    """`reach` and `facts` of the consensus alone; `balance` is that of half the size."""
+    """`disparity` and `facts` alone; `normalisation` is that of half the size."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
     geometry = _geometry(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
-    found, told = _agreed(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
-    consistent = (told[..., 0] < CONSISTENT).astype(np.float32)
-    planes = zip(found, consistent, _bytes(avg_pool2d(alpha, FINE)))
-    spread = np.stack([_filled(r[None], c + 1e-5, g, REACH_FILL)[0] for r, c, g in planes])
-    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, spread)])
+    found, measured = _matched_blocks(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
+    consistent = (measured[..., 0] < CONSISTENT).astype(np.float32)
+    planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
+    filled = np.stack([_filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
+    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, filled)])
     disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
-    return disparity, torch.from_numpy(told).movedim(-1, 1).to(alpha)
+    return disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha)
 
 
 def normalised_at_matches(
     image: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 h w"]:
-    """The image with another's mean and standard deviation, where the weight is; both show the same at a place.
+    """The image with another's mean and standard deviation, where the weight is; both show the same point at a pixel.
 
-    Levels of whole images say little where these show different parts of a scene.
+    Statistics of whole images mean little where these show different parts of a scene.
     """
     weight = (weight + 1e-6) / (weight + 1e-6).sum((2, 3), keepdim=True)
     means = [(weight * p).sum((2, 3), keepdim=True) for p in (image, like)]
-    spread, wanted = (
+    deviation, wanted = (
         (weight * (p - m).square()).sum((2, 3), keepdim=True).sqrt() for p, m in zip((image, like), means)
     )
-    return (image - means[0]) * (wanted / spread.clamp(min=1e-3)).clamp(max=4) + means[1]
+    return (image - means[0]) * (wanted / deviation.clamp(min=1e-3)).clamp(max=4) + means[1]
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:
@@ -205,7 +206,7 @@ def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
     return _Geometry(*planes)
 
 
-def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
+def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
     """Reach (B, h, w) in pixels of the reduced beta, and facts (B, h, w, 3)."""
     labels = int(max(geometry.length.max(), 0)) + 2
     disparity = np.zeros(own.shape, np.float32)
@@ -221,7 +222,7 @@ def _agreed(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray,
 
 
 def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """Inner and outer squares: what is kept, and what is worked out for it."""
+    """Inner and outer squares: the result, and what is computed for it."""
     margin = min(labels + 32, MOST_MARGIN)
     for top in range(0, hw[0], BLOCK):
         for left in range(0, hw[1], BLOCK):
@@ -290,18 +291,18 @@ def _colours(
     facts: Tensor,
     normalisation: Normalisation,
 ) -> tuple[Tensor, Tensor]:
-    """Beta's bands minus alpha at the matches, and the same spread by trust over what is connected in alpha."""
+    """Beta's bands minus alpha at the matches, and the same diffused by weight over what is connected in alpha."""
     bands = beta.shape[1]
     seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
     values, own, brightness = seen.split([bands, 1, 1], 1)
-    consistent = agreed_on(facts)
+    consistent = is_consistent(facts)
     brightness = normalised_at_matches(brightness, alpha, valid * consistent)
     soft = normalisation.softened(alpha)
     if bands > 1:
         matched = _detailed(values - own, brightness, alpha) + own - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
-    return matched, spread_from(matched, alpha, trusted(brightness - soft, consistent, valid))
+    return matched, diffused_from(matched, alpha, match_weight(brightness - soft, consistent, valid))
 
 
 def at_matches(
@@ -315,33 +316,33 @@ def at_matches(
     return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
 
 
-def agreed_on(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where the two views agree on the match."""
+def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
+    """1 where the match is consistent."""
     return _enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
-def trusted(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
-    """How far a match is to be trusted whose brightness is not alpha's by `unlike`; always more than 0."""
+def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
+    """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
     unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
     return (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
 
 
-def spread_from(
-    matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], trust: Float[Tensor, "b 1 h w"]
+def diffused_from(
+    matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b fills c h w"]:
-    """Bands spread by trust over what is connected in alpha, in each of the `FILLS` ways."""
-    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(trust[:, 0]), _bytes(alpha)))
-    spread = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
+    """Bands diffused by weight over what is connected in alpha, in each of the `FILLS` ways."""
+    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(weight[:, 0]), to_bytes(alpha[:, 0])))
+    diffused = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
 
     def along_brightness(i: int) -> None:
-        spread[i, 0] = _regressed(*planes[i], COLOUR_FILL)
+        diffused[i, 0] = _regressed(*planes[i], COLOUR_FILL)
 
     def as_it_is(i: int) -> None:
         colour, _, weight, like = planes[i]
-        spread[i, 1] = _filled(colour, weight, like, COLOUR_FILL)
+        diffused[i, 1] = _filled(colour, weight, like, COLOUR_FILL)
 
     in_parallel([partial(how, i) for i in range(len(planes)) for how in (along_brightness, as_it_is)])
-    return torch.from_numpy(spread).to(alpha)
+    return torch.from_numpy(diffused).to(alpha)
 
 
 def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
@@ -358,18 +359,18 @@ def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1
     mean = partial(box_mean, radius=DETAIL_RADIUS)
     middle, centre = mean(brightness), mean(colour)
     variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
-    spread = (mean(colour.square()) - centre.square()).clamp(min=0)
+    variation = (mean(colour.square()) - centre.square()).clamp(min=0)
     common = mean(colour * brightness) - centre * middle
-    explained = common.square() / ((variance + 1e-6) * (spread + 1e-6))
+    explained = common.square() / ((variance + 1e-6) * (variation + 1e-6))
     return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
 
 
 def _regressed(
     colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]
 ) -> NDArray[np.float32]:
-    """Colour (c, h, w) as its weighted regression on brightness (h, w) says, over what is connected in the guide.
+    """Colour (c, h, w) by its weighted regression on brightness (h, w), over what is connected in the guide.
 
-    The moments of the guided filter (He et al. 2013), spread instead of averaged over a window: what no beta sees
+    The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no beta sees
     has colour that varies with brightness as it does nearby.
     """
     moments = _filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
@@ -379,7 +380,7 @@ def _regressed(
 
 
 def matches(segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `reach` from the ends, beta's pixels."""
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels."""
     length = segments.length
     far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
     return segments.end + far.clamp(min=0).minimum(length)[..., None] * along(segments)
@@ -407,7 +408,3 @@ def _filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, 
 
 def _numpy(x: Tensor) -> NDArray[np.float32]:
     return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)
-
-
-def _bytes(image: Tensor) -> NDArray[np.uint8]:
-    return np.rint(np.clip(_numpy(image[:, 0]), 0, 1) * 255).astype(np.uint8)

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import numpy as np
 
-from pat.attention.cpu_kernels import compiled
+from pat.attention.kernels import compiled
 
 NOWHERE = np.uint8(80)
 """Cost of a label that is not on beta: more than any other can have."""
 UNSEEN = np.uint8(24)
-"""Cost of a label beyond beta's edge, where the point may well be: about as much as what is unlike."""
+"""Cost of a label beyond beta's edge, where the point may well be: about that of a mismatch."""
 MOST = np.float32(1e9)
 LEVELS = np.float32(30.0)
-"""Cost of a difference of 1 in (levelled) brightness, which counts up to `TRUNCATED`."""
+"""Cost of a difference of 1 in (normalised) brightness, which counts up to `TRUNCATED`."""
 TRUNCATED = np.float32(20.0)
 SMALL, LARGE = np.float32(12.0), np.float32(100.0)
 """Penalties of neighbours whose labels differ by one, and by more (the latter where alpha shows no edge)."""
 EDGE = np.float32(8 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
 FARTHEST = np.float32(8)
-"""A look back that lands farther off than this, in labels, counts as this far."""
+"""A difference of labels in the left-right check counts as at most this."""
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 
@@ -58,7 +58,7 @@ def _pixel(end, along, label):
 
 @compiled(nogil=True, cache=True)
 def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
-    """How unlike alpha's pixel (own) and beta's (other) at each label are: out (h, w, labels).
+    """Dissimilarity of alpha's pixel (own) and beta's (other) at each label: out (h, w, labels).
 
     The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere, or, where
     it is beta's edge that cuts the segment, not seen.
@@ -150,8 +150,8 @@ def _sweep(cost, guide, total, dx, way):
 
 @compiled(nogil=True, cache=True)
 def winners(total, end, along, length, cut, rows, columns, disparity, facts):
-    """Each pixel's best label, to a fraction (reach); and facts (h, w, 3): how far the best label of those that
-    look at the same pixel of beta is from it, by how much it is better than the second, and how good it is."""
+    """Each pixel's best label, to a fraction (disparity); and facts (h, w, 3): its distance from the best label of all
+    alpha pixels that match the same pixel of beta, its margin to the second best, and its cost."""
     claims = _claims(total, end, along, length, rows, columns)
     height, width, labels = total.shape
     for y in range(height):
@@ -170,7 +170,7 @@ def winners(total, end, along, length, cut, rows, columns, disparity, facts):
 
 @compiled(inline="always")
 def _claims(total, end, along, length, rows, columns):
-    """For each pixel of beta the label of whichever of alpha's pixels has the best claim to it."""
+    """For each pixel of beta the label of the alpha pixel that matches it at the least cost."""
     height, width, labels = total.shape
     lowest = np.full((rows, columns), MOST, np.float32)
     claims = np.full((rows, columns), -labels, np.int32)

@@ -1,6 +1,6 @@
-"""Several bands of one beta: the combination of them that alpha sees, and what alpha's detail says of each.
+"""Several bands of one beta: the combination of them that alpha sees, and how alpha's detail adds to each.
 
-A mono alpha may see what no single band does. Matched by the bands' mean, a first, coarse consensus tells which
+A mono alpha may see what no single band does. Matched by the bands' mean, a first, coarse matching gives the
 combination of them is most like alpha; by that they are matched closely, and by how well it explains alpha the
 bands are corrected together. All sums over bands are of sorted summands, so that their order cannot matter at all.
 """
@@ -22,13 +22,13 @@ from .semi_global import (
     Normalisation,
     Normalisations,
     SemiGlobalMatches,
-    agreed_on,
-    agreement,
     at_matches,
     box_mean,
+    diffused_from,
+    is_consistent,
     local_slope,
-    spread_from,
-    trusted,
+    match_weight,
+    matched_at_half_size,
 )
 
 OUTLIER = 0.06
@@ -36,7 +36,7 @@ OUTLIER = 0.06
 EQUAL = 1e-4
 """How strongly the combination is drawn to one of equal parts: share of the bands' mean variance."""
 MISFIT = 0.016
-"""Difference from alpha, averaged over `SMOOTH` pixels to either side, at which the combination tells half."""
+"""Difference from alpha, averaged over `SMOOTH` pixels to either side, at which the combination counts half."""
 SMOOTH = 4
 ALIKE = 0.08
 """Where the combination's black and white are so near to alpha's, black is taken for black and white for white, and the
@@ -54,7 +54,7 @@ class SpectralMix(NamedTuple):
     slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next; less if
         that explains alpha badly.
     gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another spectrum. 0
-        for one band, which has no say in that.
+        for one band, where that cannot be known.
     """
 
     weights: Float[Tensor, "b c"]
@@ -88,7 +88,7 @@ class SpectralMix(NamedTuple):
         return self.slopes[:, :, None, None].to(like)
 
     def reconciled(self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
-        """The bands corrected so that their combination is nearer to alpha, by as much as it can be trusted."""
+        """The bands corrected so that their combination is nearer to alpha, by as much as it is reliable."""
         step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
         return bands + step * (alpha - self.of(bands))
 
@@ -107,9 +107,9 @@ def coarse_mix(
     own, bands = avg_pool2d(alpha, factor), avg_pool2d(beta, factor)
     guide = SpectralMix.equal(bands).of(bands)
     normalisations = Normalisations.of(own, guide)
-    disparity, facts = agreement(own, guide, _reduced(blocks, factor), normalisations.half)
-    values, valid = at_matches(bands, _reduced(segments, factor), disparity)
-    return SpectralMix.fitted(values, normalisations.whole.softened(own), valid * agreed_on(facts))
+    disparity, facts = matched_at_half_size(own, guide, reduced(blocks, factor), normalisations.half)
+    values, valid = at_matches(bands, reduced(segments, factor), disparity)
+    return SpectralMix.fitted(values, normalisations.whole.softened(own), valid * is_consistent(facts))
 
 
 @torch.no_grad()
@@ -121,12 +121,12 @@ def semi_global_matching_of_bands(
     mix: SpectralMix,
     normalisations: Normalisations,
 ) -> SemiGlobalMatches:
-    """`consensus` of alpha and the mix of the bands; all are carried to alpha's view."""
-    disparity, facts = agreement(alpha, mix.of(beta), blocks, normalisations.half)
+    """`semi_global_matching` of alpha and the mix of the bands; all are warped to alpha's view."""
+    disparity, facts = matched_at_half_size(alpha, mix.of(beta), blocks, normalisations.half)
     values, valid = at_matches(beta, segments, disparity)
     matched, unlike = _matched(values, alpha, mix, normalisations.whole)
     return SemiGlobalMatches(
-        disparity, facts, matched, spread_from(matched, alpha, trusted(unlike, agreed_on(facts), valid))
+        disparity, facts, matched, diffused_from(matched, alpha, match_weight(unlike, is_consistent(facts), valid))
     )
 
 
@@ -140,7 +140,7 @@ def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Nor
     return values + slope * beyond.clamp(-MOST_DETAIL, MOST_DETAIL) - alpha, brightness - soft
 
 
-def _reduced(segments: Segments, factor: int) -> Segments:
+def reduced(segments: Segments, factor: int) -> Segments:
     """The same segments in pixels of a beta that is `factor` times smaller."""
     start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
     return Segments(start, end, segments.valid)
@@ -150,13 +150,13 @@ def _fit(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
     """Weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
     order = bands.flatten(1).sum(1).argsort()
     weight = weight + 1e-6
-    first = trust = weight.flatten()
+    first = robust = weight.flatten()
     x, y = (_local(planes, weight).flatten(1) for planes in (bands[order], alpha))
     for _ in range(2):
-        share = trust / trust.sum()
+        share = robust / robust.sum()
         weights = _combination(x, y[0], share)
         rest = y[0] - weights @ x
-        trust = first * torch.exp(-(rest / OUTLIER).square())
+        robust = first * torch.exp(-(rest / OUTLIER).square())
     explained = (1 - first @ rest.square() / (first @ y[0].square()).clamp(min=1e-12)).clamp(min=0)
     weights = weights / explained.clamp(min=DILUTED).sqrt()
     detail = _detail(bands[order]).flatten(1)

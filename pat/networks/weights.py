@@ -53,7 +53,7 @@ def load_weights(name: str | Path) -> Network:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            state = {renamed(key): file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     network = _network(path, metadata)
@@ -62,6 +62,17 @@ def load_weights(name: str | Path) -> Network:
         raise ValueError(f"{path}: the weights do not fit the {metadata['network']} that the file describes: {wrong}")
     network.load_state_dict(state)
     return network.eval().requires_grad_(False)
+
+
+_OLD_NAMES = {"trust": "confidence", "carry": "propagation"}
+"""First words of parts and options of networks in files of earlier versions."""
+
+
+def renamed(key: str) -> str:
+    """The name, in this version, of a tensor or an option in a file of any version."""
+    first, separator, rest = key.removeprefix("single.").partition("_" if "." not in key else ".")
+    single = "single." if key.startswith("single.") else ""
+    return single + _OLD_NAMES.get(first, first) + separator + rest
 
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
@@ -95,7 +106,8 @@ def _network(path: Path, metadata: Mapping[str, str]) -> Network:
         raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
     network, config = NETWORKS[metadata["network"]]
     try:
-        values = {k: tuple(v) if isinstance(v, list) else v for k, v in json.loads(metadata["config"]).items()}
+        config_values = json.loads(metadata["config"]).items()
+        values = {renamed(k): tuple(v) if isinstance(v, list) else v for k, v in config_values}
         return network(config(**values))
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: its configuration does not fit this version ({error})") from None

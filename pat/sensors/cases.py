@@ -17,7 +17,7 @@ from .optics import BoxBlur
 
 
 @dataclass(frozen=True)
-class Case:
+class DegradationCase:
     """One way in which the two images of a pair are degraded."""
 
     name: str
@@ -25,22 +25,22 @@ class Case:
     beta: tuple[Step, ...] = ()
 
 
-def paper_cases(blur: int = 5) -> tuple[Case, Case, Case, Case]:
-    """The paper's four augmentations for two inputs; each is to be drawn with probability 1/4.
+def paper_cases(blur: int = 5) -> tuple[DegradationCase, DegradationCase, DegradationCase, DegradationCase]:
+    """The paper's four augmentations for two inputs; each is drawn with probability 1/4.
 
     The paper does not give the blur; here it is a box of `blur` pixels.
     """
     reduced = (Resample(0.5, "bicubic"), Resample(2.0, "bicubic"), Clip())
     return (
-        Case("blur alpha", alpha=(BoxBlur(blur),)),
-        Case("blur beta", beta=(BoxBlur(blur),)),
-        Case("reduce beta", beta=reduced),
-        Case("blur and reduce beta", beta=(BoxBlur(blur), *reduced)),
+        DegradationCase("blur alpha", alpha=(BoxBlur(blur),)),
+        DegradationCase("blur beta", beta=(BoxBlur(blur),)),
+        DegradationCase("reduce beta", beta=reduced),
+        DegradationCase("blur and reduce beta", beta=(BoxBlur(blur), *reduced)),
     )
 
 
 class Pairs(NamedTuple):
-    """Degraded images of both cameras, and which case each pair of the batch met."""
+    """Degraded images of both cameras, and the case of each pair of the batch."""
 
     alpha: Float[Tensor, "b ca ha wa"]
     beta: Float[Tensor, "b cb hb wb"]
@@ -50,17 +50,17 @@ class Pairs(NamedTuple):
 def augment(
     alpha: Float[Tensor, "b ca ha wa"],
     beta: Float[Tensor, "b cb hb wb"],
-    cases: Sequence[Case],
+    cases: Sequence[DegradationCase],
     generator: Generator,
 ) -> Pairs:
     """Degrade each pair of a batch by one of the cases, all equally likely. Sizes must come out as they went in."""
     drawn = torch.randint(len(cases), (len(alpha),), generator=generator, device=generator.device)
     alpha, beta = alpha.clone(), beta.clone()
     for i, case in enumerate(cases):
-        met = (drawn == i).nonzero()[:, 0].to(alpha.device)
-        if len(met):
-            alpha[met] = _same_size(alpha[met], case.alpha, generator, case.name)
-            beta[met] = _same_size(beta[met], case.beta, generator, case.name)
+        index = (drawn == i).nonzero()[:, 0].to(alpha.device)
+        if len(index):
+            alpha[index] = _same_size(alpha[index], case.alpha, generator, case.name)
+            beta[index] = _same_size(beta[index], case.beta, generator, case.name)
     return Pairs(alpha, beta, drawn)
 
 
@@ -69,6 +69,6 @@ def _same_size(image: Tensor, steps: Sequence[Step], generator: Generator, name:
     if degraded.shape != image.shape:
         old, new = tuple(image.shape[1:]), tuple(degraded.shape[1:])
         raise ValueError(
-            f'case "{name}" turns {old} into {new}; the cases of a batch must keep the size: add a Resample'
+            f'case "{name}" changes {old} to {new}; the cases of a batch must keep the size: add a Resample'
         )
     return degraded

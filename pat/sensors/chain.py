@@ -19,8 +19,8 @@ from arraygeom.sampling import sample
 
 
 @dataclass(frozen=True)
-class Light:
-    """Images on their way through a chain, and what is known of what they show, all of the same pixels.
+class OpticalImage:
+    """Images in a chain, with depth, motion and camera of the same pixels where known.
 
     `depth` in metres along the optical axis; `motion` (x, y) in pixels a second; `camera` with K of these pixels;
     `pixels` is A with x ~ A x_first (float64).
@@ -37,29 +37,29 @@ class Light:
         """Height and width."""
         return self.image.shape[-2], self.image.shape[-1]
 
-    def moved(self, A: Float[Tensor, "3 3"], image: Float[Tensor, "b c2 h2 w2"]) -> Light:
-        """New images whose pixels are x' ~ A x; depth and motion are those of the nearest former pixels."""
+    def resampled(self, A: Float[Tensor, "3 3"], image: Float[Tensor, "b c2 h2 w2"]) -> OpticalImage:
+        """New images whose pixels are x' ~ A x; depth and motion are those of the nearest old pixels."""
         hw = image.shape[-2], image.shape[-1]
         if hw == self.hw and torch.equal(A, torch.eye(3, dtype=A.dtype)):
             return replace(self, image=image)
-        depth = None if self.depth is None else _looked_up(self.depth[:, None], A, hw)[:, 0]
-        motion = None if self.motion is None else _turned(_looked_up(self.motion, A, hw), A)
+        depth = None if self.depth is None else _nearest_values(self.depth[:, None], A, hw)[:, 0]
+        motion = None if self.motion is None else _rotated(_nearest_values(self.motion, A, hw), A)
         camera = None if self.camera is None else self.camera.transformed(A, hw)
-        return Light(image, A @ self.pixels, depth, motion, camera)
+        return OpticalImage(image, A @ self.pixels, depth, motion, camera)
 
 
-def _looked_up(values: Tensor, A: Tensor, hw: HW) -> Tensor:
+def _nearest_values(values: Tensor, A: Tensor, hw: HW) -> Tensor:
     old = map_homogeneous(torch.linalg.inv(A)[:2], pixel_grid(hw, dtype=values.dtype, device=values.device))
     limits = old.new_tensor([values.shape[-1] - 1, values.shape[-2] - 1])
     return sample(values, torch.minimum(old.clamp(min=0), limits)[None], interpolation="nearest").values
 
 
-def _turned(motion: Tensor, A: Tensor) -> Tensor:
+def _rotated(motion: Tensor, A: Tensor) -> Tensor:
     return torch.einsum("ij,bjhw->bihw", A[:2, :2].to(motion), motion)
 
 
 class Step(ABC):
-    """One thing that happens to an image. Subclasses say what in `apply`, or in `expose` if they must know more."""
+    """One step of the formation of an image. Subclasses define `apply`, or `expose` if they need depth or motion."""
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
         """A with x_after ~ A x_before for an image of height and width `hw`."""
@@ -67,23 +67,23 @@ class Step(ABC):
 
     @abstractmethod
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c2 h2 w2"]:
-        """The images afterwards."""
+        """The images after the step."""
 
-    def expose(self, light: Light, generator: Generator) -> Light:
-        """The images afterwards, with what is known of them."""
-        return light.moved(self.pixel_matrix(light.hw), self.apply(light.image, generator))
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
+        """The images after the step, with depth, motion and camera."""
+        return light.resampled(self.pixel_matrix(light.hw), self.apply(light.image, generator))
 
 
 class LitStep(Step):
-    """A step that must know what the image shows; `expose` is the whole of it."""
+    """A step that needs depth, motion or the camera: it defines `expose`."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The images afterwards, if what `light` holds beside the image is not needed after all."""
-        return self.expose(Light(image, torch.eye(3, dtype=torch.float64)), generator).image
+        """The images after the step, where depth, motion and camera are not needed after all."""
+        return self.expose(OpticalImage(image, torch.eye(3, dtype=torch.float64)), generator).image
 
     @abstractmethod
-    def expose(self, light: Light, generator: Generator) -> Light:
-        """The images afterwards, with what is known of them."""
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
+        """The images after the step, with depth, motion and camera."""
 
 
 class Recorded(NamedTuple):
@@ -105,9 +105,9 @@ def record(
     """Apply the steps in order.
 
     `depth` (metres) and `camera` are needed by `Defocus`, `motion` (pixels a second) by `MotionBlur` without a
-    velocity of its own. Raises ValueError if a step misses what it needs.
+    velocity of its own. Raises ValueError if a step lacks what it needs.
     """
-    light = Light(image, torch.eye(3, dtype=torch.float64), depth, motion, camera)
+    light = OpticalImage(image, torch.eye(3, dtype=torch.float64), depth, motion, camera)
     for step in steps:
         light = step.expose(light, generator)
     return Recorded(light.image, light.pixels)
@@ -131,8 +131,8 @@ def record_array(
 ) -> RecordedArray:
     """Each camera's chain on its images; cameras without one record the ideal image.
 
-    Each camera draws from its own generator, made of `seed` and its name: a camera more or less changes nothing
-    for the others. The rig's cameras follow what the steps do to the pixels. Raises ValueError for a camera that
+    Each camera draws from its own generator, seeded by `seed` and its name, independently of the other cameras. The
+    rig's cameras are transformed as the steps transform the pixels. Raises ValueError for a camera that
     the rig does not have.
     """
     recorded = {}
@@ -153,7 +153,7 @@ def record_array(
 
 
 def generator_for(seed: int, *names: object, device: torch.device | str = "cpu") -> Generator:
-    """A generator for something named, the same on every machine.
+    """A generator seeded by names, the same on every machine.
 
     >>> generator_for(0, "mono", 3).initial_seed() == generator_for(0, "mono", 3).initial_seed()
     True

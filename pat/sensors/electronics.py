@@ -19,7 +19,6 @@ class Exposure(Step):
     gain: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The brighter or darker images, not clipped."""
         return image * self.gain
 
 
@@ -43,7 +42,6 @@ class Noise(Step):
             )
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The noisy images, not clipped."""
         if self.counts == "poisson":
             return self._counted(image, generator)
         variance = (image.clamp(min=0) * self.full_well + self.read**2) / self.full_well**2
@@ -58,10 +56,9 @@ class Noise(Step):
 
 @dataclass(frozen=True)
 class Clip(Step):
-    """Saturation: values held between 0 and 1."""
+    """Saturation: values clipped to 0..1."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The clipped images."""
         return image.clamp(0, 1)
 
 
@@ -72,7 +69,6 @@ class Quantise(Step):
     bits: int = 8
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The rounded images."""
         levels = 2**self.bits - 1
         clipped = image.clamp(0, 1)
         return clipped + ((clipped * levels).round() / levels - clipped).detach()
@@ -80,10 +76,10 @@ class Quantise(Step):
 
 @dataclass(frozen=True)
 class Jitter(Step):
-    """Cameras never agree: each image gets its own gain, gamma and white balance, then is clipped.
+    """A random gain, gamma and white balance for each image, clipped to 0..1.
 
     The logarithms of gain, gamma and of each channel's balance are normal with these standard deviations. Meant
-    for coded values.
+    for sRGB-encoded values.
     """
 
     gain: float = 0.05
@@ -91,7 +87,6 @@ class Jitter(Step):
     normalisation: float = 0.03
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The changed images."""
         b, c = image.shape[:2]
         gain = self.gain * normal((b, 1), image, generator) + self.normalisation * normal((b, c), image, generator)
         gamma = self.gamma * normal((b, 1, 1, 1), image, generator)

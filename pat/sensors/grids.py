@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from kornia.color import CFA, raw_to_rgb, rgb_to_raw
@@ -15,16 +13,11 @@ from torch.nn.functional import interpolate
 
 from arraygeom.pixels import HW, resize_matrix, shift_matrix
 
+from ..media.raw import demosaiced
 from .chain import Step
 
 Pattern = Literal["RGGB", "GRBG", "BGGR", "GBRG"]
 _KORNIA = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
-_OPENCV = {
-    "RGGB": cv2.COLOR_BayerRGGB2RGB_EA,
-    "GRBG": cv2.COLOR_BayerGRBG2RGB_EA,
-    "BGGR": cv2.COLOR_BayerBGGR2RGB_EA,
-    "GBRG": cv2.COLOR_BayerGBRG2RGB_EA,
-}
 
 
 @dataclass(frozen=True)
@@ -44,17 +37,14 @@ class Resample(Step):
             raise ValueError(f"resample: give a positive factor or a (height, width), got {self.to}")
 
     def hw(self, hw: HW) -> HW:
-        """The size that comes out for a size that goes in."""
         if isinstance(self.to, tuple):
             return self.to
         return max(round(hw[0] * self.to), 1), max(round(hw[1] * self.to), 1)
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """The resize matrix."""
         return resize_matrix(hw, self.hw(hw))
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
-        """The resized images."""
         h, w = image.shape[-2:]
         new = self.hw((h, w))
         if self.method == "bicubic":
@@ -79,7 +69,6 @@ class Crop(Step):
     hw: HW
 
     def pixel_matrix(self, hw: HW) -> Float[Tensor, "3 3"]:
-        """The shift."""
         return shift_matrix(self.left, self.top)
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h2 w2"]:
@@ -110,7 +99,7 @@ class Mosaic(Step):
 
 @dataclass(frozen=True)
 class Demosaic(Step):
-    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (OpenCV, on 16 bits, clipped).
+    """Colours from a raw image: bilinear (kornia; differentiable) or edge-aware (as raw images are developed).
 
     The gradient of "edge-aware" is that of "bilinear".
     """
@@ -127,9 +116,7 @@ class Demosaic(Step):
         bilinear = raw_to_rgb(image, _KORNIA[self.pattern])
         if self.method == "bilinear":
             return bilinear
-        raw = (image.detach().clamp(0, 1) * 65535).round().cpu().numpy().astype(np.uint16)
-        colours = np.stack([cv2.cvtColor(plane[0], _OPENCV[self.pattern]) for plane in raw])
-        edge_aware = torch.from_numpy(colours.astype(np.float32) / 65535).movedim(-1, 1).to(image)
+        edge_aware = torch.stack([demosaiced(raw, self.pattern) for raw in image.detach()])
         return bilinear + (edge_aware - bilinear).detach()
 
 

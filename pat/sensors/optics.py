@@ -15,12 +15,12 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
 
-from .chain import Light, LitStep, Step
+from .chain import LitStep, OpticalImage, Step
 
 
 @dataclass(frozen=True)
 class BoxBlur(Step):
-    """Mean over a square of an odd number of pixels; the border is continued."""
+    """Mean over a square of an odd number of pixels; the border is replicated."""
 
     width: int
 
@@ -29,7 +29,6 @@ class BoxBlur(Step):
             raise ValueError(f"the width of a box blur must be an odd number of pixels, got {self.width}")
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The blurred images."""
         kernel = image.new_full((self.width,), 1 / self.width)
         return _convolved(_convolved(image, kernel[None]), kernel[:, None])
 
@@ -41,7 +40,6 @@ class GaussianBlur(Step):
     sigma: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The blurred images."""
         r = math.ceil(4 * _value(self.sigma))
         x = torch.arange(-r, r + 1, dtype=image.dtype, device=image.device)
         kernel = torch.exp(-0.5 * (x / max(self.sigma, 1e-6)) ** 2)
@@ -56,7 +54,6 @@ class DiscBlur(Step):
     radius: float | Tensor
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The blurred images."""
         return _convolved(image, disc_kernel(self.radius, image))
 
 
@@ -65,9 +62,9 @@ class Defocus(LitStep):
     """Defocus by depth: a thin lens of `lens` mm at f / `f_number`, focused at `focus` metres.
 
     A point at depth z becomes a disc of diameter f_pixels (lens / f_number / 1000) |1 / focus - 1 / z| pixels (an
-    ellipse where fx and fy differ), or a Gaussian with the same variance. Light is spread from every pixel and
-    what is nearer covers what is farther; what the sharp image does not show behind an edge is filled from
-    around it. Needs depth and a camera. Differentiable in the image, and in depth through the size of the blur.
+    ellipse where fx and fy differ), or a Gaussian with the same variance. Every pixel scatters its light, and nearer
+    pixels occlude farther ones; what the sharp image lacks behind an edge is filled from around it. Needs depth and
+    a camera. Differentiable in the image, and in depth through the size of the blur.
     """
 
     focus: float
@@ -80,17 +77,16 @@ class Defocus(LitStep):
             if not getattr(self, name) > 0:
                 raise ValueError(f"defocus: {name} must be positive, got {getattr(self, name):g}")
 
-    def expose(self, light: Light, generator: Generator) -> Light:
-        """The defocused images."""
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         if light.depth is None or light.camera is None:
             raise ValueError(
                 "defocus needs the depth of every pixel and the camera: give record() `depth` and `camera`"
             )
         fx, fy = (light.camera.K[..., i, :2].norm(dim=-1) for i in (0, 1))
         diameter = circle_of_confusion(light.depth, self.focus, self.f_number, self.lens, fx.to(light.depth))
-        return replace(light, image=self._spread(light.image, diameter / 2, float((fy / fx).mean())))
+        return replace(light, image=self._diffused(light.image, diameter / 2, float((fy / fx).mean())))
 
-    def _spread(self, image: Tensor, radius: Tensor, aspect: float) -> Tensor:
+    def _diffused(self, image: Tensor, radius: Tensor, aspect: float) -> Tensor:
         """Bins of signed radii (near is positive), from the farthest to the nearest, each over those before."""
         levels = _levels(float(radius.detach().min()), float(radius.detach().max()))
         bins = torch.bucketize(radius.detach(), radius.new_tensor(levels[1:-1]), right=True)
@@ -100,8 +96,8 @@ class Defocus(LitStep):
             inside = (bins == i)[:, None].to(image)
             light = torch.cat([image, torch.ones_like(cover)], 1)
             near, far = (self._kernel(abs(levels[i + k]), aspect, image) for k in (1, 0))
-            spread = _convolved(inside * share * light, near) + _convolved(inside * (1 - share) * light, far)
-            colour, opacity = spread[:, :-1], spread[:, -1:]
+            scattered = _convolved(inside * share * light, near) + _convolved(inside * (1 - share) * light, far)
+            colour, opacity = scattered[:, :-1], scattered[:, -1:]
             seen, cover = colour + (1 - opacity) * seen, opacity + (1 - opacity) * cover
         return seen / cover.clamp(min=1e-6)
 
@@ -141,7 +137,7 @@ class MotionBlur(LitStep):
     """The mean over the time the shutter is open, `shutter` seconds, centred on the moment of the sharp image.
 
     Everything moves with `velocity` (x, y) in pixels a second, or each pixel with the motion given to `record`.
-    Looked up backwards along each pixel's own motion: exact where neighbours move alike. The border is continued.
+    Sampled backwards along each pixel's own motion: exact where neighbours move alike. The border is replicated.
     """
 
     shutter: float
@@ -151,19 +147,18 @@ class MotionBlur(LitStep):
         if self.shutter < 0:
             raise ValueError(f"motion blur: shutter is a time in seconds, got {self.shutter:g}")
 
-    def expose(self, light: Light, generator: Generator) -> Light:
-        """The blurred images."""
-        way = self.shutter * self._motion(light).movedim(1, -1)
-        steps = max(math.ceil(2 * float(way.detach().norm(dim=-1).max())), 1)
-        times = (torch.arange(steps, dtype=way.dtype) + 0.5) / steps - 0.5
-        grid = pixel_grid(light.hw, dtype=way.dtype, device=way.device)
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
+        path = self.shutter * self._motion(light).movedim(1, -1)
+        steps = max(math.ceil(2 * float(path.detach().norm(dim=-1).max())), 1)
+        times = (torch.arange(steps, dtype=path.dtype) + 0.5) / steps - 0.5
+        grid = pixel_grid(light.hw, dtype=path.dtype, device=path.device)
         limits = grid.new_tensor([light.hw[1] - 1, light.hw[0] - 1])
-        looked = (
-            sample(light.image, torch.minimum((grid - t * way).clamp(min=0), limits)).values for t in times.tolist()
+        frames = (
+            sample(light.image, torch.minimum((grid - t * path).clamp(min=0), limits)).values for t in times.tolist()
         )
-        return replace(light, image=torch.stack(list(looked)).mean(0))
+        return replace(light, image=torch.stack(list(frames)).mean(0))
 
-    def _motion(self, light: Light) -> Tensor:
+    def _motion(self, light: OpticalImage) -> Tensor:
         if self.velocity is not None:
             b, _, h, w = light.image.shape
             return light.image.new_tensor(self.velocity)[:, None, None].expand(b, 2, h, w)
@@ -183,15 +178,14 @@ class Vignetting(LitStep):
     falloff: tuple[float, ...] = ()
     natural: bool = False
 
-    def expose(self, light: Light, generator: Generator) -> Light:
-        """The darkened images."""
+    def expose(self, light: OpticalImage, generator: Generator) -> OpticalImage:
         grid = pixel_grid(light.hw, dtype=light.image.dtype, device=light.image.device)
         gain = self._falloff(grid, light)
         if self.natural:
             gain = gain * _cos4(grid, light.camera)
         return replace(light, image=light.image * gain.reshape(-1, 1, *light.hw))
 
-    def _falloff(self, grid: Tensor, light: Light) -> Tensor:
+    def _falloff(self, grid: Tensor, light: OpticalImage) -> Tensor:
         h, w = light.hw
         middle = grid.new_tensor([[(w - 1) / 2, (h - 1) / 2]])
         centre = middle if light.camera is None else light.camera.K[..., :2, 2].to(grid).reshape(-1, 2)
@@ -201,7 +195,7 @@ class Vignetting(LitStep):
 
 def _cos4(grid: Tensor, camera: Camera | None) -> Tensor:
     if camera is None:
-        raise ValueError("natural vignetting needs to know the rays: give record() the camera")
+        raise ValueError("natural vignetting needs the rays: give record() the camera")
     rays, _ = camera.to(grid).rays(grid.expand(*camera.K.shape[:-2], *grid.shape))
     return (rays[..., 2] / rays.norm(dim=-1)) ** 4
 
@@ -232,7 +226,7 @@ def _value(x: float | Tensor) -> float:
 
 
 def _convolved(image: Tensor, kernel: Tensor) -> Tensor:
-    """Each channel with the odd-sized kernel (kh, kw), the border continued."""
+    """Each channel with the odd-sized kernel (kh, kw), the border replicated."""
     h, w = kernel.shape
     planes = pad(image.flatten(0, 1)[:, None], (w // 2, w // 2, h // 2, h // 2), mode="replicate")
     return conv2d(planes, kernel[None, None]).view(image.shape)

@@ -1,13 +1,13 @@
 """Chains as lists in a file.
 
     mono:
-      - linear
+      - decode-srgb
       - spectral: luminance
       - defocus: {focus: 3, f_number: 2, lens: 25}
       - resample: 0.5
       - noise: {full_well: 8000, read: 3}
       - clip
-      - coded
+      - encode-srgb
       - quantise: 8
 
 A step is its name, or its name with its options; a single value is its first option. Steps are named as their
@@ -23,30 +23,31 @@ from typing import Any
 
 from pat.support.schema import from_document, near
 
-from .cases import Case
+from .cases import DegradationCase
 from .chain import Step
 from .electronics import Clip, Exposure, Jitter, Noise, Quantise
 from .grids import Crop, Demosaic, Mosaic, Resample
 from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting
-from .spectral import Coded, Gamma, Linear, Spectral
+from .spectral import DecodeSRGB, EncodeSRGB, Gamma, Spectral
 
 _CLASSES: tuple[type[Step], ...] = (
-    *(Linear, Coded, Gamma, Spectral, Exposure, Vignetting),
+    *(DecodeSRGB, EncodeSRGB, Gamma, Spectral, Exposure, Vignetting),
     *(BoxBlur, GaussianBlur, DiscBlur, Defocus, MotionBlur),
     *(Resample, Crop, Mosaic, Demosaic, Noise, Clip, Quantise, Jitter),
 )
-STEPS: dict[str, type[Step]] = {re.sub(r"(?<!^)(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
-"""Every step by its name in files."""
+STEPS: dict[str, type[Step]] = {re.sub(r"(?<=[a-z])(?=[A-Z])", "-", c.__name__).lower(): c for c in _CLASSES}
+STEPS |= {"linear": DecodeSRGB, "coded": EncodeSRGB}
+"""Every step by its name in files; "linear" and "coded" are former names of the sRGB conversions."""
 
 
 def read_chain(value: Any, where: str = "chain") -> tuple[Step, ...]:
     """The steps of a list as YAML has it. Raises ValueError naming the entry (`where`), with the nearest name.
 
-    >>> read_chain(["linear", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
-    (Linear(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
+    >>> read_chain(["decode-srgb", {"noise": {"full_well": 8000, "read": 3}}, {"quantise": 12}])
+    (DecodeSRGB(), Noise(full_well=8000.0, read=3.0, counts='gaussian'), Quantise(bits=12))
     """
     if not isinstance(value, list):
-        raise ValueError(f"{where}: wanted a list of steps, such as [linear, {{noise: {{full_well: 8000}}}}]")
+        raise ValueError(f"{where}: wanted a list of steps, such as [decode-srgb, {{noise: {{full_well: 8000}}}}]")
     return tuple(_step(entry, f"{where}[{i}]") for i, entry in enumerate(value))
 
 
@@ -57,21 +58,21 @@ def read_chains(value: Any, where: str = "sensors") -> dict[str, tuple[Step, ...
     return {str(name): read_chain(steps, f"{where}.{name}") for name, steps in value.items()}
 
 
-def read_cases(value: Any, where: str = "cases") -> tuple[Case, ...]:
+def read_cases(value: Any) -> tuple[DegradationCase, ...]:
     """Cases for pairs, from a list of mappings with `name` and, if degraded, `alpha` and `beta`."""
     if not isinstance(value, list) or not value:
-        raise ValueError(f"{where}: wanted a list of cases, such as [{{name: blur beta, beta: [{{box-blur: 5}}]}}]")
-    return tuple(_case(entry, f"{where}[{i}]") for i, entry in enumerate(value))
+        raise ValueError("cases: wanted a list of cases, such as [{name: blur beta, beta: [{box-blur: 5}]}]")
+    return tuple(_case(entry, f"cases[{i}]") for i, entry in enumerate(value))
 
 
-def _case(entry: Any, where: str) -> Case:
+def _case(entry: Any, where: str) -> DegradationCase:
     if not isinstance(entry, Mapping) or "name" not in entry:
         raise ValueError(f"{where}: wanted a mapping with name, alpha and beta")
     for key in entry:
         if key not in ("name", "alpha", "beta"):
             raise ValueError(f"{where}.{key}: unknown key{near(key, ('name', 'alpha', 'beta'))}")
     alpha, beta = (read_chain(entry.get(side, []), f"{where}.{side}") for side in ("alpha", "beta"))
-    return Case(str(entry["name"]), alpha, beta)
+    return DegradationCase(str(entry["name"]), alpha, beta)
 
 
 def _step(entry: Any, where: str) -> Step:

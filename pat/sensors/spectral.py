@@ -1,4 +1,4 @@
-"""Spectral responses, and the coding of light."""
+"""Spectral responses, and the encoding of light."""
 
 from __future__ import annotations
 
@@ -12,32 +12,30 @@ from torch import Generator, Tensor
 
 from arraygeom.sensor import Band, Curve
 
-from ..media.colour import linear_from_srgb, srgb_from_linear
+from ..media.colour import REC601, linear_from_srgb, srgb_from_linear
 from .chain import Step
 
 CHANNELS = ((600.0, 35.0), (540.0, 35.0), (460.0, 35.0), (850.0, 60.0))
-"""What the channels R, G, B and NIR of an ideal image are taken to hold: Gaussians, centre and sigma in nm."""
+"""Assumed responses of the channels R, G, B and NIR of an ideal image: Gaussians, centre and sigma in nm."""
 
 NAMES = ("rgb", "luminance", "nir")
-_REC601 = (0.299, 0.587, 0.114)
 _VISIBLE, _NEAR_INFRARED = (400.0, 700.0), (400.0, 1000.0)
 
 
 @dataclass(frozen=True)
-class Linear(Step):
-    """sRGB coding to linear light (IEC 61966-2-1)."""
+class DecodeSRGB(Step):
+    """sRGB values to linear light (IEC 61966-2-1)."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The linear values; the straight part of the curve continues below zero."""
+        """The linear values; the linear part of the curve continues below zero."""
         return linear_from_srgb(image)
 
 
 @dataclass(frozen=True)
-class Coded(Step):
-    """Linear light to sRGB coding, the inverse of `Linear`."""
+class EncodeSRGB(Step):
+    """Linear light to sRGB values, the inverse of `DecodeSRGB`."""
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The coded values."""
         return srgb_from_linear(image)
 
 
@@ -48,13 +46,12 @@ class Gamma(Step):
     gamma: float | Tensor = 2.2
 
     def apply(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
-        """The coded values."""
         return image.clamp(min=1e-8) ** (1 / self.gamma)
 
 
 @dataclass(frozen=True)
 class Spectral(Step):
-    """What a sensor with another spectral response sees of an RGB, or an RGB + NIR, image.
+    """The image of a sensor with another spectral response, from an RGB or an RGB + NIR image.
 
     "rgb" is the first three channels; "luminance" is Rec. 601 (0.299, 0.587, 0.114); "nir" is the fourth channel;
     a `Band` or a `Curve` is one channel: the channels taken as Gaussians (`CHANNELS`), weighted by how much of
@@ -82,7 +79,7 @@ class Spectral(Step):
 
     def _weights(self, channels: int) -> tuple[float, ...]:
         if self.response == "luminance":
-            return (*_REC601, 0.0)[:channels]
+            return (*REC601, 0.0)[:channels]
         if self.response == "nir":
             if channels == 3:
                 raise ValueError("the response 'nir' needs an image with a NIR channel, got RGB alone")
@@ -104,7 +101,7 @@ def band_weights(band: Band, channels: int = 3) -> tuple[float, ...]:
     low, high = _VISIBLE if channels == 3 else _NEAR_INFRARED
     if not low <= band.centre <= high:
         kind = "an RGB image" if channels == 3 else "an RGB + NIR image"
-        raise ValueError(f"{kind} tells nothing of a band at {band.centre:g} nm; use {low:g} to {high:g} nm")
+        raise ValueError(f"{kind} holds no band at {band.centre:g} nm; use {low:g} to {high:g} nm")
     own = (band.width / (8 * math.log(2)) ** 0.5) ** 2
     variances = [own + sigma**2 for _, sigma in CHANNELS[:channels]]
     exponents = [-((band.centre - c) ** 2) / (2 * v) for (c, _), v in zip(CHANNELS, variances)]

@@ -7,13 +7,13 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 
-from .scene import Board
+from .scene import BoardObject
 
 PIXELS = 112
 """Pixels a square of a drawn board; a multiple of the 7 modules of a 5x5 marker with its border."""
 
 
-def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
+def opencv_board(board: BoardObject) -> cv2.aruco.CharucoBoard:
     """The same board for OpenCV's detector. Raises ValueError for a dictionary it does not have."""
     code = getattr(cv2.aruco, board.dictionary, None)
     if code is None:
@@ -22,14 +22,14 @@ def opencv_board(board: Board) -> cv2.aruco.CharucoBoard:
     return cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
 
 
-def inner_corners(board: Board) -> Float[NDArray, "n 3"]:
+def inner_corners(board: BoardObject) -> Float[NDArray, "n 3"]:
     """The corners between squares in the board's frame, metres, row by row (as OpenCV numbers ChArUco's)."""
     columns, rows = board.squares
     y, x = np.mgrid[1:rows, 1:columns] * board.square
     return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
 
-def draw_board(board: Board) -> UInt8[NDArray, "h w"]:
+def draw_board(board: BoardObject) -> UInt8[NDArray, "h w"]:
     """The sheet, margins included: black and white, `PIXELS` a square."""
     columns, rows = board.squares
     if board.kind == "charuco":

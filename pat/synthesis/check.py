@@ -1,63 +1,33 @@
-"""Is a rendered array true, and worth having? Depth and cameras of one view must foretell what the others see."""
+"""Checks of a rendered array: depth and cameras of one view must predict what the others see."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import permutations
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from arraygeom.camera import Camera, Projected
+from arraygeom.camera import Camera
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
 from arraygeom.sampling import sample
 
-from .layered import ArrayBatch
 from .rendered import RenderedFrame
 from .surfaces import depth_between
 
 
-class Across(NamedTuple):
-    """For every pixel of one view: where its point is in another, whether it is seen there, and its colour there."""
-
-    x: Float[Tensor, "b h w 2"]
-    visible: Bool[Tensor, "b h w"]
-    image: Float[Tensor, "b 3 h w"]
-
-
-def look_across(batch: ArrayBatch, alpha: int = 0, beta: int = 1, *, tolerance: float = 0.01) -> Across:
-    """Follow every pixel of view `alpha` into view `beta` by its depth.
-
-    Visible means on beta's image and as far from beta as the surface recorded there, to the relative `tolerance`.
-    Inverse depth is interpolated, which is exact on planes; points beside an edge in beta count as not visible.
-    """
-    a, b = batch.cameras[alpha], batch.cameras[beta]
-    grid = pixel_grid(a.hw, device=batch.images[alpha].device).flatten(0, 1).expand(len(a.K), -1, 2)
-    x, depth, in_front = foretell(a, grid, batch.depth[alpha].flatten(1), b)
-    seen = sample(torch.cat([batch.images[beta], 1 / batch.depth[beta][:, None]], 1), x)
-    same = (seen.values[:, 3] * depth - 1).abs() < tolerance
-    visible = in_front & seen.valid & same
-    h, w = a.hw
-    return Across(x.unflatten(1, (h, w)), visible.unflatten(1, (h, w)), seen.values[:, :3].unflatten(2, (h, w)))
-
-
-def foretell(alpha: Camera, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"], beta: Camera) -> Projected:
-    """Where and how far away beta must see what alpha sees at pixels x at a depth."""
-    return beta.project(alpha.unproject(x, depth))
-
-
 @dataclass(frozen=True, kw_only=True)
-class Limits:
+class CheckLimits:
     """What a rendered scene must keep to.
 
     `error` bounds the 95th percentile, in pixels, of how far a point that both of two views see misses its pixel on
-    the way there and back by both depths; `shift` bounds the displacement, in pixels, of the colours that are
-    foretold; `contradicted` the share of points where a view looks through a surface
+    the way there and back by both depths; `shift` bounds the displacement, in pixels, of the predicted
+    colours; `contradicted` the share of points where a view looks through a surface
     that another one sees. `dark` and `bright` bound the share of pixels below 0.004 and above 1 in all colours.
     `texture` is the least share of 8x8 patches with contrast above 2 %, `overlap` the least share of a view's
     pixels that some other view sees.
@@ -73,8 +43,8 @@ class Limits:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
-    """Figures by view and by "alpha > beta", and what is wrong (nothing if accepted)."""
+class SceneCheck:
+    """Figures by view and by "alpha > beta", and the reasons for refusal (none if accepted)."""
 
     views: dict[str, dict[str, float]] = field(default_factory=dict)
     pairs: dict[str, dict[str, float]] = field(default_factory=dict)
@@ -82,7 +52,7 @@ class Report:
 
     @property
     def accepted(self) -> bool:
-        """Whether nothing is wrong."""
+        """Whether there is no reason for refusal."""
         return not self.reasons
 
     def to_document(self) -> dict[str, Any]:
@@ -90,31 +60,31 @@ class Report:
         return {"accepted": self.accepted, "reasons": list(self.reasons), "views": self.views, "pairs": self.pairs}
 
 
-def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: Limits | None = None) -> Report:
+def check_views(rig: Rig, frames: Mapping[str, RenderedFrame], limits: CheckLimits | None = None) -> SceneCheck:
     """Check one frame of every camera against each other and against the limits.
 
     Pairs of frames of different times are left out.
     """
-    limits = limits or Limits()
+    limits = limits or CheckLimits()
     views = {name: view_figures(frame) for name, frame in frames.items()}
     together = [(a, b) for a, b in permutations(frames, 2) if frames[a].time == frames[b].time]
     pairs = {f"{a} > {b}": pair_figures(_camera(rig, a), frames[a], _camera(rig, b), frames[b]) for a, b in together}
     reasons = [r for name, figures in views.items() for r in _view_reasons(name, figures, limits)]
     reasons += [r for name, figures in pairs.items() for r in _pair_reasons(name, figures, limits)]
     reasons += _overlap_reasons(pairs, {a for a, _ in together}, limits)
-    return Report(views=views, pairs=pairs, reasons=tuple(reasons))
+    return SceneCheck(views=views, pairs=pairs, reasons=tuple(reasons))
 
 
 def view_figures(frame: RenderedFrame) -> dict[str, float]:
     """Brightness, texture and depths of one image."""
-    there = frame.depth.isfinite()
-    depths = frame.depth[there] if there.any() else frame.depth.new_tensor([torch.inf])
+    finite = frame.depth.isfinite()
+    depths = frame.depth[finite] if finite.any() else frame.depth.new_tensor([torch.inf])
     figures = {
         "mean": frame.rgb.mean(),
         "dark": (frame.rgb.amax(0) < 0.004).float().mean(),
         "bright": (frame.rgb.amin(0) > 1).float().mean(),
         "texture": texture(frame.rgb),
-        "covered": there.float().mean(),
+        "covered": finite.float().mean(),
         "near": depths.min(),
         "far": depths.max(),
     }
@@ -122,10 +92,10 @@ def view_figures(frame: RenderedFrame) -> dict[str, float]:
 
 
 def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
-    """The share of patches whose luminance deviates by more than 2 % of its mean."""
-    luminance = rgb.mean(0)[None, None].clamp(0, 1)
-    mean = avg_pool2d(luminance, min(patch, *rgb.shape[1:]))
-    square = avg_pool2d(luminance**2, min(patch, *rgb.shape[1:]))
+    """The share of patches whose brightness deviates by more than 2 % of its mean."""
+    grey = rgb.mean(0)[None, None].clamp(0, 1)
+    mean = avg_pool2d(grey, min(patch, *rgb.shape[1:]))
+    square = avg_pool2d(grey**2, min(patch, *rgb.shape[1:]))
     deviation = (square - mean**2).clamp(min=0).sqrt()
     return (deviation > 0.02 * mean.clamp(min=0.01)).float().mean()
 
@@ -133,7 +103,7 @@ def texture(rgb: Float[Tensor, "3 h w"], patch: int = 8) -> Float[Tensor, ""]:
 def pair_figures(
     alpha: Camera, here: RenderedFrame, beta: Camera, there: RenderedFrame, *, most: int = 200_000
 ) -> dict[str, float]:
-    """How well alpha's depth foretells beta's view, at up to `most` pixels.
+    """How well alpha's depth predicts beta's view, at up to `most` pixels.
 
     `inside` is the share of alpha's pixels whose points are on beta's image; of all, `visible` are seen there,
     `hidden` lie behind something nearer, `contradicted` in front of what beta records. Points beside an edge in beta
@@ -143,19 +113,19 @@ def pair_figures(
     """
     alpha, beta = alpha.to(dtype=torch.float64), beta.to(dtype=torch.float64)
     x, depth, index = _chosen(here, most)
-    ahead = foretell(alpha, x, depth, beta)
+    ahead = beta.project(alpha.unproject(x, depth))
     inside = ahead.valid & beta.contains(ahead.x.nan_to_num(-1e9))
     if not inside.any():
         return {"inside": 0.0, "visible": 0.0, "hidden": 0.0, "contradicted": 0.0}
     total, x, index = len(depth), x[inside], index[inside]
-    target, foretold = ahead.x[inside], ahead.depth[inside]
+    target, predicted = ahead.x[inside], ahead.depth[inside]
     recorded, clean = depth_between(there.depth, there.index, target)
     clean = clean & recorded.isfinite()
-    recorded = torch.where(clean, recorded, foretold)
-    back = foretell(beta, target, recorded, alpha)
+    recorded = torch.where(clean, recorded, predicted)
+    back = alpha.project(beta.unproject(target, recorded))
     error = (back.x - x).norm(dim=-1)
     visible = clean & back.valid & (error < 1)
-    nearer = recorded < foretold
+    nearer = recorded < predicted
     figures = {
         "inside": inside.double().mean(),
         "visible": visible.sum() / total,
@@ -169,11 +139,11 @@ def pair_figures(
 
 
 def _chosen(frame: RenderedFrame, most: int) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixels that see something, evenly thinned: x (n, 2), depth and index."""
+    """Pixels with finite depth, evenly subsampled: x (n, 2), depth and index."""
     grid = pixel_grid((frame.depth.shape[0], frame.depth.shape[1]), dtype=torch.float64)
-    there = frame.depth.isfinite()
-    step = max(1, int(there.sum()) // most)
-    return grid[there][::step], frame.depth[there][::step].double(), frame.index[there][::step]
+    finite = frame.depth.isfinite()
+    step = max(1, int(finite.sum()) // most)
+    return grid[finite][::step], frame.depth[finite][::step].double(), frame.index[finite][::step]
 
 
 def _compared(
@@ -198,7 +168,7 @@ def _camera(rig: Rig, name: str) -> Camera:
     return camera
 
 
-def _view_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
+def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> list[str]:
     found = []
     if figures["dark"] > limits.dark:
         found.append(f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})")
@@ -209,7 +179,7 @@ def _view_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> li
     return found
 
 
-def _pair_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> list[str]:
+def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> list[str]:
     found = []
     if figures.get("p95", 0.0) > limits.error:
         found.append(f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})")
@@ -220,7 +190,7 @@ def _pair_reasons(name: str, figures: Mapping[str, float], limits: Limits) -> li
     return found
 
 
-def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: Limits) -> list[str]:
+def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: CheckLimits) -> list[str]:
     """Views of which no other view sees enough."""
     best = {n: max(f["visible"] for p, f in pairs.items() if p.startswith(f"{n} > ")) for n in sorted(names)}
     return [

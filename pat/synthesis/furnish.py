@@ -1,4 +1,4 @@
-"""Furnishes rooms: shapes, lights and walls around the cameras of a rig, from a seed."""
+"""Rooms with shapes, lights and walls around the cameras of a rig, from a seed."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from arraygeom.rig import Rig
 from .scene import Key, Light, Material, Motion, Object, Relief, Scene, Shape, Texture, TextureKind, Vec3, World
 
 DEPTHS = (2.0, 20.0)
-"""Near and far, metres, of scenes for rigs that state none."""
+"""Near and far, metres, of scenes for rigs without a depth range."""
 
 _SHAPES: tuple[Shape, ...] = ("plane", "cube", "sphere", "cylinder", "cone", "torus")
 _PATTERNS: tuple[TextureKind, ...] = ("voronoi", "magic", "brick", "checker", "noise", "wave")
@@ -28,7 +28,7 @@ _WALLS: tuple[TextureKind, ...] = ("voronoi", "brick", "noise", "wave", "magic")
 _IRRADIANCE = 5.0
 
 Surface = Callable[["Setting", float, tuple[TextureKind, ...]], Texture]
-"""Makes the texture of a surface that is so many metres away, of one of some kinds."""
+"""Makes the texture, of one of these kinds, of a surface at this depth (metres)."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class _Room:
 
 
 class Setting:
-    """The rig that looks, and the randomness of one scene."""
+    """The rig, and the random generator of one scene."""
 
     def __init__(self, rig: Rig, rng: Generator):
         self.rng = rng
@@ -65,7 +65,7 @@ class Setting:
         return max(float(c.K[:2, :2].abs().max()) for c in self.cameras)
 
     def metres(self, depth: float, pixels: float) -> float:
-        """What so many pixels are at a depth, in the camera that sees finest."""
+        """Width of so many pixels at a depth, in the camera with the finest resolution."""
         return float(pixels * depth / self.focal)
 
     def camera(self) -> Camera:
@@ -92,13 +92,13 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
     count = int(setting.rng.integers(10, 21))
     objects: list[Object] = []
     for _ in range(20 * count):
-        if len(objects) < count and (thing := _object(setting, room, objects, surface, moving)):
-            objects.append(thing)
+        if len(objects) < count and (item := _object(setting, room, objects, surface, moving)):
+            objects.append(item)
     walls = Material(texture=surface(setting, 0.8 * setting.far, _WALLS), roughness=0.9, specular=0.1)
-    place = Key(
+    key = Key(
         position=vec(room.centre), rotation=vec(Rotation.from_matrix(room.R).as_rotvec()), extent=vec(room.extent)
     )
-    objects.append(Object(name="room", shape="room", motion=Motion((place,)), material=walls))
+    objects.append(Object(name="room", shape="room", motion=Motion((key,)), material=walls))
     return Scene(
         objects=tuple(objects),
         lights=_lights(setting, room),
@@ -115,8 +115,8 @@ def furnished(name: str, seed: int, rig: Rig, surface: Surface, moving: float) -
 def _room(setting: Setting) -> _Room:
     """A room around the cameras, its walls between near and far along every camera's axis."""
     rng, camera = setting.rng, setting.cameras[0]
-    turn = Rotation.from_rotvec(np.radians(rng.uniform(-8, 8, 3)))
-    R = (turn * Rotation.from_matrix(camera.R.double().numpy())).as_matrix().T
+    rotation = Rotation.from_rotvec(np.radians(rng.uniform(-8, 8, 3)))
+    R = (rotation * Rotation.from_matrix(camera.R.double().numpy())).as_matrix().T
     local = (setting.centres - setting.centres[0]) @ R
     back = local[:, 2].min() - 2 * setting.near
     rays = [_rays(c) for c in setting.cameras]
@@ -125,7 +125,7 @@ def _room(setting: Setting) -> _Room:
     for _ in range(30):
         centre, extent = np.array([0, 0, (front + back) / 2]), np.array([2 * half[0], 2 * half[1], front - back])
         room = _Room(R, setting.centres[0] + R @ centre, extent)
-        nearest, farthest = _reach(room, setting.cameras, rays)
+        nearest, farthest = _wall_depths(room, setting.cameras, rays)
         if farthest <= 0.98 * setting.far and nearest >= setting.near:
             return room
         front = front if farthest <= 0.98 * setting.far else 0.93 * front
@@ -148,7 +148,7 @@ def _half_view(cameras: Sequence[Camera]) -> NDArray:
     return np.max(angles, axis=0)
 
 
-def _reach(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]) -> tuple[float, float]:
+def _wall_depths(room: _Room, cameras: Sequence[Camera], rays: Sequence[NDArray]) -> tuple[float, float]:
     """The least and the greatest depth at which cameras see the walls."""
     depths = []
     for camera, directions in zip(cameras, rays):
@@ -197,7 +197,7 @@ def _tinted(rng: Generator, light: Light) -> Light:
 
 
 def _object(setting: Setting, room: _Room, others: list[Object], surface: Surface, moving: float) -> Object | None:
-    """A shape at a random place in view, or None if the place drawn does not suit."""
+    """A shape at a random place in view, or None if the drawn position is unsuitable."""
     rng, camera = setting.rng, setting.camera()
     depth = float(1 / rng.uniform(1 / (0.75 * setting.far), 1 / (1.25 * setting.near)))
     centre = setting.ahead(camera, rng.uniform(-0.95, 0.95, 2), depth)
@@ -238,15 +238,15 @@ def _relief(rng: Generator, extent: NDArray) -> Relief:
 
 
 def _path(setting: Setting, start: Key, radius: float, duration: float) -> tuple[Key, ...]:
-    """Four keys, evenly spaced: steps up to the object's size, turns up to 60 degrees, a fifth longer or shorter."""
+    """Four keys, evenly spaced: steps up to its size, rotations up to 60 degrees, a fifth longer or shorter."""
     rng, keys = setting.rng, [start]
     for k in range(1, 4):
         position = np.asarray(keys[-1].position) + rng.normal(size=3) * 0.4 * radius
         if setting.nearest(position) - 1.2 * radius < setting.near:
             position = np.asarray(keys[-1].position)
-        turn = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(keys[-1].rotation)
+        rotation = Rotation.from_rotvec(np.radians(rng.uniform(-35, 35, 3))) * Rotation.from_rotvec(keys[-1].rotation)
         extent = np.asarray(start.extent) * rng.uniform(0.8, 1.2, 3)
-        key = Key(position=vec(position), rotation=vec(turn.as_rotvec()), extent=vec(extent), time=k * duration / 3)
+        key = Key(position=vec(position), rotation=vec(rotation.as_rotvec()), extent=vec(extent), time=k * duration / 3)
         keys.append(key)
     return tuple(keys)
 
@@ -266,11 +266,11 @@ def _material(rng: Generator, texture: Texture, pixel: float) -> Material:
 
 
 def seeded(name: str, seed: int) -> Generator:
-    """Randomness of its own for every generator and seed."""
+    """An independent random generator for every scene generator and seed."""
     return np.random.default_rng([zlib.crc32(name.encode()), seed])
 
 
 def vec(values: NDArray) -> Vec3:
-    """Three numbers as a scene keeps them."""
+    """Three numbers as a tuple, for a scene."""
     x, y, z = (float(v) for v in values)
     return x, y, z

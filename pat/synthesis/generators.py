@@ -18,8 +18,9 @@ from scipy.spatial.transform import Rotation
 from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 
+from ..media.colour import linear_from_srgb
 from .furnish import Setting, furnished, seeded, vec
-from .scene import Board, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
+from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -27,7 +28,7 @@ IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 def abstract(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """The paper's scenes: 10 to 20 shapes with patterns in a room, within the depths of the rig.
 
-    With `moving` seconds, objects move, turn and stretch along random paths for so long. The same seed and rig
+    With `moving` seconds, objects move, rotate and stretch along random paths for so long. The same seed and rig
     give the same scene. Raises ValueError if the rig has no calibrated camera.
     """
     return furnished("abstract", seed, rig, _pattern, moving)
@@ -51,7 +52,7 @@ def photographs(seed: int, rig: Rig, folder: str | Path, *, moving: float = 0.0)
     return furnished("photographs", seed, rig, image, moving)
 
 
-def board(poses: Sequence[Pose], spec: Board, *, seed: int = 0) -> Scene:
+def board(poses: Sequence[Pose], spec: BoardObject, *, seed: int = 0) -> Scene:
     """A calibration board that is at the k-th pose (world_from_board) at the time of k seconds.
 
     Render it with cameras of one frame a second for as many seconds as there are poses.
@@ -82,7 +83,7 @@ GENERATORS: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photograph
 """By name. All take a seed; "abstract" and "photographs" a rig."""
 
 
-def random_board_poses(rig: Rig, spec: Board, count: int, *, seed: int = 0) -> list[Pose]:
+def random_board_poses(rig: Rig, spec: BoardObject, count: int, *, seed: int = 0) -> list[Pose]:
     """Poses (world_from_board) in front of all cameras at once: near and far, to all sides, tilted up to 40 degrees.
 
     The board is from 0.6 to 1.1 times as long as the narrowest view is wide, and its middle is in every image.
@@ -108,13 +109,13 @@ def _pattern(setting: Setting, depth: float, kinds: tuple[TextureKind, ...]) -> 
 
 
 def _paints(rng: Generator) -> tuple[Paint, ...]:
-    """Two to four paints, by turns lighter and darker, of hues near each other or not."""
-    hue, spread, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
+    """Two to four paints, alternately lighter and darker, of similar hues or not."""
+    hue, width, dark_first = rng.uniform(), rng.choice([0.08, 0.5]), int(rng.integers(2))
     paints = []
     for i in range(int(rng.integers(2, 5))):
         value = rng.uniform(0.25, 0.5) if (i + dark_first) % 2 else rng.uniform(0.6, 0.95)
-        coded = colorsys.hsv_to_rgb((hue + rng.uniform(-spread, spread)) % 1, rng.uniform(0.1, 0.9), value)
-        r, g, b = (_linear(c) for c in coded)
+        encoded = colorsys.hsv_to_rgb((hue + rng.uniform(-width, width)) % 1, rng.uniform(0.1, 0.9), value)
+        r, g, b = linear_from_srgb(torch.tensor(encoded, dtype=torch.float64)).tolist()
         paints.append(Paint((r, g, b), _near_infrared(rng, (r, g, b))))
     return tuple(paints)
 
@@ -139,7 +140,7 @@ def _images(folder: Path) -> tuple[str, ...]:
 
 
 def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:
-    """One of the images, and if it can be helped none that is black in large parts."""
+    """One of the images, preferably none that is black in large parts."""
     drawn = [str(rng.choice(files)) for _ in range(8)]
     return next((file for file in drawn if _blackness(file) < 0.3), drawn[0])
 
@@ -149,11 +150,6 @@ def _blackness(file: str) -> float:
     """The share of pixels that are nearly black; 1 for what is no image."""
     small = cv2.imread(file, cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return 1.0 if small is None else float((small < 24).mean())
-
-
-def _linear(coded: float) -> float:
-    """sRGB to linear."""
-    return coded / 12.92 if coded <= 0.04045 else ((coded + 0.055) / 1.055) ** 2.4
 
 
 # Boards -----------------------------------------------------------------------------------------------------------
@@ -166,8 +162,8 @@ def _board_key(pose: Pose, middle: NDArray, extent: Vec3, time: float) -> Key:
     )
 
 
-def _board_pose(setting: Setting, spec: Board) -> Pose:
-    """The board faces the cameras' middle, turned and tilted; its middle is where every camera can see."""
+def _board_pose(setting: Setting, spec: BoardObject) -> Pose:
+    """The board faces the cameras' middle, rotated and tilted; its middle is visible to every camera."""
     rng = setting.rng
     narrow = max(float((c.K[:2, :2].abs().amax(1) / torch.tensor([c.hw[1], c.hw[0]])).max()) for c in setting.cameras)
     for _ in range(200):

@@ -5,31 +5,26 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-import cv2
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.atomic import write_atomically
-
+from ..media.colour import REC709, luminance, srgb_image
 from ..media.images import write_image
+from ..media.video import write_video
 from .rendered import Rendered, RenderedFrame
 
 Channels = Literal["bw", "rgb", "rgba", "nir"]
 Kind = Literal["png8", "png16", "jpeg", "exr"]
 
-REC709 = (0.2126, 0.7152, 0.0722)
-"""Weights of linear red, green and blue in luminance."""
-
 _SUFFIX = {"png8": ".png", "png16": ".png", "jpeg": ".jpg", "exr": ".exr"}
 
 
 def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels: Channels = "rgb") -> list[Path]:
-    """Write all frames of a rendered folder as images named like its arrays; the paths written.
+    """Write all frames of a rendered folder as images named like its arrays; returns the paths.
 
-    PNG and JPEG are sRGB and cut at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without the
-    pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
+    PNG and JPEG are sRGB and clipped at white; EXR (32-bit float) stays linear. Raises ValueError for "rgba" without
+    the pass "alpha", "nir" without the pass "nir", and "rgba" as JPEG.
     """
     written = []
     for name in rendered.rig.names:
@@ -40,12 +35,21 @@ def export(rendered: Rendered, out: str | Path, *, kind: Kind = "png8", channels
     return written
 
 
+def export_video(rendered: Rendered, camera: str, path: Path) -> None:
+    """The frames of a camera as a video (.mp4, .mkv), at its frame rate. Raises ValueError if there is only one."""
+    count = rendered.frames(camera)
+    if count < 2:
+        raise ValueError(f"camera '{camera}' has one frame: render with a duration")
+    frames = (srgb_image(rendered.frame(camera, k).rgb) for k in range(count))
+    write_video(path, frames, rate=rendered.rig[camera].sensor.frame_rate or 30.0)
+
+
 def light(frame: RenderedFrame, channels: Channels) -> Float[Tensor, "c h w"]:
     """The linear channels of a frame, colour multiplied by coverage in "rgba". Raises ValueError for missing passes."""
     if channels == "rgb":
         return frame.rgb
     if channels == "bw":
-        return (frame.rgb * frame.rgb.new_tensor(REC709)[:, None, None]).sum(0, keepdim=True)
+        return luminance(frame.rgb, REC709)
     extra = frame.nir if channels == "nir" else frame.alpha
     if extra is None:
         needed = "nir" if channels == "nir" else "alpha"
@@ -54,37 +58,14 @@ def light(frame: RenderedFrame, channels: Channels) -> Float[Tensor, "c h w"]:
 
 
 def write_light(path: Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> None:
-    """Write linear light to a file, whole or not at all, in the format its name ends in (.png, .jpg, .exr)."""
-    if path.suffix == ".exr":
-        _write_exr(path, image)
-    elif len(image) == 4:
-        _write_rgba(path, image, bits)
-    else:
-        write_image(path, coded(image), bits=bits)
+    """Write linear light, with its coverage if it has four channels, in the format its name ends in.
 
-
-def coded(light: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
-    """Linear light as sRGB, cut to 0..1."""
-    light = light.clamp(0, 1)
-    return torch.where(light <= 0.0031308, 12.92 * light, 1.055 * light.clamp(min=1e-9) ** (1 / 2.4) - 0.055)
-
-
-def _write_rgba(path: Path, image: Float[Tensor, "4 h w"], bits: int) -> None:
-    """PNG holds colours that are not multiplied by coverage."""
-    if path.suffix != ".png":
-        raise ValueError(f"{path}: only PNG and EXR hold coverage (rgba)")
-    colours = coded(image[:3] / image[3:].clamp(min=1e-6))
-    full = 2**bits - 1
-    planes = torch.cat([colours.flip(0), image[3:].clamp(0, 1)]).movedim(0, -1).mul(full).round().numpy()
-    with write_atomically(path) as temporary:
-        cv2.imwrite(str(temporary), planes.astype(np.uint8 if bits == 8 else np.uint16))
-
-
-def _write_exr(path: Path, image: Float[Tensor, "c h w"]) -> None:
-    import OpenEXR
-
-    name = {1: "Y", 3: "RGB", 4: "RGBA"}[len(image)]
-    planes = np.ascontiguousarray(image.float().movedim(0, -1).numpy())
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with write_atomically(path) as temporary:
-        OpenEXR.File(header, {name: planes[..., 0].copy() if name == "Y" else planes}).write(str(temporary))
+    .exr stays linear and multiplied by coverage; .png and .jpg are sRGB-encoded, and .png holds colours that are not
+    multiplied by coverage.
+    """
+    linear = path.suffix == ".exr"
+    coverage = image[3:] if len(image) == 4 else None
+    if linear:
+        return write_image(path, image[:3], bits=32, coverage=coverage)
+    colours = image if coverage is None else image[:3] / coverage.clamp(min=1e-6)
+    write_image(path, srgb_image(colours), bits=bits, coverage=coverage)

@@ -1,8 +1,8 @@
 """Scenes of layers: textured planes at random depths and slants with random outlines, seen by any cameras.
 
-A layer is a plane in the world with a painter: a camera with K = I that looks at it squarely from distance 1, so
+A layer is a plane in the world with a painter: a camera with K = I that faces it from distance 1, so
 that the painter's image is the plane itself in metres. The plane's homography from each view to the painter
-gives, at any pixel, the place on the plane and (as its third entry) the inverse depth: images, depth and
+gives, at any pixel, the position on the plane and (as its third entry) the inverse depth: images, depth and
 occlusion are exact, and no geometry is approximated. All surfaces are opaque and diffuse.
 """
 
@@ -32,27 +32,18 @@ _MAX_OVERSAMPLING = 4
 
 @dataclass(frozen=True)
 class ArrayBatch:
-    """Images and truth, one entry a camera, alpha first.
+    """Images and ground truth, one entry a camera, alpha first.
 
-    `images` 0..1 (sRGB as the photographs have it); `depth` in metres along each camera's own axis at the
-    pixels' centres; K, R and t are `cam_from_world`; `depth_range` holds bounds (near, far) of alpha's depths;
-    `index` says which layer is seen there, counted from 1.
+    `images` 0..1 (sRGB, as the photographs); `depth` in metres along each camera's own axis at the
+    pixels' centres; `cameras` are batched (B); `depth_range` holds bounds (near, far) of alpha's depths;
+    `index` is the number of the visible layer, from 1.
     """
 
     images: list[Float[Tensor, "b 3 _ _"]]
     depth: list[Float[Tensor, "b _ _"]]
-    K: list[Float[Tensor, "b 3 3"]]
-    R: list[Float[Tensor, "b 3 3"]]
-    t: list[Float[Tensor, "b 3"]]
-    hw: list[HW]
+    cameras: list[Camera]
     depth_range: Float[Tensor, "b 2"]
     index: list[Int[Tensor, "b _ _"]] = field(default_factory=list)
-
-    @property
-    def cameras(self) -> list[Camera]:
-        """The cameras, each batched (B)."""
-        poses = (Pose(R, t) for R, t in zip(self.R, self.t))
-        return [Camera(K=K, cam_from_world=p, hw=hw) for K, p, hw in zip(self.K, poses, self.hw)]
 
 
 class LayeredScenes:
@@ -97,8 +88,7 @@ class LayeredScenes:
         images, depth, index = zip(*(self._seen(layers, v, f) for v, f in zip(rigs.cameras, factors)))
         bounds = torch.stack(depth[0].flatten(1).aminmax(dim=1), -1)
         cameras = [c.to(device=self.device, dtype=torch.float32) for c in rigs.cameras]
-        K, R, t, hw = ([getattr(c, k) for c in cameras] for k in ("K", "R", "t", "hw"))
-        return ArrayBatch(list(images), list(depth), K, R, t, hw, bounds, list(index))
+        return ArrayBatch(list(images), list(depth), cameras, bounds, list(index))
 
     def _seen(self, layers: Layers, camera: Camera, factor: int) -> tuple[Tensor, Tensor, Tensor]:
         """Image, and depth at the pixels' centres and index of the surface that covers most of each pixel."""

@@ -1,4 +1,4 @@
-"""What is in a layered scene: random planes with their outlines, textures and colours."""
+"""The content of a layered scene: random planes with their outlines, textures and colours."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from torch import Generator, Tensor
 from arraygeom.camera import Camera
 from arraygeom.pose import Pose, matvec
 
+from ..media.colour import REC601
 from .photos import PhotoBank
 from .rigs import RigBatch, log_uniform, uniform
 
@@ -24,9 +25,9 @@ _GRAZING = 0.04
 class Layers:
     """The layers (B, L) of a batch of scenes, in float64 on the CPU.
 
-    A layer is the plane Z = 1 of its own frame, `plane_from_world`, where (X, Y) in metres are places on it. It
+    A layer is the plane Z = 1 of its own frame, `plane_from_world`, where (X, Y) in metres are positions on it. It
     covers all of that plane if `solid`, else the inside of an outline, which lives on [-1, 1]^2. Textures are
-    looked up at texels and their colours (r, g, b, 1) multiplied by `colour`.
+    sampled at texels and their colours (r, g, b, 1) multiplied by `colour`.
     """
 
     plane_from_world: Pose
@@ -65,7 +66,7 @@ def draw_layers(rigs: RigBatch, count: tuple[int, int], photos: PhotoBank, shape
 
 
 class _Planes(NamedTuple):
-    """Of each layer (B, L): the ray to its anchor, its normal, its reach in alpha's pixels, and so on."""
+    """Of each layer (B, L): the ray to its anchor, its normal, its radius in alpha's pixels, and so on."""
 
     ray: Tensor
     normal: Tensor
@@ -152,7 +153,7 @@ def _not_nearer(rigs: RigBatch, q: Tensor, normal: Tensor, ray: Tensor, radius: 
     """Inverse depths at the anchors, lowered where the slant would bring the plane nearer than `near`.
 
     The inverse depth of a plane grows by q |normal_xy| / (normal . ray) over one focal length of the image;
-    `radius` is how far the layer reaches, in alpha's pixels.
+    `radius` is the layer's radius in alpha's pixels.
     """
     slope = normal[..., :2].norm(dim=-1) / (normal * ray).sum(-1).clamp(min=1e-3)
     grown = 1 + slope * radius / rigs.cameras[0].K[:, :1, 0]
@@ -175,12 +176,12 @@ def _painters(normal: Tensor) -> Tensor:
 
 
 def _upright(R: Tensor) -> Tensor:
-    """The angle by which e1 is turned in the image."""
+    """The angle of e1 in the image."""
     return torch.atan2(R[..., 0, 1], R[..., 0, 0])
 
 
 def _affine(angle: Tensor, sx: Tensor, sy: Tensor) -> Tensor:
-    """Scale, then turn: a 3x3 matrix without shift."""
+    """Scale, then rotate: a 3x3 matrix without shift."""
     A = torch.eye(3, dtype=torch.float64).repeat(*angle.shape, 1, 1)
     c, s = angle.cos(), angle.sin()
     A[..., :2, :2] = torch.stack([c * sx, -s * sy, s * sx, c * sy], -1).unflatten(-1, (2, 2))
@@ -205,21 +206,21 @@ def _texture(
     other = torch.randint(len(photos), shape, generator=g)
     texture = torch.where(torch.rand(shape, generator=g) < 0.5, photo, other)
     s = log_uniform((0.5, 3.0), shape, g) / metres_per_pixel
-    turn = torch.where(torch.rand(shape, generator=g) < 0.8, 0.1, 3.0) * _randn(shape, g)
-    A = _affine(_upright(R) + turn, s * (torch.randint(2, shape, generator=g) * 2 - 1), s * facing.clamp(min=0.1))
+    angle = torch.where(torch.rand(shape, generator=g) < 0.8, 0.1, 3.0) * _randn(shape, g)
+    A = _affine(_upright(R) + angle, s * (torch.randint(2, shape, generator=g) * 2 - 1), s * facing.clamp(min=0.1))
     A[..., :2, 2] = uniform((0, 1), (*shape, 2), g) * photos.wh.cpu()[texture, 0]
     return texture, A
 
 
 _YCC_FROM_RGB = torch.tensor(
-    [[0.299, 0.587, 0.114], [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], dtype=torch.float64
+    [list(REC601), [-0.168736, -0.331264, 0.5], [0.5, -0.418688, -0.081312]], dtype=torch.float64
 )
 
 
 def _paint(shape: tuple[int, int], g: Generator) -> Tensor:
     """Affine colour maps (B, L, 3, 4) of the textures: contrast, brightness, hue, saturation and tint.
 
-    Half of the layers keep their hue; one in eight is nearly plain. Luminance does not tell the hue of the rest.
+    Half of the layers keep their hue; one in eight is nearly plain. The hue of the rest is independent of luminance.
     """
     natural = torch.rand(shape, generator=g) < 0.5
     plain = torch.rand(shape, generator=g) < 0.125

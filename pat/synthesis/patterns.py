@@ -1,26 +1,28 @@
-"""Textures that photographs lack: smooth shades, repeated patterns, and colour that luminance does not tell."""
+"""Textures that photographs lack: smooth shades, repeated patterns, and colour that is independent of luminance."""
 
 from __future__ import annotations
 
 import cv2
 import numpy as np
 
+from ..media.colour import REC601, to_bytes
+
 _SIDE = 256
-_LUMINANCE = np.array([0.299, 0.587, 0.114], np.float32)
+_LUMINANCE = np.array(REC601, np.float32)
 
 
 def patterns(rng: np.random.Generator, count: int) -> list[np.ndarray]:
-    """`count` textures (256, 256, 3) uint8, in turn gradients, stripes, tiles, dots and noise."""
+    """`count` textures (256, 256, 3) uint8, alternating gradients, stripes, tiles, dots and noise."""
     makers = (_gradient, _stripes, _tiles, _dots, _cloud)
-    return [_bytes(makers[i % len(makers)](rng)) for i in range(count)]
+    return [to_bytes(makers[i % len(makers)](rng)) for i in range(count)]
 
 
 def recoloured(images: list[np.ndarray], rng: np.random.Generator, count: int) -> list[np.ndarray]:
     """Textures with the luminance of one image and the chroma of another, or smooth, or without one of them.
 
-    What a network could learn of colour from luminance in photographs does not hold here.
+    The correlation of colour and luminance of photographs does not hold here.
     """
-    return [_bytes(_mixed(images, rng)) for _ in range(count)]
+    return [to_bytes(_mixed(images, rng)) for _ in range(count)]
 
 
 def _mixed(images: list[np.ndarray], rng: np.random.Generator) -> np.ndarray:
@@ -94,7 +96,3 @@ def _cloud(rng: np.random.Generator) -> np.ndarray:
         for k in range(1, 8)
     ]
     return _colours(rng, 1)[0] + 0.2 * sum(octaves)
-
-
-def _bytes(image: np.ndarray) -> np.ndarray:
-    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)

@@ -1,6 +1,6 @@
-"""A bank of photographs that stays in memory, looked up per pixel at the right level of detail.
+"""A bank of photographs in memory, sampled per pixel at the right level of detail.
 
-Textures repeat by mirroring, so that a plane may be as large as it likes. Each is kept with its pyramid of
+Textures repeat by mirroring, so that planes may be of any size. Each is stored with its pyramid of
 2x area averages as packed bytes (R + 256 G + 65536 B in one int32): one gather fetches one texel.
 """
 
@@ -52,9 +52,9 @@ class PhotoBank:
     ) -> PhotoBank:
         """All images under the folders, colour or grey, reduced to `max_edge` pixels, and patterns beside them.
 
-        `cache` names an .npz file (keep it outside the repository) that is written on the first call and read
-        on later ones; it is not checked against the folders. `choose` says by its number whether an image is
-        taken, to hold some out. Raises ValueError where no image is found.
+        `cache` names an .npz file that is written on the first call and read
+        on later ones; it is not checked against the folders. `choose` selects images by number, to hold
+        some out. Raises ValueError where no image is found.
         """
         images = _cached(cache) if cache and Path(cache).exists() else _read(folders, max_edge)
         if cache and not Path(cache).exists():

@@ -1,4 +1,4 @@
-"""A rendered scene on disk: images and truth of every camera, its rig, its description, how it was checked.
+"""A rendered scene on disk: images and ground truth of every camera, its rig, its description, its check.
 
 A folder holds `rig.yaml` (the rig as rendered), `scene.yaml`, `render.json` (settings, versions, frames, check) and
 one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `Frame` by name.
@@ -10,7 +10,6 @@ import dataclasses
 import json
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -27,18 +26,18 @@ from arraygeom.rig import Rig
 from .scene import Scene
 
 RENDER_FILE = "render.json"
-"""The last file written: a folder that has it is whole."""
+"""The last file written: a folder that has it is complete."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RenderedFrame:
-    """One image and its truth, at the pixels' centres.
+    """One image and its ground truth, at the pixels' centres.
 
     `rgb` is linear radiance (stored as float16, 1 is white by intent, brighter is possible), `nir` that of the near
     infrared, `alpha` how much of a pixel objects cover. `depth` is z in metres (float32), infinite where nothing
-    is. `index` is 0 where nothing is, else the object's place in the scene plus one. `normals` are unit vectors in
+    is. `index` is 0 where nothing is, else the object's number in the scene plus one. `normals` are unit vectors in
     the camera's frame; `flow` is how far each pixel's point moves in the image until the camera's next frame (for
-    one frame: 1/30 s). What a lens does not see has `depth` NaN and index 0.
+    one frame: 1/30 s). Pixels that a lens does not see have `depth` NaN and index 0.
     """
 
     time: float
@@ -53,13 +52,13 @@ class RenderedFrame:
 
 @dataclass(frozen=True)
 class Rendered:
-    """A rendered folder. Images are read when asked for."""
+    """A rendered folder. Images are read lazily."""
 
     folder: Path
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """What `render.json` says: `settings`, `versions`, `seconds`, `frames` and `check`."""
+        """The content of `render.json`: `settings`, `versions`, `seconds`, `frames` and `check`."""
         return dict(json.loads((self.folder / RENDER_FILE).read_text(encoding="utf-8")))
 
     @cached_property
@@ -74,7 +73,7 @@ class Rendered:
 
     @property
     def accepted(self) -> bool:
-        """Whether the self-check found nothing wrong."""
+        """Whether the check accepted it."""
         return bool(self.about["check"]["accepted"])
 
     def frames(self, camera: str) -> int:
@@ -88,17 +87,13 @@ class Rendered:
             tensors = {k: torch.from_numpy(arrays[k].astype(np.int64 if k == "index" else np.float32)) for k in arrays}
         return RenderedFrame(time=entry["time"], **tensors)
 
-    def first_frames(self) -> Mapping[str, RenderedFrame]:
-        """The first frame of every camera."""
-        return {name: self.frame(name) for name in self.rig.names}
-
 
 _STORED = {"rgb": np.float16, "nir": np.float16, "alpha": np.float16, "normals": np.float16, "index": np.uint16}
 _MOST = 6e4
 
 
 def save_frame(path: Path, frame: RenderedFrame) -> None:
-    """Write the arrays of a frame, on disk when this returns."""
+    """Write the arrays of a frame, synced to disk."""
     arrays: dict[str, NDArray] = {}
     for field in dataclasses.fields(frame):
         value = getattr(frame, field.name)
@@ -120,5 +115,5 @@ def frame_file(rig: Rig, camera: str, number: int = 0) -> str:
 
 
 def is_rendered(folder: str | Path) -> bool:
-    """Whether a folder holds a whole rendered scene."""
+    """Whether a folder holds a complete rendered scene."""
     return (Path(folder) / RENDER_FILE).is_file()

@@ -28,7 +28,7 @@ class RigBatch:
 
 @dataclass(frozen=True)
 class RigDistribution:
-    """What random rigs look like. Pairs are ranges; lengths are drawn evenly in their logarithm.
+    """A distribution of random rigs. Pairs are ranges; lengths are drawn evenly in their logarithm.
 
     - `mode`: "rectified" (betas displaced along x alone, their images resized copies of alpha's geometry, so
       that x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
@@ -40,7 +40,7 @@ class RigDistribution:
       of a batch.
     - `alpha`, rectified only: whether alpha is the left camera, the right, or either (one draw a rig).
     - general only: `focal_ratio` (on top of the resolution), `rotation` in degrees about a random axis,
-      `toe_in` (how far betas turn towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how far
+      `toe_in` (how far betas rotate towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how far
       beta's patch misses alpha's, as a fraction of its size).
     """
 
@@ -97,9 +97,9 @@ class RigDistribution:
         centre = self._baseline(alpha, near, g)[:, None] * _direction(batch, g)
         depth = 1 / torch.lerp(1 / far, 1 / near, uniform((0, 1), (batch,), g))
         target = _middle_ray(alpha) * depth[:, None]
-        turn = uniform(self.toe_in, (batch, 1), g) * _turn_towards(target - centre, target)
+        rotation = uniform(self.toe_in, (batch, 1), g) * _rotation_towards(target - centre, target)
         wobble = math.radians(self.rotation) * torch.randn(batch, 3, generator=g, dtype=torch.float64) / 2
-        R = rotation_from_vector(wobble) @ rotation_from_vector(turn)
+        R = rotation_from_vector(wobble) @ rotation_from_vector(rotation)
         t = -(R @ centre[..., None])[..., 0]
         K = alpha.K.clone()
         K[:, 0, 0] *= resolution * log_uniform(self.focal_ratio, (batch,), g)
@@ -139,8 +139,8 @@ def _middle_ray(camera: Camera) -> Tensor:
     return (torch.linalg.inv(camera.K) @ middle[:, None])[..., 0]
 
 
-def _turn_towards(direction: Tensor, old: Tensor) -> Tensor:
-    """Rotation vector that takes `direction` to where `old` was, so that beta sees it as alpha does."""
+def _rotation_towards(direction: Tensor, old: Tensor) -> Tensor:
+    """Rotation vector from `direction` to `old`, so that beta sees it as alpha does."""
     a, b = (v / v.norm(dim=-1, keepdim=True) for v in (direction, old))
     axis = torch.linalg.cross(a, b)
     sine = axis.norm(dim=-1, keepdim=True)

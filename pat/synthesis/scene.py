@@ -39,12 +39,12 @@ class Paint:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Board:
+class BoardObject:
     """A calibration target, printed in black on white.
 
     `squares` are (columns, rows) of `square` metres; a ChArUco board has markers of `marker` metres from an OpenCV
     `dictionary` in its white squares. `margin` metres of white surround it. Its frame has the origin at the outer
-    corner of the first square, x along the columns, y along the rows, z away from who looks at it (as OpenCV's).
+    corner of the first square, x along the columns, y along the rows, z away from the viewer (as OpenCV's).
     """
 
     kind: Literal["charuco", "chessboard"] = "charuco"
@@ -67,7 +67,7 @@ class Texture:
 
     Patterns live in the object's own coordinates in metres and have about `scale` features a metre; `offset`
     shifts them, `distortion` (0 to some) makes them irregular, `grain` (0..1) lays fine noise over them. They run
-    through the `paints` in order. A "image" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
+    through the `paints` in order. An "image" is a file (sRGB) whose width covers 1 / `scale` metres of the surface
     and which repeats beyond; it is multiplied by the first paint's colour. Its near infrared is its red plus
     1.5 times by how much green exceeds red and blue (leaves), times the paint's. A "board" fills its plane.
     """
@@ -79,7 +79,7 @@ class Texture:
     distortion: float = 0.0
     grain: float = 0.0
     image: str = ""
-    board: Board | None = None
+    board: BoardObject | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,7 +99,7 @@ class Material:
     emission: float = 0.0
 
 
-class Placement(NamedTuple):
+class ObjectPose(NamedTuple):
     """X_world = R diag(extent) X_object + position, for a shape that fills [-0.5, 0.5]^3."""
 
     R: Float[NDArray, "3 3"]
@@ -126,7 +126,7 @@ class Key:
 
 @dataclass(frozen=True)
 class Motion:
-    """Keys in order of time. Between them positions and extents change evenly and rotations turn evenly about an
+    """Keys in order of time. Between them positions and extents change evenly and rotations evenly about an
     axis; before the first and after the last nothing moves."""
 
     keys: tuple[Key, ...]
@@ -141,13 +141,13 @@ class Motion:
         """Whether nothing ever changes."""
         return all(replace(k, time=0.0) == replace(self.keys[0], time=0.0) for k in self.keys)
 
-    def at(self, time: float) -> Placement:
+    def at(self, time: float) -> ObjectPose:
         """Where the object is at a time in seconds."""
         a, b, fraction = self._between(time)
         start = Rotation.from_rotvec(a.rotation)
-        turn = (Rotation.from_rotvec(b.rotation) * start.inv()).as_rotvec()
-        R = (Rotation.from_rotvec(fraction * turn) * start).as_matrix()
-        return Placement(R, _mix(a.position, b.position, fraction), _mix(a.extent, b.extent, fraction))
+        rotation = (Rotation.from_rotvec(b.rotation) * start.inv()).as_rotvec()
+        R = (Rotation.from_rotvec(fraction * rotation) * start).as_matrix()
+        return ObjectPose(R, _mix(a.position, b.position, fraction), _mix(a.extent, b.extent, fraction))
 
     def _between(self, time: float) -> tuple[Key, Key, float]:
         after = next((i for i, k in enumerate(self.keys) if k.time > time), len(self.keys))
@@ -201,7 +201,7 @@ class Light:
 
 @dataclass(frozen=True)
 class World:
-    """Light from everywhere that no object blocks: radiance of red, green, blue and near infrared."""
+    """Light from all directions that no object blocks: radiance of red, green, blue and near infrared."""
 
     rgb: Vec3 = (0.0, 0.0, 0.0)
     nir: float = 0.0
@@ -209,7 +209,7 @@ class World:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """All there is to see. `depth` is (near, far) in metres, `generator` and `seed` say where the scene is from."""
+    """The content of a scene. `depth` is (near, far) in metres, `generator` and `seed` are its origin."""
 
     objects: tuple[Object, ...]
     lights: tuple[Light, ...] = ()
@@ -239,7 +239,7 @@ class Scene:
             raise ValueError(f"{source}: {error}") from None
 
     def save(self, path: str | Path) -> None:
-        """Write the scene file, whole or not at all."""
+        """Write the scene file atomically."""
         write_text(path, self.to_yaml())
 
     @classmethod

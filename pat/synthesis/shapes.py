@@ -37,7 +37,7 @@ class Mesh(NamedTuple):
 
 
 class _Surface(NamedTuple):
-    """A patch, how many cells it needs along s and t to look right, and whether corners that coincide are one.
+    """A patch, its cells along s and t, and whether corners that coincide are merged.
 
     They are not at the tip of a cone, where each has the normal of its own part of the side.
     """
@@ -47,24 +47,24 @@ class _Surface(NamedTuple):
     weld: bool = True
 
 
-def mesh(thing: Object) -> Mesh:
+def mesh(item: Object) -> Mesh:
     """The object's surface, relief included.
 
     Patches of a plain shape do not share corners, so that edges between them are sharp; those of a relief do.
     """
-    extent = np.asarray(thing.motion.keys[0].extent)
-    parts = [_part(s, extent, thing.relief) for s in SURFACES[thing.shape]]
-    if thing.relief is None:
-        return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, SURFACES[thing.shape])])
-    return _with_relief(_welded(_joined(parts), extent), thing.relief)
+    extent = np.asarray(item.motion.keys[0].extent)
+    parts = [_part(s, extent, item.relief) for s in SURFACES[item.shape]]
+    if item.relief is None:
+        return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, SURFACES[item.shape])])
+    return _with_relief(_welded(_joined(parts), extent), item.relief)
 
 
-def inside(thing: Object, point: Float[NDArray, "3"], time: float) -> bool:
+def inside(item: Object, point: Float[NDArray, "3"], time: float) -> bool:
     """Whether a point of the world is within a solid object, or about as near to it as its relief is high."""
-    place = thing.motion.at(time)
-    margin = thing.relief.height if thing.relief else 0.0
-    local = place.R.T @ (point - place.position) / (place.extent + 2 * margin)
-    return thing.shape in _INSIDE and bool(_INSIDE[thing.shape](*local))
+    placement = item.motion.at(time)
+    margin = item.relief.height if item.relief else 0.0
+    local = placement.R.T @ (point - placement.position) / (placement.extent + 2 * margin)
+    return item.shape in _INSIDE and bool(_INSIDE[item.shape](*local))
 
 
 def _part(surface: _Surface, extent: NDArray, relief: Relief | None) -> Mesh:
@@ -111,7 +111,7 @@ def _welded(loose: Mesh, extent: NDArray) -> Mesh:
 
 
 def _triangles_last(faces: NDArray, uv: NDArray) -> tuple[NDArray, NDArray]:
-    """Faces with two equal corners in a row turned so that these come last."""
+    """Faces with two equal adjacent corners rotated so that these come last."""
     faces, uv = faces.copy(), uv.copy()
     for i in range(3):
         rows = np.flatnonzero(faces[:, i] == faces[:, i + 1])
@@ -134,9 +134,9 @@ def _normals(surface: Mesh) -> NDArray:
     return total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-12)
 
 
-def _noise(points: NDArray, seed: int, waves: int = 24) -> NDArray:
+def _noise(points: NDArray, seed: int) -> NDArray:
     """Smooth noise in -1..1 with features about 1 across: plane waves of random directions."""
-    rng = np.random.default_rng(seed)
+    waves, rng = 24, np.random.default_rng(seed)
     direction = rng.normal(size=(waves, 3))
     direction *= (2 * np.pi * rng.uniform(0.35, 0.8, (waves, 1))) / np.linalg.norm(direction, axis=1, keepdims=True)
     total = np.cos(points @ direction.T + rng.uniform(0, 2 * np.pi, waves)).sum(1)
@@ -149,14 +149,14 @@ def _quad(origin: Vec3, along_s: Vec3, along_t: Vec3) -> Patch:
 
 
 def _sphere(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    polar, turn = np.pi * t, 2 * np.pi * s
-    return 0.5 * np.sin(polar) * np.cos(turn), -0.5 * np.cos(polar), 0.5 * np.sin(polar) * np.sin(turn)
+    polar, azimuth = np.pi * t, 2 * np.pi * s
+    return 0.5 * np.sin(polar) * np.cos(azimuth), -0.5 * np.cos(polar), 0.5 * np.sin(polar) * np.sin(azimuth)
 
 
 def _disc(y: float, sign: int) -> Patch:
     def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        turn = 2 * np.pi * s * sign
-        return 0.5 * t * np.cos(turn), np.full_like(s, y), 0.5 * t * np.sin(turn)
+        azimuth = 2 * np.pi * s * sign
+        return 0.5 * t * np.cos(azimuth), np.full_like(s, y), 0.5 * t * np.sin(azimuth)
 
     return patch
 
@@ -165,16 +165,16 @@ def _side(top: float) -> Patch:
     """The side of a cylinder (`top` 1) or cone (0) whose axis is y, its top at y = -0.5."""
 
     def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-        radius, turn = 0.5 * (top + (1 - top) * t), 2 * np.pi * s
-        return radius * np.cos(turn), t - 0.5, radius * np.sin(turn)
+        radius, azimuth = 0.5 * (top + (1 - top) * t), 2 * np.pi * s
+        return radius * np.cos(azimuth), t - 0.5, radius * np.sin(azimuth)
 
     return patch
 
 
 def _torus(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
-    turn, tube = 2 * np.pi * s, 2 * np.pi * t
+    azimuth, tube = 2 * np.pi * s, 2 * np.pi * t
     radius = 0.5 * (1 - TORUS) + 0.5 * TORUS * np.cos(tube)
-    return radius * np.cos(turn), 0.5 * np.sin(tube), radius * np.sin(turn)
+    return radius * np.cos(azimuth), 0.5 * np.sin(tube), radius * np.sin(azimuth)
 
 
 _CUBE = (

@@ -21,7 +21,7 @@ def depth_between(
     as a step or crease: how far, relatively, an inverse depth is from the middle of its neighbours'.
     """
     inverse = torch.where(depth.isfinite(), 1 / depth, 0.0).to(x)
-    layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _bends(inverse, uneven))])[None]
+    layers = torch.stack([inverse, index.to(x), *(b.to(x) for b in _creases(inverse, uneven))])[None]
     steps = x.new_tensor([[0, 0], [1, 0], [0, 1], [1, 1]]).reshape(4, *[1] * (x.ndim - 1), 2)
     corners = sample(layers, (x.floor() + steps)[None], interpolation="nearest").values[0]
     q, around, across, down = corners.unbind(0)
@@ -30,8 +30,8 @@ def depth_between(
     return 1 / sample(layers[:, :1], x[None]).values[0, 0], clean
 
 
-def _bends(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
-    """Where inverse depth bends or steps, along rows and along columns. Between two such pixels there is an edge."""
+def _creases(inverse: Float[Tensor, "h w"], uneven: float) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """Creases and steps of inverse depth, along rows and along columns. Between two such pixels there is an edge."""
     across, down = torch.zeros_like(inverse, dtype=torch.bool), torch.zeros_like(inverse, dtype=torch.bool)
     across[:, 1:-1] = inverse.diff(n=2, dim=1).abs() > uneven * inverse[:, 1:-1]
     down[1:-1] = inverse.diff(n=2, dim=0).abs() > uneven * inverse[1:-1]

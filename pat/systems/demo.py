@@ -1,4 +1,4 @@
-"""The sample array that ships with the package, and the report on its fusion."""
+"""The figure of the sample array's fusion."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from pathlib import Path
 from torch import Tensor
 
 from ..data.sample_array import ALPHA, BETA, SampleArray
-from ..fusion.results import Frame, colour_depth, save_panels
+from ..fusion.results import Frame
+from ..media.figures import colour_depth, save_panels
 
 
-def report_figure(sample: SampleArray, baseline: Tensor, frame: Frame, path: Path) -> None:
+def save_demo_figure(sample: SampleArray, baseline: Tensor, frame: Frame, path: Path) -> None:
     """One figure: inputs, the classical baseline, the fusion, ground truth, depth and confidence."""
     panels = {
         "alpha: mono": sample.images[ALPHA],

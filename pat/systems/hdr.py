@@ -1,4 +1,4 @@
-"""More range than one camera has: alpha's brightness merged with that of betas exposed otherwise."""
+"""High dynamic range: alpha's brightness merged with that of betas of other exposures."""
 
 from __future__ import annotations
 
@@ -9,49 +9,47 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import Camera, Rig, pixel_grid, sample
 
 from ..fusion.results import Frame
-from ..media.colour import linear_from_srgb
+from ..media.colour import linear_from_srgb, srgb_from_linear
 from ..media.raw import light_of
-from ..sensors import Coded
 
 WHITE = 0.97
-"""Values from here on count as cut off."""
+"""Values from here on count as saturated."""
 READ_NOISE = 1.5e-3
-"""Variance of reading over that of one white of light, for weighing exposures: typical of machine vision sensors."""
+"""Variance of the read noise over the shot noise at white, for weighting exposures: typical of machine vision."""
 
 
 def merged(frame: Frame, rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]], alpha: str) -> Frame:
-    """The fused frame with brightness from all cameras, coded as sRGB, above 1 where alpha's white is exceeded.
+    """The fused frame with brightness from all cameras, sRGB-encoded, above 1 where alpha's white is exceeded.
 
-    Betas, one band each, are looked up by the frame's depth. What alpha would read is a sum of those bands that are
-    not at white, fitted where no camera is; it is averaged with alpha's own reading by the noise and error that each
-    has, and takes its place where alpha is at white. `rig` says the exposures and gains. Raises ValueError if hardly
-    a point is within the range of all cameras.
+    Betas, one band each, are sampled at the frame's depth. Alpha's value is predicted as a weighted sum of the bands
+    that are not saturated, fitted where no camera is; it is averaged with alpha's own value by the noise and error of
+    each, and replaces it where alpha is saturated. `rig` has the exposures and gains. Raises ValueError if hardly a
+    point is within the range of all cameras.
     """
     own = linear_from_srgb(images[alpha])[0]
     names = [name for name in rig.betas(alpha) if name in images and images[name].shape[0] == 1]
     bands = torch.stack([_at_alpha(frame, rig, images[name], alpha, name) for name in names])
     scale = [light_of(rig[name].sensor, rig[alpha].sensor) for name in names]
     good = torch.stack([b.isfinite() & (b * s < WHITE) for b, s in zip(bands, scale)])
-    theirs, noise = _foretold(torch.where(good, bands, 0.0), good, scale, own)
-    believed = torch.where(noise.isfinite(), frame.confidence / noise, 0.0)
-    known = torch.where(own < WHITE, 1 / (own + READ_NOISE), 0.0)
-    total = believed + known
-    light = torch.where(total > 0, (believed * theirs + known * own) / total.clamp(min=1e-12), own)
-    light = torch.where((own >= WHITE) & noise.isfinite(), torch.maximum(theirs, own), light)
-    brighter = Coded().apply(light[None, None], Generator())[0] - images[alpha]
-    return frame._replace(image=frame.image + brighter)
+    predicted, noise = _predicted(torch.where(good, bands, 0.0), good, scale, own)
+    weight = torch.where(noise.isfinite(), frame.confidence / noise, 0.0)
+    own_weight = torch.where(own < WHITE, 1 / (own + READ_NOISE), 0.0)
+    total = weight + own_weight
+    light = torch.where(total > 0, (weight * predicted + own_weight * own) / total.clamp(min=1e-12), own)
+    light = torch.where((own >= WHITE) & noise.isfinite(), torch.maximum(predicted, own), light)
+    return frame._replace(image=frame.image + srgb_from_linear(light[None]) - images[alpha])
 
 
 def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> Float[Tensor, "h w"]:
-    """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or not on the image."""
+    """Linear light of a beta at alpha's pixels, by depth; NaN where it is not known or outside the image."""
     a, b = rig[alpha], rig[name]
     if not (isinstance(a, Camera) and isinstance(b, Camera)):
-        raise ValueError("merging exposures needs calibrated cameras: the depth tells where betas see a point")
+        raise ValueError("merging exposures needs calibrated cameras: betas are sampled by depth")
     X = a.to(torch.float32).unproject(pixel_grid(a.hw), frame.depth)
     x, _, valid = b.to(torch.float32).project(X)
     found = sample(linear_from_srgb(image)[None], torch.where(valid[..., None], x, -1e3)[None])
@@ -59,22 +57,22 @@ def _at_alpha(frame: Frame, rig: Rig, image: Tensor, alpha: str, name: str) -> F
 
 
 MISPLACED = 0.1
-"""Relative error that looking betas up by depth makes, besides that of the fit."""
+"""Relative error of sampling betas by depth, besides that of the fit."""
 FULL_WELL = 10_000.0
-"""Electrons at white, for weighing noise of light against errors of what is foretold."""
+"""Electrons at white, for weighting shot noise against errors of the prediction."""
 
 
-def _foretold(
+def _predicted(
     bands: Float[Tensor, "m h w"], good: Tensor, scale: Sequence[float], own: Float[Tensor, "h w"]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """What alpha would read by the bands that are good at a pixel, and the variance of that, in 1 / FULL_WELL.
+    """Alpha's value predicted from the bands that are good at a pixel, and its variance, in 1 / FULL_WELL.
 
     Where none is good the variance is infinite.
     """
     train = good.all(0) & (own < WHITE) & (own > 0.05)
     if train.sum() < 100:
         raise ValueError("exposures cannot be merged: hardly a point is within the range of all cameras")
-    theirs, noise = torch.zeros_like(own), torch.full_like(own, torch.inf)
+    predicted, noise = torch.zeros_like(own), torch.full_like(own, torch.inf)
     for count in range(len(bands), 0, -1):
         for chosen in combinations(range(len(bands)), count):
             some = list(chosen)
@@ -84,19 +82,19 @@ def _foretold(
             parts = zip(weights, [scale[i] for i in some], bands[some])
             variance = sum((w / s) ** 2 * (b * s + READ_NOISE) for w, s, b in parts) + FULL_WELL * (error * value) ** 2
             here = good[some].all(0) & noise.isinf()
-            theirs, noise = torch.where(here, value, theirs), torch.where(here, variance, noise)
-    return theirs, noise
+            predicted, noise = torch.where(here, value, predicted), torch.where(here, variance, noise)
+    return predicted, noise
 
 
 def _fit(bands: Float[Tensor, "m n"], own: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], float]:
-    """Weights of the bands that sum up to alpha's reading, and the median relative error of that."""
+    """Weights with which the bands sum up to alpha's value, and the median relative error of the sum."""
     relative = 1 / (own + 0.02)
     weights = torch.linalg.lstsq((bands * relative).T, (own * relative)[:, None]).solution[:, 0]
     return weights, float(((weights @ bands - own) * relative).abs().median())
 
 
-class Usable(NamedTuple):
-    """The darkest and the brightest light that an image tells, and their ratio in factors of two."""
+class DynamicRange(NamedTuple):
+    """The darkest and the brightest light that an image measures."""
 
     low: float
     high: float
@@ -108,22 +106,22 @@ class Usable(NamedTuple):
 
 
 def usable_range(
-    told: Sequence[Float[Tensor, "*n"]], ground_truth: Sequence[Float[Tensor, "*n"]], *, within: float = 0.25
-) -> Usable:
-    """The widest run of half-stops of true light in which an image's relative error (median) is `within` this.
+    measured: Float[Tensor, "*n"], ground_truth: Float[Tensor, "*n"], *, within: float = 0.25
+) -> DynamicRange:
+    """The widest run of half-stops of true light in which an image's median relative error is at most `within`.
 
     Raises ValueError if there is none.
     """
-    t, light = (torch.cat([v.flatten() for v in values]) for values in (told, ground_truth))
+    found, light = measured.flatten(), ground_truth.flatten()
     bins = (2 * light.clamp(min=1e-7).log2()).floor().long()
     runs: list[list[int]] = [[]]
     for i in range(int(bins.min()), int(bins.max()) + 1):
         here = bins == i
         if here.sum() < 50:
             continue
-        right = float(((t[here] - light[here]).abs() / light[here]).median()) <= within
+        right = float(((found[here] - light[here]).abs() / light[here]).median()) <= within
         runs = [*runs[:-1], [*runs[-1], i]] if right else [*runs, []]
     best = max(runs, key=len)
     if not best:
-        raise ValueError("the image tells no light anywhere")
-    return Usable(2 ** (best[0] / 2), 2 ** ((best[-1] + 1) / 2))
+        raise ValueError("the image measures no light within that error")
+    return DynamicRange(2 ** (best[0] / 2), 2 ** ((best[-1] + 1) / 2))

@@ -1,4 +1,4 @@
-"""What the systems look at: one layered scene, seen by any camera, in any light, at any time."""
+"""The layered scene of a system, rendered for any camera, in any light, at any time."""
 
 from __future__ import annotations
 
@@ -6,30 +6,29 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig
 from arraygeom.pose import matvec
+from pat.evaluation.ablation import sample_photographs
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.layers import Layers, draw_layers
-from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rigs import RigBatch, RigDistribution
 
-Seen = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
+RenderedView = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
 
 
 BAND = 4_000_000
 """Samples (pixels times oversampling) rendered at once: about 1.5 GiB with ten layers."""
 
 
-class Stage(LayeredScenes):
+class SystemScene(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
-    Textures are the images of a folder, or patterns and the images that scikit-image ships. The seed decides all.
+    Textures are the images of a folder, or patterns and the images that scikit-image ships; `seed` determines all.
     """
 
     def __init__(
@@ -56,8 +55,8 @@ class Stage(LayeredScenes):
         return camera.replace(K=camera.K[None], cam_from_world=Pose(pose.R[None], pose.t[None]), distortion=None)
 
     @torch.no_grad()
-    def seen(self, name: str, layers: Layers | None = None) -> Seen:
-        """The image (sRGB) and the depth that a camera sees, of the scene itself or of it changed.
+    def seen(self, name: str, layers: Layers | None = None) -> RenderedView:
+        """The image (sRGB) and the depth that a camera sees, of the scene itself or of changed layers.
 
         Large images are rendered in bands of rows, with a row around for the width of outlines.
         """
@@ -79,7 +78,7 @@ class Stage(LayeredScenes):
         return image, depth
 
     def painted(self, values: Sequence[float]) -> Layers:
-        """The scene with each layer of one grey value, 0..1, instead of its texture."""
+        """The scene with a grey value, 0..1, for each layer instead of its texture."""
         paint = torch.zeros_like(self.scene.colour)
         paint[..., 3] = torch.tensor(values, dtype=paint.dtype)[None, :, None]
         return dataclasses.replace(self.scene, colour=paint)
@@ -105,9 +104,4 @@ class Stage(LayeredScenes):
 
 
 def _textures(photos: Path | None, seed: int) -> PhotoBank:
-    if photos is not None:
-        return PhotoBank.load(photos, seed=seed)
-    from pat.data.make_sample import photographs
-
-    images = photographs()
-    return PhotoBank(images + patterns(np.random.default_rng(seed), 10), photos=len(images))
+    return PhotoBank.load(photos, seed=seed) if photos else sample_photographs(count=10, seed=seed)

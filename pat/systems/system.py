@@ -1,9 +1,8 @@
-"""Running a system: a scene is rendered for its rig, recorded, fused from files as a user's would be, and compared."""
+"""Runs a system: a scene is rendered for its rig, recorded to files, fused from them and compared."""
 
 from __future__ import annotations
 
 import importlib
-import itertools
 import json
 import os
 import subprocess
@@ -20,24 +19,25 @@ from jaxtyping import Float
 from safetensors import safe_open
 from safetensors.torch import save_file
 from tifffile import imread
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import Rig
 from arraygeom.atomic import write_atomically, write_text
 from arraygeom.io.native import write as rig_text
-from pat.evaluation.baseline import classical, classical_band_calibrated
+from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
+from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
-from pat.fusion.results import Frame, colour_depth, save_frame, save_panels, view_of
+from pat.fusion.results import Frame, save_frame, view_of
 from pat.fusion.sequence import ImageFiles, SequenceFusion, flicker
 from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
+from pat.media.figures import colour_depth, save_panels
 from pat.media.images import read_image, write_image
 from pat.media.raw import as_bright
 from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.sensors import Coded
 from pat.support.memory import watch_peak
 from pat.systems.hdr import merged, usable_range
 
@@ -45,10 +45,10 @@ NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
 
 
 @dataclass(frozen=True)
-class Recording:
-    """What the cameras recorded: raw values 0..1 by camera, frame by frame; alpha's view in truth (sRGB).
+class SystemRecording:
+    """Raw values 0..1 by camera, frame by frame, and the ground truth: alpha's view (sRGB).
 
-    `light` is the linear light that each camera saw, on alpha's scale, where that is asked about.
+    `light` is the linear light that each camera received, on alpha's scale, for systems that need it.
     """
 
     raw: Mapping[str, list[Float[Tensor, "_ _ _"]]]
@@ -56,22 +56,22 @@ class Recording:
     light: Mapping[str, Float[Tensor, "1 _ _"]] = field(default_factory=dict)
 
     @property
-    def known(self) -> dict[str, Tensor]:
+    def reference(self) -> dict[str, Tensor]:
         """All but the raw images, by name."""
-        ground_truth = {f"truth {i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)}
-        return ground_truth | {f"light {name}": image.contiguous() for name, image in self.light.items()}
+        ground_truth = {f"ground truth/{i:03d}": image.contiguous() for i, image in enumerate(self.ground_truth)}
+        return ground_truth | {f"light/{name}": image.contiguous() for name, image in self.light.items()}
 
     @classmethod
-    def of(cls, known: Mapping[str, Tensor]) -> Recording:
-        """What `known` was of, without the raw images."""
-        kinds = {name.partition(" ")[::2]: tensor for name, tensor in known.items()}
-        ground_truth = [kinds[key] for key in sorted(kinds) if key[0] == "truth"]
+    def of(cls, reference: Mapping[str, Tensor]) -> SystemRecording:
+        """The recording of a `reference`, without the raw images."""
+        kinds = {name.partition("/")[::2]: tensor for name, tensor in reference.items()}
+        ground_truth = [kinds[key] for key in sorted(kinds) if key[0] == "ground truth"]
         return cls({}, ground_truth, {name: tensor for (kind, name), tensor in kinds.items() if kind == "light"})
 
 
 @dataclass(frozen=True)
-class System:
-    """One of the paper's arrays: its rig at full size, and how it is run (see the modules of the four)."""
+class ArraySystem:
+    """One of the paper's arrays: its rig at full size, and the module that renders and records it."""
 
     name: str
     rig: Rig
@@ -79,7 +79,7 @@ class System:
 
     @property
     def title(self) -> str:
-        """What it is, in a line."""
+        """A line of description."""
         return str(self.module.TITLE)
 
     @property
@@ -89,7 +89,7 @@ class System:
 
     @property
     def expected(self) -> str:
-        """The figures that `run` gave when they were last looked at, at reduced size."""
+        """The table that `run_system` gave at reduced size when it was last recorded."""
         file = Path(self.module.__file__ or "").with_name("expected.md")
         return file.read_text(encoding="utf-8") if file.is_file() else ""
 
@@ -102,19 +102,19 @@ class System:
         return rig
 
 
-class Result(NamedTuple):
+class SystemResult(NamedTuple):
     """The table that was written, and the files."""
 
     table: str
     written: list[Path]
 
 
-def load_system(name: str) -> System:
-    """A system by name. Raises ValueError naming those there are."""
+def load_system(name: str) -> ArraySystem:
+    """A system by name. Raises ValueError listing the names."""
     if name not in NAMES:
         raise ValueError(f"no system '{name}': there are {', '.join(NAMES)}")
     module = importlib.import_module(f"pat.systems.{name.replace('-', '_')}")
-    return System(name, Rig.load(Path(module.__file__ or "").with_name("rig.yaml")), module)
+    return ArraySystem(name, Rig.load(Path(module.__file__ or "").with_name("rig.yaml")), module)
 
 
 def run_system(
@@ -127,7 +127,7 @@ def run_system(
     weights: str = "mono-colour",
     max_memory: str | None = None,
     say: Callable[[str], None] = lambda text: None,
-) -> Result:
+) -> SystemResult:
     """Render, record, fuse and compare; inputs, images, figure.png and scores.md go to `out`.
 
     At `full` size, or at `scale` times the reduced one, which is minutes on two cores; half of it is seconds.
@@ -138,16 +138,16 @@ def run_system(
     recording, files = recorded(system, rig, out / "inputs", photos=photos, say=say)
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
-    how = How(weights, max_memory, say)
+    how = FusionOptions(weights, max_memory, say)
     lines, panels = run(how, system, rig, files, recording, out)
     save_panels(panels, out / "figure.png", columns=4)
     table = "\n".join(lines) + "\n"
     write_text(out / "scores.md", table)
-    return Result(table, sorted(p for p in out.iterdir() if p.is_file()))
+    return SystemResult(table, sorted(p for p in out.iterdir() if p.is_file()))
 
 
-class How(NamedTuple):
-    """With which weights to fuse, in what memory, and who is told."""
+class FusionOptions(NamedTuple):
+    """Weights, memory limit, progress callback."""
 
     weights: str
     max_memory: str | None
@@ -155,27 +155,27 @@ class How(NamedTuple):
 
 
 def recorded(
-    system: System, rig: Rig, out: Path, *, photos: Path | None, say: Callable[[str], None]
-) -> tuple[Recording, dict[str, list[Path]]]:
-    """What the cameras record of the system's scene, and the files: rendered, unless it was before."""
-    from .stage import Stage
+    system: ArraySystem, rig: Rig, out: Path, *, photos: Path | None, say: Callable[[str], None]
+) -> tuple[SystemRecording, dict[str, list[Path]]]:
+    """The recording of the system's scene, and its files; rendered unless it was before with the same settings."""
+    from .stage import SystemScene
 
-    module, kept = system.module, out / "recorded.safetensors"
+    module, cache = system.module, out / "recorded.safetensors"
     key = f"{system.name}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
-    if kept.is_file():
-        with safe_open(kept, "pt") as file:
+    if cache.is_file():
+        with safe_open(cache, "pt") as file:
             if file.metadata()["key"] == key:
-                say(f"taking the recording in {out}")
+                say(f"using the recording in {out}")
                 counts = json.loads(file.metadata()["counts"])
-                return Recording.of({name: file.get_tensor(name) for name in file.keys()}), _files(out, counts)  # noqa: SIM118
+                return SystemRecording.of({name: file.get_tensor(name) for name in file.keys()}), _files(out, counts)  # noqa: SIM118
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
-    kept.unlink(missing_ok=True)
-    stage = Stage(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
+    cache.unlink(missing_ok=True)
+    stage = SystemScene(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
     recording = module.record_scene(stage)
     write_recording(recording, rig, out)
     counts = {name: len(images) for name, images in recording.raw.items()}
-    with write_atomically(kept) as temporary:
-        save_file(recording.known, temporary, {"key": key, "counts": json.dumps(counts)})
+    with write_atomically(cache) as temporary:
+        save_file(recording.reference, temporary, {"key": key, "counts": json.dumps(counts)})
     return recording, _files(out, counts)
 
 
@@ -183,8 +183,8 @@ def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:
     return {name: [out / f"{name}_{i:03d}.png" for i in range(count)] for name, count in counts.items()}
 
 
-def write_recording(recording: Recording, rig: Rig, out: Path) -> None:
-    """The images as cameras store them, 16 bits with the counts of the rig's, the truth, and the rig."""
+def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> None:
+    """The raw images as 16-bit files with the rig's counts, the ground truth, and the rig."""
     out.mkdir(parents=True, exist_ok=True)
     rig.save(out / "rig.yaml")
     for name, images in recording.raw.items():
@@ -193,14 +193,20 @@ def write_recording(recording: Recording, rig: Rig, out: Path) -> None:
             counts = (image.clamp(0, 1) * white).round()
             write_image(out / f"{name}_{i:03d}.png", counts / 65535, bits=16)
     for i, image in enumerate(recording.ground_truth):
-        write_image(out / f"truth_{i:03d}.png", image, bits=16)
+        write_image(out / f"ground_truth_{i:03d}.png", image, bits=16)
 
 
 Panels = dict[str, Tensor]
+ImagePaths = Mapping[str, list[Path]]
 
 
 def _still(
-    how: How, system: System, rig: Rig, files: Mapping[str, list[Path]], recording: Recording, out: Path
+    how: FusionOptions,
+    system: ArraySystem,
+    rig: Rig,
+    files: Mapping[str, list[Path]],
+    recording: SystemRecording,
+    out: Path,
 ) -> tuple[list[str], Panels]:
     alpha, ground_truth = system.alpha, recording.ground_truth[0]
     first = {name: paths[0] for name, paths in files.items()}
@@ -227,13 +233,15 @@ def _still(
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
     white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
-    panels |= {"truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
+    panels |= {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
     panels |= {"depth (bright is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
-    return [*_table(rows, ground_truth, white), *_known_where(frame, ground_truth), *extra, *memory], panels
+    return [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth), *extra, *memory], panels
 
 
-def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out: Path) -> tuple[Frame, list[str]]:
-    """A frame fused by `pat fuse` in a process of its own, and what that took, as lines of text."""
+def fused_apart(
+    how: FusionOptions, rig: Path, files: Mapping[str, Path], alpha: str, out: Path
+) -> tuple[Frame, list[str]]:
+    """A frame fused by `pat fuse` in a process of its own, and its memory and time, as lines of text."""
     images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
     command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", alpha, *images, "--out", str(out)]
     command += ["--bits", "16", "--weights", how.weights, "--max-memory", str(how.max_memory)]
@@ -257,7 +265,12 @@ def fused_apart(how: How, rig: Path, files: Mapping[str, Path], alpha: str, out:
 
 
 def _sequence(
-    how: How, system: System, rig: Rig, files: Mapping[str, list[Path]], recording: Recording, out: Path
+    how: FusionOptions,
+    system: ArraySystem,
+    rig: Rig,
+    files: Mapping[str, list[Path]],
+    recording: SystemRecording,
+    out: Path,
 ) -> tuple[list[str], Panels]:
     alpha, network = system.alpha, load_weights(how.weights)
     frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
@@ -279,11 +292,15 @@ def _sequence(
     }
     lines = [
         *_sequence_table(methods, recording.ground_truth, greys),
-        *_known_where(fused[2], recording.ground_truth[2]),
+        *_confidence_line(fused[2], recording.ground_truth[2]),
     ]
     i = next(i for i in range(len(fused)) if i not in colours)
     first = next(name for name in rig.betas(alpha))
-    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0], "truth": recording.ground_truth[i]}
+    panels = {
+        f"alpha, frame {i}": greys[i],
+        f"beta {first}": frames[first][0],
+        "ground truth": recording.ground_truth[i],
+    }
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
     panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
     return lines, panels
@@ -293,45 +310,25 @@ def _images(job: SequenceFusion, i: int) -> dict[str, Tensor]:
     return {job.alpha: job.grey(i), **{n: job.frames[n][j] for n, j in job.timeline.at(i).items()}}
 
 
-def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Float[Tensor, "3 h w"]:
-    """The classical fusion: with the one colour beta, or with each of the betas that see one band."""
-    betas = [name for name in rig.betas(alpha) if name in images]
-    if images[betas[0]].shape[0] == 3:
-        return classical(rig, dict(images), alpha, betas[0])
-    return torch.cat([_band(rig, images, alpha, name) for name in betas])
-
-
-def _band(rig: Rig, images: Mapping[str, Tensor], alpha: str, name: str) -> Tensor:
-    pair = rig.pair(alpha, name)
-    (a, b), pose = pair.cameras, pair.beta_from_alpha
-    near, far = (float(d) for d in pair.depth_range)
-    return classical_band_calibrated(images[alpha], images[name], a.K, b.K, pose.R, pose.t, depth=(near, far))
-
-
 def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:
-    lines = ["| | PSNR, dB | SSIM |", "| --- | ---: | ---: |"]
-    for name, image in rows.items():
-        found = score((image / white).clamp(0, 1), ground_truth / white)
-        lines.append(f"| {name} | {found.psnr:.2f} | {found.ssim:.4f} |")
-    return lines
+    scores = {name: score((image / white).clamp(0, 1), ground_truth / white) for name, image in rows.items()}
+    cells = [(name, f"{found.psnr:.2f}", f"{found.ssim:.4f}") for name, found in scores.items()]
+    return markdown_table(["", "PSNR, dB", "SSIM"], cells).splitlines()
 
 
 def _sequence_table(methods: Mapping[str, list[Tensor]], ground_truth: list[Tensor], greys: list[Tensor]) -> list[str]:
-    lines = ["| | PSNR, dB | lowest | SSIM | flicker x 1000 |", "| --- | ---: | ---: | ---: | ---: |"]
-    for name, images in {**methods, "truth": ground_truth}.items():
+    rows = []
+    for name, images in methods.items():
         scores = [score(p.clamp(0, 1), t) for p, t in zip(images, ground_truth)]
-        levels, ssim = [s.psnr for s in scores], sum(s.ssim for s in scores) / len(scores)
-        shown = f"{1000 * flicker(images, greys):.2f}"
-        figures = (
-            ("", "", "")
-            if name == "truth"
-            else (f"{sum(levels) / len(levels):.2f}", f"{min(levels):.2f}", f"{ssim:.4f}")
-        )
-        lines.append(f"| {name} | {' | '.join(figures)} | {shown} |")
+        psnr, ssim = ([getattr(s, kind) for s in scores] for kind in ("psnr", "ssim"))
+        figures = (f"{sum(psnr) / len(psnr):.2f}", f"{min(psnr):.2f}", f"{sum(ssim) / len(ssim):.4f}")
+        rows.append((name, *figures, f"{1000 * flicker(images, greys):.2f}"))
+    rows.append(("ground truth", "", "", "", f"{1000 * flicker(ground_truth, greys):.2f}"))
+    table = markdown_table(["", "PSNR, dB", "lowest", "SSIM", "flicker x 1000"], rows)
     return [
         "Means over the frames; flicker is the mean change of chroma from frame to frame where nothing moves.",
         "",
-        *lines,
+        *table.splitlines(),
     ]
 
 
@@ -339,49 +336,38 @@ WRONG = 0.1
 """Chroma farther off than this counts as a wrong colour."""
 
 
-def _known_where(frame: Frame, ground_truth: Tensor) -> list[str]:
-    """Whether confidence knows where colour is wrong: among the surest and the least sure quarter of the pixels."""
+def _confidence_line(frame: Frame, ground_truth: Tensor) -> list[str]:
+    """Shares of wrong colours among the quarters of the pixels with the highest and the lowest confidence."""
     off = (to_luma_chroma(frame.image)[1] - to_luma_chroma(ground_truth)[1]).abs().amax(0).flatten()
     order = frame.confidence.flatten().argsort()
     quarter = len(order) // 4
-    sure, doubtful = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
-    return ["", f"Wrong colours: {sure:.1%} of the quarter where confidence is highest, {doubtful:.1%} where lowest."]
+    high, low = (float((off[part] > WRONG).float().mean()) for part in (order[-quarter:], order[:quarter]))
+    return ["", f"Wrong colours: {high:.1%} of the quarter where confidence is highest, {low:.1%} where lowest."]
 
 
 def _ranges(
-    rig: Rig, recording: Recording, images: Mapping[str, Tensor], frame: Frame, joint: Frame, alpha: str
+    rig: Rig, recording: SystemRecording, images: Mapping[str, Tensor], frame: Frame, joint: Frame, alpha: str
 ) -> list[str]:
-    """A table of the range of light that each image tells right to a quarter."""
-    lines = ["", "| light told right to a quarter | darkest | brightest | stops |", "| --- | ---: | ---: | ---: |"]
-    told = {name: (linear_from_srgb(images[name])[0], recording.light[name][0]) for name in rig.names}
+    """A table of the range of light that each image measures with an error of at most a quarter."""
+    measured = {name: (linear_from_srgb(images[name])[0], recording.light[name][0]) for name in rig.names}
     ground_truth = linear_from_srgb(recording.ground_truth[0])
     for name, image in {"fusion": frame.image, "fusion, exposures merged": joint.image}.items():
-        told[name] = (luminance(linear_from_srgb(image.clamp(min=0)))[0], luminance(ground_truth)[0])
-    for name, (value, light) in told.items():
-        found = usable_range([value], [light])
-        lines.append(f"| {name} | {found.low:.4f} | {found.high:.3f} | {found.stops:.1f} |")
-    return lines
+        measured[name] = (luminance(linear_from_srgb(image.clamp(min=0)))[0], luminance(ground_truth)[0])
+    ranges = {name: usable_range(value, light) for name, (value, light) in measured.items()}
+    rows = [(name, f"{r.low:.4f}", f"{r.high:.3f}", f"{r.stops:.1f}") for name, r in ranges.items()]
+    columns = ["light measured to a quarter", "darkest", "brightest", "stops"]
+    return ["", *markdown_table(columns, rows).splitlines()]
 
 
 def _permuted(network: FusionNetwork, rig: Rig, images: Mapping[str, Tensor], alpha: str, frame: Frame) -> list[str]:
     """How far a fusion with the betas in another order differs from the same fusion with its bands reordered."""
     betas = rig.betas(alpha)
     order = [2, 0, 1]
-    turned = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})
-    other = fuse(network, turned, images, alpha=alpha).image
+    permuted = rig.replace(cameras={n: rig[n] for n in (alpha, *(betas[i] for i in order))})
+    other = fuse(network, permuted, images, alpha=alpha).image
     same = score(other.clamp(0, 1), frame.image[order].clamp(0, 1)).psnr
-    left = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
-    return ["", f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {left:.1f} dB)."]
-
-
-def coded(linear: Float[Tensor, "c h w"]) -> Float[Tensor, "c h w"]:
-    """Linear light coded as sRGB."""
-    return Coded().apply(linear[None], Generator())[0]
-
-
-def mosaic(rgb: Float[Tensor, "3 h w"], pattern: str) -> Float[Tensor, "1 h w"]:
-    """What a sensor behind a colour filter mosaic records: one of the three colours at each pixel."""
-    raw = torch.empty_like(rgb[:1])
-    for i, (row, column) in enumerate(itertools.product((0, 1), (0, 1))):
-        raw[0, row::2, column::2] = rgb["RGB".index(pattern[i]), row::2, column::2]
-    return raw
+    before = score(other.clamp(0, 1), frame.image.clamp(0, 1)).psnr
+    return [
+        "",
+        f"Betas in another order: the bands follow to {same:.1f} dB (against the former order: {before:.1f} dB).",
+    ]

@@ -1,1 +1,1 @@
-"""The training engine: recipes, samples, losses, the loop, and what it leaves on disk."""
+"""Training: recipes, samples, losses, the loop, checkpoints."""

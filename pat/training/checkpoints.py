@@ -1,4 +1,4 @@
-"""Checkpoints: all that a run needs to go on as if it had not stopped. Tensors and JSON, nothing pickled."""
+"""Checkpoints: the whole state of a run. Tensors and JSON, nothing pickled."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from arraygeom.atomic import write_atomically
 from pat.networks.weights import misfit
 
 FORMAT = "pat-checkpoint 1"
-KEPT = 2
+RETAINED = 2
 
 
 class Checkpoint(NamedTuple):
@@ -57,9 +57,9 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
-    """Write a checkpoint, whole or not at all, and remove all but it and the one before.
+    """Write a checkpoint atomically, and remove all but it and the previous one.
 
-    Raises OSError, the older ones intact, where there is no room.
+    Raises OSError, the older ones intact, if the disk is full.
     """
     step = checkpoint.facts["step"]
     path = folder / f"step-{step:08d}.safetensors"
@@ -69,19 +69,19 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
             save_file(tensors, temporary, {"format": FORMAT, "facts": json.dumps(checkpoint.facts)})
     except (SafetensorError, OSError) as error:
         raise OSError(_no_room(folder, step, tensors, error)) from None
-    for old in _files(folder)[KEPT:]:
+    for old in _files(folder)[RETAINED:]:
         old.unlink()
     return path
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest checkpoint that can be read whole; None if there is none."""
+    """The newest complete checkpoint; None if there is none."""
     found = (read_checkpoint(path) for path in _files(folder))
     return next((checkpoint for checkpoint in found if checkpoint), None)
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """A checkpoint, or None for a file that is not a whole one."""
+    """A checkpoint, or None for an incomplete file."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
@@ -99,7 +99,7 @@ def _files(folder: Path) -> list[Path]:
 def _no_room(folder: Path, step: int, tensors: Mapping[str, Tensor], error: Exception) -> str:
     wanted = sum(t.numel() * t.element_size() for t in tensors.values()) / 2**20
     free = shutil.disk_usage(folder if folder.is_dir() else folder.parent).free / 2**20
-    last = next((f"the last good one, {p}, is as it was" for p in _files(folder)), "there is no older one")
+    last = next((f"the last good one, {p}, is intact" for p in _files(folder)), "there is no older one")
     reason = " ".join(str(error).split())
     return (
         f"the checkpoint of step {step} ({wanted:.0f} MiB) could not be written to {folder} ({free:.0f} MiB free): "

@@ -1,4 +1,4 @@
-"""What a training run is made of: one typed recipe, a YAML file that people write, and the command line over it."""
+"""Training recipes: one typed dataclass, read from YAML, with command-line overrides."""
 
 from __future__ import annotations
 
@@ -25,57 +25,57 @@ GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8
 NetworkConfig = GuidedPATConfig | PATConfig | BandwisePATConfig
 FieldName = Literal["epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
-"""What may differ between a run and its continuation: the samples and the steps do not depend on it."""
+"""Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
 
 
 @dataclass(frozen=True)
-class Recording:
-    """How each camera degrades what it sees."""
+class RecordingConfig:
+    """Degradations of each camera's images."""
 
     gain: float = 0.3
-    """Chance of another gain, gamma and white balance."""
+    """Probability of another gain, gamma and white balance."""
     blur: float = 0.25
-    """Chance of Gaussian blur."""
+    """Probability of Gaussian blur."""
     noise: float = 0.6
-    """Chance of shot and read noise."""
+    """Probability of shot and read noise."""
     paper: float = 0.3
-    """Chance of one of the paper's four degradations on top, for one beta."""
+    """Probability of one of the paper's four degradations on top, for one beta."""
     miscalibrated: float = 0.0
-    """Error of the poses that fields are made from: how far it moves points, root mean square, pixels."""
+    """Error of the poses that fields are computed from: root mean square displacement of points, pixels."""
     lens: float = 0.0
-    """Chance of a lens that bends (|k1| up to 0.3), its image straightened again."""
+    """Probability of lens distortion (|k1| up to 0.3), the image undistorted before fusion."""
     spectral: float = 0.0
-    """Chance of random bands, one to four if one beta has them all, in the place of red, green and blue."""
+    """Probability of random bands, one to four if one beta has them all, instead of red, green and blue."""
     ideal: bool = False
-    """The truth is the scene itself; else it has alpha's luminance as recorded, noise and all."""
+    """The ground truth is the scene itself; else it has alpha's luminance as recorded, noise included."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """A recipe. A step sees `groups` times `batch` scenes; there are `steps` steps, or as many as fit into `minutes`.
 
-    Raises ValueError for numbers that make no run.
+    Raises ValueError for inconsistent values.
     """
 
     photos: tuple[Path, ...] = ()
-    """Folders of photographs that scenes are textured with."""
+    """Folders of photographs: the textures of layered scenes."""
     out: Path = Path("runs/mono-colour")
     """Folder for weights, checkpoints, figures and images."""
     start: Path | None = None
-    """File of weights to go on from."""
+    """File of weights to start from."""
     network: NetworkConfig = dataclasses.field(default_factory=GuidedPATConfig)
     steps: int = 4000
     """Steps of the whole run."""
     minutes: float = float("inf")
-    """Minutes of the whole run, if they are over before its steps."""
+    """Time limit of the whole run, minutes."""
     batch: int = 4
-    """Scenes made and seen together."""
+    """Scenes in a batch."""
     groups: int = 1
-    """Batches a step, shared out among processes."""
+    """Batches a step, distributed over processes."""
     hw: tuple[int, int] = (96, 192)
     """Height and width of alpha in the scenes."""
     loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
-    """On the image: minus the mean PSNR, or the mean squared error."""
+    """On the image: minus the mean PSNR, with or without SSIM, or the mean squared error."""
     rate: float = 8e-4
     """Learning rate of Adam."""
     momenta: tuple[float, float] = (0.9, 0.99)
@@ -83,48 +83,48 @@ class TrainConfig:
     schedule: Literal["cosine", "halving"] = "cosine"
     """The rate falls along half a cosine, or is halved every 30/80 of the way."""
     warmup: int = 100
-    """Steps over which the rate rises at first."""
+    """Steps of linear warm-up of the rate."""
     clip: float = 1.0
-    """Norm that gradients are cut to; inf for none."""
+    """Norm that gradients are clipped to; inf for none."""
     reuse: float = 2.0
-    """How often a batch of scenes is recorded, at random moments and differently."""
+    """How many times a batch of scenes is recorded on average, each time differently."""
     average: int = 300
-    """Over about how many steps the weights are averaged that are validated and kept."""
+    """Time constant, in steps, of the weight average that is validated and saved."""
     validate: int = 250
-    """Validate every so many steps, and keep the weights if they are the best so far."""
+    """Steps between validations, which save the weights if they are the best so far."""
     save: int = 250
-    """Write a checkpoint every so many steps."""
+    """Steps between checkpoints."""
     filtered: float = 0.15
-    """Share of the batches in which beta is three cameras, one a band."""
+    """Share of the batches with three betas, one a band."""
     rectified: float = 0.5
     """Share of the batches with rigs of `rectified_rigs`, the others being of `general_rigs`."""
     rectified_rigs: RigDistribution = RECTIFIED
     general_rigs: RigDistribution = GENERAL
     rendered: float = 0.0
-    """Share of the batches made of rendered scenes, in place of photographs in layers."""
+    """Share of the batches made of rendered scenes instead of layered ones."""
     rendered_from: tuple[Path, ...] = ()
-    """Folders of rendered scenes, as `pat render` leaves them."""
+    """Folders of rendered scenes, output of `pat render`."""
     pairs: float = 0.0
     """Share of the batches made of stereo pairs."""
     pairs_from: tuple[Path, ...] = ()
     """Folders of rectified stereo pairs in colour."""
-    recording: Recording = Recording()
+    recording: RecordingConfig = RecordingConfig()
     field: FieldName = "epipolar"
-    """Where the network looks."""
+    """The receptive field, by name."""
     held_out: int = 12
-    """Every so many photographs one is for validation only."""
+    """One photograph in so many is for validation only."""
     seed: int = 0
-    """Of everything random."""
+    """Random seed."""
     cache: Path | None = None
-    """File (.npz) of photographs read before, or to be written."""
+    """File (.npz) that caches the photographs."""
     device: str = "auto"
-    """Like cuda or cpu; auto takes a GPU if there is one."""
+    """Torch device, such as cuda or cpu; auto takes a GPU if there is one."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """Of convolutions; attention and geometry are in float32."""
+    """Precision of convolutions; attention and geometry are in float32."""
     compile: bool = False
     """Compile convolutions by torch.compile."""
     tensorboard: bool = False
-    """Write figures and images for TensorBoard, too."""
+    """Log figures and images for TensorBoard too."""
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
@@ -143,8 +143,8 @@ class TrainConfig:
             if not 0 <= share <= 1:
                 raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
-                said = "there is no folder" if share else f"{folders[0]} is given"
-                raise ValueError(f"{name} is {share:g} and {said}: give both `{name}` and `{name}_from`, or neither")
+                found = "there is no folder" if share else f"{folders[0]} is given"
+                raise ValueError(f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither")
         if self.rendered + self.pairs > 1:
             raise ValueError(f"rendered and pairs are shares of the batches, {self.rendered + self.pairs:g} in all")
 
@@ -178,7 +178,7 @@ def parse_config(text: str, name: str = "config") -> TrainConfig:
 
 
 def _config(values: Any) -> TrainConfig:
-    """All but the network first: which entries that may have depends on its kind."""
+    """All but the network first: its entries depend on its kind."""
     if not isinstance(values, Mapping):
         raise ValueError(f"wanted entries (name: value), got {values!r}")
     config = from_document(TrainConfig, {k: v for k, v in values.items() if k != "network"})
@@ -194,12 +194,12 @@ def config_text(config: TrainConfig) -> str:
 
 
 def save_config(config: TrainConfig, path: Path) -> None:
-    """Write `config_text`; the file appears whole or not at all."""
+    """Write `config_text` atomically."""
     write_text(path, config_text(config))
 
 
 def command_line(arguments: list[str]) -> TrainConfig:
-    """`[RECIPE] [--name value ...]`: a recipe by name or file, and anything in it given anew."""
+    """`[RECIPE] [--name value ...]`: a recipe by name or file, and overrides of its values."""
     base = TrainConfig()
     if arguments and not arguments[0].startswith("-"):
         base, arguments = load_config(arguments[0]), arguments[1:]
@@ -208,7 +208,7 @@ def command_line(arguments: list[str]) -> TrainConfig:
         prog="pat train [RECIPE]",
         description=(
             "Train weights on scenes made from photographs while training. RECIPE is a YAML file or one of "
-            f"{', '.join(recipes())}; the options below change it. The same command again goes on where a run "
+            f"{', '.join(recipes())}; the options below change it. The same command again continues a run that "
             "stopped. On N processors: torchrun --nproc_per_node N -m pat train RECIPE --groups N"
         ),
         default=base,

@@ -1,4 +1,4 @@
-"""Images taken through lenses that bend, and straightened again by what `pat fuse` straightens with."""
+"""Images recorded through distorting lenses, and undistorted as `pat fuse` does it."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from arraygeom.undistortion import resampled
 STRONGEST = 0.3
 """|k1| of the strongest lens."""
 STRETCHED = 0.4
-"""By how much a lens stretches or squeezes at most, along the radius, in the corner farthest from its axis."""
+"""Largest relative change of radial scale, in the corner farthest from the axis."""
 LOST = 0.1
-"""Share of the height or width that a straightened beta lacks at most on each side."""
+"""Largest share of the height or width that an undistorted beta lacks on each side."""
 
 
 def through_lenses(
@@ -31,30 +31,30 @@ def through_lenses(
     *,
     lost: float = 0.0,
 ) -> Sampled:
-    """What is `recorded` of images that a lens bends, one for each of the pinholes, straightened back to those.
+    """Images distorted by a random lens, one for each pinhole, passed to `recorded`, and undistorted to the pinholes.
 
     Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not valid.
     """
     pinholes = [one_camera(cameras, i) for i in range(len(images))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
-    has_lens = [
+    distorted = [
         resampled(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
     ]
-    seen = recorded(torch.cat(has_lens).clamp(0, 1).to(images.device)).cpu()
+    seen = recorded(torch.cat(distorted).clamp(0, 1).to(images.device)).cpu()
     back = [resampled(p, lens, pinhole, extended=True) for p, lens, pinhole in zip(seen, lenses, pinholes)]
     values, valid = (torch.cat(parts) for parts in zip(*back))
     return Sampled(values.clamp(min=0).to(images), valid.to(images.device))
 
 
 def lens_over(pinhole: Camera, g: Generator, lost: float = 0.0) -> Camera:
-    """A camera with a random lens and as many pixels, that sees all that the pinhole sees, but for what is lost."""
+    """A camera with a random lens and as many pixels, that covers the pinhole's view but for the lost borders."""
     x = border(pinhole)
     rays, _ = pinhole.rays(x)
     widest = float(rays[..., :2].square().sum(-1).max())
     k1 = (2 * float(torch.rand((), generator=g)) - 1) * min(STRONGEST, STRETCHED / (3 * widest))
     lens = pinhole.replace(distortion=Distortion(BROWN_CONRADY, pinhole.K.new_tensor([k1, 0, 0, 0])))
-    has_lens, _ = lens.distort(x)
-    low, high = has_lens.amin(0) - 0.5, has_lens.amax(0) + 0.5
+    distorted, _ = lens.distort(x)
+    low, high = distorted.amin(0) - 0.5, distorted.amax(0) + 0.5
     cut = lost * torch.rand(2, 2, generator=g, dtype=torch.float64) * (high - low)
     low, high = low + cut[0], high - cut[1]
     return lens.transformed(filling(low, high, pinhole.hw), pinhole.hw)

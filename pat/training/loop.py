@@ -26,7 +26,7 @@ from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_
 from .config import TrainConfig, config_text, difference, parse_config, save_config
 from .losses import Objective, validation
 from .processes import Process, process
-from .samples import Sample, Source, alone, scenes
+from .samples import Sample, SampleSource, alone, scenes
 from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
@@ -35,11 +35,11 @@ EARLY = 16
 
 
 def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
-    """Train, looking where `field` (or `config.field`) says; returns the file of the best weights.
+    """Train with the receptive field `field` (or `config.field`); returns the file of the best weights.
 
     In `config.out`: best.safetensors, config.yaml, log.jsonl (a line for each validation), steps.csv (a line for
-    each step), images/ and checkpoints/. Where that folder holds the same run, stopped, it goes on: with
-    `steps` the result is that of a run never stopped, bit for bit; with `minutes` the time spent counts.
+    each step), images/ and checkpoints/. If that folder holds the same run, interrupted, it continues: with
+    `steps` the result is that of an uninterrupted run, bit for bit; with `minutes` the time spent counts.
 
     Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
     the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run.
@@ -70,8 +70,8 @@ class Run:
         self.average = AveragedModel(self.network, multi_avg_fn=get_ema_multi_avg_fn(1 - 1 / config.average))
         self.adam = torch.optim.Adam(self.network.parameters(), lr=config.rate, betas=config.momenta)
         self.step, self.best, minutes = 0, -math.inf, 0.0
-        self.learn, examine = self._scenes(field)
-        self.examination = [] if not here.first else list(examine(8))
+        self.learn, validate = self._scenes(field)
+        self.validation = [] if not here.first else list(validate(8))
         if checkpoint:
             restore(checkpoint, self.network, self.adam, self.average)
             self.step, self.best, minutes = (checkpoint.facts[k] for k in ("step", "best", "minutes"))
@@ -106,7 +106,7 @@ class Run:
             if self.step % self.config.validate == 0 or done >= 1:
                 self._validate()
             elif self.step < self.config.validate and self.step >= EARLY and self.step & (self.step - 1) == 0:
-                self.watch.show(self.averaged, self.examination, self.step)
+                self.watch.show(self.averaged, self.validation, self.step)
             if self.step % self.config.save == 0 or done >= 1:
                 self._save(done=done >= 1)
             if done >= 1:
@@ -143,10 +143,10 @@ class Run:
         """Measure, show, and keep the weights if they are the best so far."""
         if not self.here.first:
             return
-        facts = validation(self.averaged, self.examination)
+        facts = validation(self.averaged, self.validation)
         facts |= {"step": self.step, "loss": self.loss, "minutes": self._minutes()}
         self.watch.validated(facts)
-        self.watch.show(self.averaged, self.examination, self.step)
+        self.watch.show(self.averaged, self.validation, self.step)
         if facts["psnr"] > self.best:
             self.best = facts["psnr"]
             recipe = {"recipe": json.dumps(asdict(self.config), default=str), "validation": json.dumps(facts)}
@@ -162,7 +162,7 @@ class Run:
     def _minutes(self) -> float:
         return (time.monotonic() - self.began) / 60
 
-    def _scenes(self, field: ReceptiveField | None) -> tuple[Source, Source]:
+    def _scenes(self, field: ReceptiveField | None) -> tuple[SampleSource, SampleSource]:
         """Photographs are read by the first process first, which may leave a cache to the others."""
         if not self.here.first:
             self.here.wait()
@@ -172,7 +172,7 @@ class Run:
         return sources
 
     def _offence(self, given: list[Sample]) -> str:
-        """Save the groups of a step that went wrong, and say which samples did it."""
+        """Save the groups of a failed step; the error message names the samples."""
         objective = Objective(self.network, self.config.loss)
         found = []
         for group, part in zip(self.groups, given):
@@ -184,7 +184,7 @@ class Run:
         who = ", ".join(found) or "no single sample of this process"
         return (
             f"step {self.step}: the loss or its gradient is not finite, by {who}; the batch is in "
-            f"{self.config.out}/offending-step-{self.step}-*.safetensors: look at it, or lower `rate` "
+            f"{self.config.out}/offending-step-{self.step}-*.safetensors: inspect it, or lower `rate` "
             f"(now {self.config.rate:g}); the last checkpoint and the best weights are as they were"
         )
 
@@ -217,12 +217,12 @@ def new_network(config: TrainConfig) -> Network:
 
 
 def convolutions(network: nn.Module) -> list[nn.Module]:
-    """The parts without attention. Where to look is a function, which torch.compile would break at, and geometry."""
+    """The parts without attention, whose search segments are functions that torch.compile would break at."""
     return [part for part in network.children() if not isinstance(part, (AttentionEngine, nn.ModuleList))]
 
 
 def in_bfloat16(part: nn.Module) -> None:
-    """Let a part compute in bfloat16 where autocast does, and answer in float32."""
+    """Let a part compute in bfloat16 where autocast does, with float32 output."""
     forward = part.forward
 
     def cast(*images: Tensor) -> Any:
@@ -243,8 +243,8 @@ def finite(objective: Objective, given: Sample) -> bool:
 
 
 def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
-    """All tensors of a group of samples: alpha, truth, and beta, position, visible of each beta by number."""
-    tensors = {"alpha": given.alpha, "truth": given.ground_truth}
+    """All tensors of a group of samples: alpha, ground truth, and beta, position, visible of each beta by number."""
+    tensors = {"alpha": given.alpha, "ground_truth": given.ground_truth}
     for name in ("betas", "position", "visible"):
         tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
     with write_atomically(path) as temporary:
@@ -252,7 +252,7 @@ def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
 
 
 def former_run(config: TrainConfig) -> Checkpoint | None:
-    """Where the same run stopped, if it did. Raises ValueError if the folder holds another run."""
+    """The last checkpoint of the same run, if there is one. Raises ValueError if the folder holds another run."""
     checkpoint = newest_checkpoint(config.out / CHECKPOINTS)
     if checkpoint is None:
         return None

@@ -1,4 +1,4 @@
-"""What training minimises, and what tells how far it is."""
+"""Training losses, and validation figures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
 from pat.networks.bandwise import BandwisePAT
-from pat.networks.guided import GuidedPAT, Seen
+from pat.networks.guided import BetaEstimate, GuidedPAT
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import Network
 
@@ -18,7 +18,7 @@ from .samples import Sample
 
 
 def image_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
-    """Minus the mean PSNR over 10, but for a floor under the error: every sample pulls alike."""
+    """Minus the mean PSNR over 10, with a floor on the error: every sample has the same weight."""
     return ((image - ground_truth).square().flatten(1).mean(1) + 1e-5).log10().mean()
 
 
@@ -29,10 +29,10 @@ def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
         return avg_pool2d(x, 7, 1)
 
     a, b = mean(image), mean(ground_truth)
-    spread = mean(image * image) - a * a + mean(ground_truth * ground_truth) - b * b
+    variances = mean(image * image) - a * a + mean(ground_truth * ground_truth) - b * b
     common = mean(image * ground_truth) - a * b
-    likeness = (2 * a * b + 1e-4) * (2 * common + 9e-4) / ((a * a + b * b + 1e-4) * (spread + 9e-4))
-    return 1 - likeness.mean()
+    similarity = (2 * a * b + 1e-4) * (2 * common + 9e-4) / ((a * a + b * b + 1e-4) * (variances + 9e-4))
+    return 1 - similarity.mean()
 
 
 def image_and_structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
@@ -62,30 +62,30 @@ class Objective(nn.Module):
         return loss + match_loss(seen, given) if seen else loss
 
 
-def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[Seen]]:
-    """The network's answer, and what each beta told where it says."""
+def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
+    """The network's output, and its match in each beta if it reports it."""
     if isinstance(network, (GuidedPAT, BandwisePAT)):
-        return network.explain(given.alpha, given.betas, given.looks)
-    return network(given.alpha, given.betas, given.looks), []
+        return network.explain(given.inputs)
+    return network(given.inputs), []
 
 
-def match_loss(seen: list[Seen], given: Sample) -> Tensor:
-    """How far off the looks were where beta sees the point, pixels, and how wrong the confidence; 0 if nobody knows."""
+def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
+    """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground truth."""
     total = given.ground_truth.new_zeros(())
-    for told, ground_truth, visible in zip(seen, given.position, given.visible):
-        off = (told.attended.position - ground_truth.movedim(-1, 1)).abs().sum(1)
+    for match, ground_truth, visible in zip(seen, given.position, given.visible):
+        off = (match.attended.position - ground_truth.movedim(-1, 1)).abs().sum(1)
         total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
         good = (visible & (off.detach() < 1.5)).to(off)
-        total = total + 0.05 * binary_cross_entropy_with_logits(told.logit[:, 0], good)
+        total = total + 0.05 * binary_cross_entropy_with_logits(match.logit[:, 0], good)
     return total / len(seen)
 
 
 @torch.no_grad()
 def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
-    """Mean PSNR, and the share of visible pixels matched within a pixel and a half (NaN if nobody knows)."""
+    """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth)."""
     psnr, near = [], []
     for given in samples:
-        fused = network(given.alpha, given.betas, given.looks)
+        fused = network(given.inputs)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
         for where, visible in list(zip(given.position, given.visible))[:1]:

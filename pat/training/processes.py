@@ -16,7 +16,7 @@ CPU = torch.device("cpu")
 
 @dataclass(frozen=True)
 class Process:
-    """Which process this is, of how many, and the device it works on."""
+    """Rank of this process, their number, and its device."""
 
     rank: int = 0
     count: int = 1
@@ -24,11 +24,11 @@ class Process:
 
     @property
     def first(self) -> bool:
-        """Whether it is this process that writes and validates."""
+        """Whether this process writes and validates."""
         return self.rank == 0
 
     def share(self, groups: int) -> list[int]:
-        """The groups of a step that are this process's. Raises ValueError where they cannot be shared out evenly."""
+        """The groups of a step that are this process's. Raises ValueError where they cannot be distributed evenly."""
         if groups % self.count:
             raise ValueError(f"{groups} groups cannot be shared by {self.count} processes: give --groups a multiple")
         return list(range(self.rank, groups, self.count))
@@ -47,12 +47,12 @@ class Process:
         """The first process's number, in all of them."""
         if self.count == 1:
             return number
-        told = torch.tensor([number], dtype=torch.float64, device=self.device)
-        distributed.broadcast(told, 0)
-        return float(told)
+        shared = torch.tensor([number], dtype=torch.float64, device=self.device)
+        distributed.broadcast(shared, 0)
+        return float(shared)
 
     def wait(self) -> None:
-        """Until all processes are here."""
+        """Barrier: wait for all processes."""
         if self.count > 1:
             distributed.barrier()
 
@@ -61,7 +61,7 @@ class Process:
 def process(device: str = "auto") -> Iterator[Process]:
     """This process, connected with the others if torchrun started several (gloo on CPUs, NCCL on GPUs).
 
-    Raises ValueError for a device that there is not.
+    Raises ValueError for a device that does not exist.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     chosen = _device(device)

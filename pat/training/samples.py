@@ -2,15 +2,15 @@
 
 A share of them may come from rendered scenes, and from stereo pairs.
 
-What a step sees is a pure function of the seed and the number of the step, so that a run goes on where it
-stopped, and so that processes share out a step without talking to each other.
+The samples of a step are a pure function of the seed and the number of the step, so that a run continues where it
+stopped, and processes share a step without communication.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
 
@@ -29,34 +29,33 @@ from arraygeom import (
     NearestVoxels,
     Pair,
     Pose,
-    Positions,
     ReceptiveField,
     Rectified,
-    Segments,
     pixel_grid,
     rotation_from_vector,
     sample,
 )
 from arraygeom.fields import pinhole_track
+from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
-from pat.networks.protocol import Look
+from pat.networks.protocol import Inputs
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
-from .config import FieldName, Recording, TrainConfig
+from .config import FieldName, RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
 from .scenes import RenderedCrops
 from .spectra import MOST, Spectra
 from .stereo import PairCrops
 
-KEPT = 48
-"""Groups of scenes that wait to be recorded again."""
+CACHED = 48
+"""Groups of scenes cached to be recorded again."""
 FEW = 8
-"""With fewer than this many waiting, a new one is always made."""
+"""With fewer cached than this, a new one is always made."""
 SCENE, RECORDING = 0, 1
-"""What randomness is for, besides the seed and a number."""
+"""Purpose of a random generator, beside the seed and a number."""
 
 FIELDS: dict[FieldName, Callable[[], ReceptiveField]] = {
     "epipolar": Epipolar,
@@ -67,58 +66,63 @@ FIELDS: dict[FieldName, Callable[[], ReceptiveField]] = {
     "local": Local,
     "dense": Dense,
 }
-"""Where samples may look, by name."""
+"""Receptive fields by name."""
 
 
 class Sample(NamedTuple):
-    """What a network is given, what it should answer, and, if known, where in each beta it should have looked."""
+    """A network's input, the ground truth, and, if known, the true position of each pixel in each beta."""
 
     alpha: Tensor
     betas: list[Tensor]
-    looks: list[Look]
+    fields: list[FieldOnGrid]
     ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
 
+    @property
+    def inputs(self) -> Inputs:
+        """What a network is given."""
+        return Inputs.of(self.alpha, self.betas, self.fields)
+
 
 class Planned(NamedTuple):
-    """Which scenes a step records: their number, and what kind of rig they are seen by."""
+    """The scenes that a step records: their number, and the kind of their rigs."""
 
     scenes: int
     kind: str
     betas: int
     dropped: int | None
-    """The number of the scenes that are not wanted any more."""
+    """The number of the scenes to drop from the cache."""
 
 
 def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
-    """What each step records, from step 0: new scenes, or some of the last `KEPT` again."""
+    """What each step records, from step 0: new scenes, or some of the last `CACHED` again."""
     draw = random.Random(seed)
-    kept: list[Planned] = []
+    cached: list[Planned] = []
     for number in range(2**62):
-        new = len(kept) < FEW or draw.random() < 1 / config.reuse
+        new = len(cached) < FEW or draw.random() < 1 / config.reuse
         if new:
             kind = _source(config, draw) or ("rectified" if draw.random() < config.rectified else "general")
             betas = 3 if draw.random() < config.filtered else 1
-            dropped = kept.pop() if len(kept) > KEPT else None
-            kept.insert(0, Planned(number, kind, betas, None))
-            yield kept[0]._replace(dropped=dropped.scenes if dropped else None)
+            dropped = cached.pop() if len(cached) > CACHED else None
+            cached.insert(0, Planned(number, kind, betas, None))
+            yield cached[0]._replace(dropped=dropped.scenes if dropped else None)
         else:
-            yield kept[int(draw.random() * len(kept))]
+            yield cached[int(draw.random() * len(cached))]
 
 
 def _source(config: TrainConfig, draw: random.Random) -> str | None:
-    """Where scenes come from, if not from photographs. Draws only where there is a choice."""
+    """The source of scenes, if not photographs. Draws only where there is a choice."""
     if not (config.rendered or config.pairs):
         return None
     drawn = draw.random()
     return "rendered" if drawn < config.rendered else "pairs" if drawn < config.rendered + config.pairs else None
 
 
-class Source:
+class SampleSource:
     """Samples by the number of the step: called with a count it gives the first group of that many steps.
 
-    `photos` may be missing where all batches come from `folders`, which are by the kind of scenes that they hold.
+    `photos` may be None where all batches come from `folders`, by kind of scenes.
     """
 
     def __init__(
@@ -139,7 +143,7 @@ class Source:
             for betas in (1, 3)
             if photos is not None
         }
-        self.kept: dict[tuple[int, int], ArrayBatch] = {}
+        self.cache: dict[tuple[int, int], ArrayBatch] = {}
 
     def __call__(self, count: int) -> Iterator[Sample]:
         """The first group of the first `count` steps."""
@@ -154,11 +158,11 @@ class Source:
 
     def sample(self, planned: Planned, step: int, group: int) -> Sample:
         """One group of one step."""
-        if (planned.scenes, group) not in self.kept:
+        if (planned.scenes, group) not in self.cache:
             g = _generator(self.seed, SCENE, planned.scenes, group)
-            self.kept[planned.scenes, group] = self._made(planned, g)
+            self.cache[planned.scenes, group] = self._made(planned, g)
         g = _generator(self.seed, RECORDING, step, group)
-        scene = self.kept[planned.scenes, group]
+        scene = self.cache[planned.scenes, group]
         return degraded(scene, g, field=self.field, recording=self.config.recording)
 
     def _made(self, planned: Planned, g: Generator) -> ArrayBatch:
@@ -168,30 +172,32 @@ class Source:
         return self.makers[planned.kind, planned.betas].sample(self.config.batch, g)
 
     def _forget(self, scenes: int | None) -> None:
-        for key in [key for key in self.kept if key[0] == scenes]:
-            del self.kept[key]
+        for key in [key for key in self.cache if key[0] == scenes]:
+            del self.cache[key]
 
 
-def scenes(config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu") -> tuple[Source, Source]:
+def scenes(
+    config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu"
+) -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
     layered = config.rendered + config.pairs < 1
     bank, unseen = photographs(config) if layered else (None, None)
     look, n = field or FIELDS[config.field](), config.held_out
-    learn, examine = config.seed + 1, config.seed + 2
+    learn, validate = config.seed + 1, config.seed + 2
     known, new = (
         crops(config, learn, device, lambda i: i % n != 0),
-        crops(config, examine, device, lambda i: i % n == 0),
+        crops(config, validate, device, lambda i: i % n == 0),
     )
     return (
-        Source(bank, config, learn, look, device, folders=known),
-        Source(unseen, config, examine, look, device, folders=new),
+        SampleSource(bank, config, learn, look, device, folders=known),
+        SampleSource(unseen, config, validate, look, device, folders=new),
     )
 
 
 def crops(
     config: TrainConfig, seed: int, device: str, choose: Callable[[int], bool]
 ) -> dict[str, RenderedCrops | PairCrops]:
-    """What folders of scenes and of pairs give, by kind; of each those chosen by their number."""
+    """Windows of rendered scenes and of pairs, by kind; of each the items chosen by their number."""
     found: dict[str, RenderedCrops | PairCrops] = {}
     common: dict[str, Any] = {"hw": config.hw, "seed": seed, "device": device, "choose": choose}
     if config.rendered_from:
@@ -223,31 +229,31 @@ def degraded(
     g: Generator,
     *,
     field: ReceptiveField = Epipolar(),  # noqa: B008
-    recording: Recording = Recording(),  # noqa: B008
+    recording: RecordingConfig = RecordingConfig(),  # noqa: B008
 ) -> Sample:
-    """What cameras record of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's pitch."""
+    """Recorded images of a scene: alpha grey, betas in colour (or a band each), enlarged to alpha's resolution."""
     images, alone = _banded(scene, g, recording.spectral), len(scene.images) == 2
     ideal, grey, cameras = images[0], luminance(scene.images[0]), scene.cameras
     alpha = recorded(grey, cameras[0], g, recording).values
-    betas, looks, position, visible = [], [], [], []
+    betas, on_grid, position, visible = [], [], [], []
     for i, image in enumerate(images[1:], 1):
         band = image if alone else image[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
-        betas.append(_enlarged(seen.values, scene.hw[0]))
+        betas.append(_enlarged(seen.values, scene.cameras[0].hw))
         if alone and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
-        looks.append(Look.along(field, perturbed(pair, recording.miscalibrated, g)))
+        on_grid.append(FieldOnGrid.of(field, perturbed(pair, recording.miscalibrated, g)))
         if scene.depth:
-            found = truth_in(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
+            found = transfer(pair, scene.depth[0], scene.depth[i].masked_fill(~seen.valid, torch.nan))
             position.append(found[0])
             visible.append(found[1])
     ground_truth = ideal if recording.ideal else ideal + (alpha - grey)
-    return Sample(alpha, betas, looks, ground_truth, position, visible)
+    return Sample(alpha, betas, on_grid, ground_truth, position, visible)
 
 
 def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
-    """The scene's images, by this chance in other bands than red, green and blue."""
+    """The scene's images, with this probability in other bands than red, green and blue."""
     if spectral == 0 or not _chance(spectral, g):
         return scene.images
     count = 1 + int(torch.randint(MOST, (), generator=g)) if len(scene.images) == 2 else len(scene.images) - 1
@@ -255,8 +261,8 @@ def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
     return [spectra.of(image) for image in scene.images]
 
 
-def recorded(image: Tensor, camera: Camera, g: Generator, recording: Recording, *, lost: float = 0.0) -> Sampled:
-    """What a camera makes of an image: perhaps bent by a lens and straightened, up to `lost` of it on each side."""
+def recorded(image: Tensor, camera: Camera, g: Generator, recording: RecordingConfig, *, lost: float = 0.0) -> Sampled:
+    """The recorded image, perhaps distorted by a lens and undistorted, up to `lost` of it missing on each side."""
 
     def record_here(image: Tensor) -> Tensor:
         return record(image, steps(g, recording), g).image
@@ -267,8 +273,8 @@ def recorded(image: Tensor, camera: Camera, g: Generator, recording: Recording, 
     return Sampled(record_here(image), image.new_ones(b, h, w, dtype=torch.bool))
 
 
-def steps(g: Generator, recording: Recording) -> list[Step]:
-    """Gain, blur and noise of one camera; each with its own chance."""
+def steps(g: Generator, recording: RecordingConfig) -> list[Step]:
+    """Gain, blur and noise of one camera; each with its own probability."""
     steps: list[Step] = []
     if _chance(recording.gain, g):
         steps.append(Jitter(0.04, 0.04, 0.01))
@@ -280,29 +286,29 @@ def steps(g: Generator, recording: Recording) -> list[Step]:
 
 
 def pair_of(scene: ArrayBatch, beta: int, g: Generator) -> Pair:
-    """The batch of pairs (alpha, beta), beta at alpha's pitch, with bounds looser than the scenes' own."""
+    """The batch of pairs (alpha, beta), beta at alpha's resolution, with bounds looser than the scenes' own."""
     near, far = scene.depth_range.double().unbind(-1)
     loose = torch.rand(2, len(near), generator=g, dtype=torch.float64).to(near.device)
     depth = near / (1 + 0.6 * loose[0]), torch.where(loose[1] < 0.5, torch.inf, far * (1 + 2 * loose[1]))
     cameras = [c.to(torch.float64) for c in scene.cameras]
-    return Pair(cameras[0], cameras[beta].resize(scene.hw[0]), depth)
+    return Pair(cameras[0], cameras[beta].resize(scene.cameras[0].hw), depth)
 
 
 def perturbed(pair: Pair, pixels: float, g: Generator) -> Pair:
-    """The pairs with beta turned at random so that points move by about `pixels`, root mean square, on each axis."""
+    """The pairs with beta rotated at random so that points move by about `pixels`, root mean square, on each axis."""
     if pixels == 0:
         return pair
     alpha, beta = pair.cameras
     drawn = torch.randn(len(beta.K), 3, generator=g, dtype=torch.float64).to(beta.K)
-    turn = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
-    moved: Camera = beta.replace(cam_from_world=Pose(turn, torch.zeros_like(beta.t)) @ beta.cam_from_world)
+    rotation = rotation_from_vector(drawn * pixels / beta.K[:, :1, 0])
+    moved: Camera = beta.replace(cam_from_world=Pose(rotation, torch.zeros_like(beta.t)) @ beta.cam_from_world)
     return Pair(alpha, moved, pair.depth)
 
 
-def truth_in(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
-    """Where alpha's pixels are in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w).
+def transfer(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions of alpha's pixels in beta (B, h, w, 2), and whether beta sees the same surface there (B, h, w).
 
-    What has no depth (NaN) is not visible, and at (0, 0).
+    Pixels without depth (NaN) are not visible, and at (0, 0).
     """
     hw = pair.alpha.hw
     track = pinhole_track(pair, pixel_grid(hw, device=depth.device).reshape(1, -1, 2))
@@ -317,20 +323,13 @@ def truth_in(pair: Pair, depth: Tensor, beta_depth: Tensor) -> tuple[Tensor, Ten
 
 
 def alone(given: Sample, i: int) -> Sample:
-    """The i-th of a group of samples by itself."""
+    """The i-th of a group of samples."""
 
     def one(parts: Sequence[Tensor]) -> list[Tensor]:
         return [part if len(part) == 1 else part[i : i + 1] for part in parts]
 
-    def look(old: Look) -> Look:
-        def at(x: Tensor) -> Segments | Positions:
-            found = old.at(x)
-            return type(found)(*one([getattr(found, entry.name) for entry in fields(found)]))
-
-        return Look(at, old.samples)
-
-    (alpha, ground_truth), looks = one([given.alpha, given.ground_truth]), [look(old) for old in given.looks]
-    return Sample(alpha, one(given.betas), looks, ground_truth, one(given.position), one(given.visible))
+    (alpha, ground_truth), on_grid = one([given.alpha, given.ground_truth]), [f.of_one(i) for f in given.fields]
+    return Sample(alpha, one(given.betas), on_grid, ground_truth, one(given.position), one(given.visible))
 
 
 def _enlarged(image: Tensor, hw: tuple[int, int]) -> Tensor:

@@ -1,4 +1,4 @@
-"""Bands for networks that are to serve any: made of red, green and blue at random, so that none of these is learned."""
+"""Random bands mixed from red, green and blue, so that networks learn no band in particular."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Spectra(NamedTuple):
 
     @classmethod
     def drawn(cls, batch: int, count: int, generator: Generator) -> Spectra:
-        """Half of the bands are of one colour, half are bent by a gamma, one in ten is inverted."""
+        """Half of the bands are of one colour, half have a gamma curve, one in ten is inverted."""
 
         def chance(p: float) -> Tensor:
             return torch.rand(batch, count, generator=generator) < p
@@ -34,8 +34,8 @@ class Spectra(NamedTuple):
         parts = torch.rand(batch, count, 3, generator=generator).square() + 1e-3
         one = torch.eye(3)[torch.randint(3, (batch, count), generator=generator)]
         mixture = torch.where(chance(0.5)[..., None], one, parts / parts.sum(-1, keepdim=True))
-        has_lens = 1.4 * torch.rand(batch, count, generator=generator) - 0.7
-        gamma = torch.where(chance(0.5), has_lens, 0.0).exp2()
+        exponent = 1.4 * torch.rand(batch, count, generator=generator) - 0.7
+        gamma = torch.where(chance(0.5), exponent, 0.0).exp2()
         low = 0.2 * torch.rand(batch, count, generator=generator)
         high = 1 - 0.4 * torch.rand(batch, count, generator=generator)
         inverted = chance(0.1)

@@ -1,4 +1,4 @@
-"""What a run shows while it goes on: a bar, a line for each step and each validation, images, TensorBoard."""
+"""Progress of a run: a bar, a line for each step and each validation, images, TensorBoard."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ HEADER = "step,loss,gradient,rate\n"
 
 
 class Watch:
-    """The first process's eyes; the others have none (`Watch(None, ...)` does nothing).
+    """Progress reports of the first process; in others `Watch(None, ...)` does nothing.
 
-    `steps.csv` has a line for each step and `log.jsonl` one for each validation. What they say of steps after
-    `step`, where the run goes on, is taken out.
+    `steps.csv` has a line for each step and `log.jsonl` one for each validation. Lines of steps after
+    `step`, where the run continues, are removed.
     """
 
     def __init__(self, config: TrainConfig | None, *, step: int = 0) -> None:
@@ -56,7 +56,7 @@ class Watch:
         self.bar.start()
 
     def step(self, step: int, loss: float, norm: float, rate: float, *, done: float, speed: float) -> None:
-        """Note one step; `done` is how much of the run is, `speed` in scenes a second."""
+        """Report one step; `done` is the completed fraction of the run, `speed` in scenes a second."""
         if self.config is None:
             return
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
@@ -66,7 +66,7 @@ class Watch:
                 self.board.add_scalar(name, value, step)
 
     def validated(self, facts: Mapping[str, float]) -> None:
-        """Print and keep what a validation found."""
+        """Report a validation."""
         if self.config is None:
             return
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
@@ -79,7 +79,7 @@ class Watch:
                 self.board.add_scalar(f"validation/{name}", facts[name], int(facts["step"]))
 
     def show(self, network: nn.Module, samples: list[Sample], step: int) -> None:
-        """Images of the validation: beta, alpha, fused, truth, confidence, side by side."""
+        """Images of the validation: beta, alpha, fused, ground truth, confidence, side by side."""
         if self.config is None:
             return
         sheet = contact_sheet(network, samples[:SHOWN])
@@ -88,12 +88,12 @@ class Watch:
             self.board.add_image("validation", sheet, step)
 
     def flush(self) -> None:
-        """Put what was noted on disk."""
+        """Flush the files."""
         if self.config is not None:
             self.steps.flush()
 
     def close(self) -> None:
-        """Put the bar away."""
+        """Close bar and files."""
         if self.config is None:
             return
         self.bar.stop()
@@ -104,7 +104,7 @@ class Watch:
 
 @torch.no_grad()
 def contact_sheet(network: nn.Module, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
-    """One row for the first scene of each group: beta (three bands, or one), alpha, fused, truth, confidence."""
+    """One row for the first scene of each group: beta (three bands, or one), alpha, fused, ground truth, confidence."""
     return torch.cat([_row(network, given) for given in samples], -2).cpu()
 
 
@@ -120,10 +120,10 @@ def _row(network: nn.Module, given: Sample) -> Tensor:
 
 
 def _keep_lines(path: Path, step: int, step_of: Any, *, header: str = "") -> None:
-    """Take out what a file says of steps after `step`, and a last line cut short."""
+    """Remove the lines of steps after `step`, and a last line cut short."""
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)[bool(header) :] if path.is_file() else []
-    kept = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
-    write_text(path, header + "".join(kept))
+    earlier = [line for line in lines if line.endswith("\n") and step_of(line) <= step]
+    write_text(path, header + "".join(earlier))
 
 
 def _board(folder: Path) -> Any:

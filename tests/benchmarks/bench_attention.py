@@ -1,5 +1,5 @@
 """Measures attention: `python -m tests.benchmarks.bench_attention` prints a table and writes RESULTS.md
-beside this file, whole or not at all.
+beside this file, atomically.
 
 The compiled backend of each device runs against two usual ways to do the same: (a) index keys and values at
 every position, matmul, softmax, matmul; (b) the same with `grid_sample`. Each measurement is a process of its
@@ -29,6 +29,7 @@ from torch.nn.functional import grid_sample
 from arraygeom.atomic import write_text
 from arraygeom.segments import Segments
 from pat.attention import attend
+from pat.evaluation.tables import markdown_header, markdown_row
 
 RESULTS = Path(__file__).with_name("RESULTS.md")
 REPEATS, ENOUGH = 9, 6.0
@@ -48,32 +49,34 @@ def field(ha: int, wa: int, samples: int, device: str) -> Segments:
     return Segments(start.to(device), end.to(device), torch.ones(ha, wa, dtype=torch.bool, device=device))
 
 
-def index_everything(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
+def index_everything(q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str) -> Tensor:
     """(a): (b, d, h, w, l) keys and values, nearest, from images that lie channels first, as they usually
     do."""
-    x, y = _pixels(k, look, samples)
+    x, y = _pixels(k, segments, samples)
     keys, values = (t.contiguous()[:, :, y, x] for t in (k, v))
     weight = torch.einsum("bdhw,bdhwl->bhwl", q, keys).softmax(-1)
     return torch.einsum("bhwl,bdhwl->bdhw", weight, values)
 
 
-def index_channels_last(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
+def index_channels_last(
+    q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str
+) -> Tensor:
     """(a) at its best: whole rows of channels are copied, (b, h, w, l, d)."""
-    x, y = _pixels(k, look, samples)
+    x, y = _pixels(k, segments, samples)
     keys, values = (t.permute(0, 2, 3, 1)[:, y, x] for t in (k, v))
     weight = torch.matmul(keys, q.permute(0, 2, 3, 1)[..., None]).squeeze(-1).softmax(-1)
     return torch.matmul(weight[..., None, :], values).squeeze(-2).permute(0, 3, 1, 2)
 
 
-def _pixels(k: Tensor, look: Segments, samples: int) -> tuple[Tensor, Tensor]:
-    xy = (look.positions(samples).xy + 0.5).floor().long()
+def _pixels(k: Tensor, segments: Segments, samples: int) -> tuple[Tensor, Tensor]:
+    xy = (segments.positions(samples).xy + 0.5).floor().long()
     return xy[..., 0].clamp(0, k.shape[3] - 1), xy[..., 1].clamp(0, k.shape[2] - 1)
 
 
-def grid_sampled(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
+def grid_sampled(q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str) -> Tensor:
     """(b): the same with `grid_sample`, nearest or bilinear."""
     b, _, ha, wa = q.shape
-    xy = look.positions(samples).xy.reshape(1, ha * wa, samples, 2)
+    xy = segments.positions(samples).xy.reshape(1, ha * wa, samples, 2)
     wh = xy.new_tensor([k.shape[3] - 1, k.shape[2] - 1])
     grid = (2 * xy / wh - 1).expand(b, -1, -1, -1).to(q.dtype)
     keys, values = (grid_sample(t, grid, mode=interpolation, align_corners=True) for t in (k, v))
@@ -82,8 +85,8 @@ def grid_sampled(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, 
 
 
 def fused(backend: str):
-    def run(q: Tensor, k: Tensor, v: Tensor, look: Segments, samples: int, interpolation: str) -> Tensor:
-        return attend(q, k, v, look, samples=samples, interpolation=interpolation, backend=backend)
+    def run(q: Tensor, k: Tensor, v: Tensor, segments: Segments, samples: int, interpolation: str) -> Tensor:
+        return attend(q, k, v, segments, samples=samples, interpolation=interpolation, backend=backend)
 
     return run
 
@@ -103,13 +106,13 @@ def measure(job: dict) -> dict:
     if job["method"] == ONE_THREAD:
         torch.set_num_threads(1)
     q, k, v = (features(ha, wa, d, dtype, device).requires_grad_(job["backward"]) for _ in range(3))
-    look, run = field(ha, wa, samples, device), METHODS[job["method"]]
+    segments, run = field(ha, wa, samples, device), METHODS[job["method"]]
     cotangent = torch.ones_like(q) if job["backward"] else None
 
     def once() -> float:
         _wait(device)
         begin = time.perf_counter()
-        out = run(q, k, v, look, samples, job["interpolation"])
+        out = run(q, k, v, segments, samples, job["interpolation"])
         if job["backward"]:
             torch.autograd.grad(out, (q, k, v), cotangent)
         _wait(device)
@@ -294,9 +297,8 @@ def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
     """One line of the table."""
     rate = rates[entry["method"] == ONE_THREAD]
     result, (shape, work, *_) = done[name(entry)], name(entry)
-    start = f"| {' | '.join(name(entry))} |"
     if "failed" in result:
-        return f"{start} {result['failed'][:80]} |" + " |" * (len(COLUMNS) - 5)
+        return markdown_row([*name(entry), result["failed"][:80], *[""] * (len(COLUMNS) - 5)])
     flops = (3 if entry["backward"] else 1) * 4 * entry["ha"] * entry["wa"] * entry["samples"] * entry["d"]
     least = (2 if entry["backward"] else 1) * result["unit"]
     against = [
@@ -315,7 +317,7 @@ def row(entry: dict, done: dict, rates: dict, bandwidth: float) -> str:
         f"{flops / result['time'] / 1e12:.2g} ({flops / result['time'] / rate:.0%})",
         f"{least / result['time'] / 1e9:.2g} ({least / result['time'] / bandwidth:.0%})",
     ]
-    return f"{start} {' | '.join(cells)} |"
+    return markdown_row([*name(entry), *cells])
 
 
 COLUMNS = (
@@ -343,7 +345,7 @@ def table(device: str, *, quick: bool) -> list[str]:
     )
     lines = [
         *("", f"## {device}", "", limits if here else "No GPU on this machine.", ""),
-        *(f"| {' | '.join(COLUMNS)} |", "|---" * len(COLUMNS) + "|"),
+        markdown_header(COLUMNS, align="l"),
     ]
     print("\n".join(lines), flush=True)
     done: dict = {}
@@ -389,13 +391,12 @@ def bars(done: dict, rates: dict) -> list[str]:
         "",
         "512x256, 80 samples, D = 64, float32, if not said otherwise:",
         "",
-        "| asked | | measured | |",
-        "|---" * 4 + "|",
+        markdown_header(["asked", "", "measured", ""], align="l"),
     ]
     for what, value, sign, bar in asked:
         reached = value >= bar if sign == ">=" else value <= bar
         verdict = "not measured" if math.isnan(value) else "reached" if reached else "missed"
-        lines.append(f"| {what} | {sign} {bar} | {value:.2f} | {verdict} |")
+        lines.append(markdown_row([what, f"{sign} {bar}", f"{value:.2f}", verdict]))
     return lines
 
 

@@ -20,10 +20,11 @@ from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
 from arraygeom.io import read_rig
 from calib.boards.bundle import adjust
-from calib.boards.calibrate import Calibration, calibrate, epipolar_errors, fit_alone
 from calib.boards.collect import collect_folder
+from calib.boards.rig import Calibration, calibrate, calibrate_single, epipolar_errors
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import errors_of, pose_errors
+from pat.evaluation.tables import markdown_header, markdown_row
+from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.rendered import BOARD
 from tests.calib.tracks import (
     CALISCOPE_BOARD,
@@ -77,7 +78,7 @@ def bumblebee_pairs(data: Path) -> Iterator[Figure]:
     )
     told = found.deviations()
     deviation = np.degrees(np.hypot(told["right.rotation.0"], told["right.rotation.1"]))
-    yield Figure("turn against published", f"{turn:.2f} degrees (own deviation {deviation:.2f})", "agreement")
+    yield Figure("rotation against published", f"{turn:.2f} degrees (own deviation {deviation:.2f})", "agreement")
     yield Figure("seconds", f"{seconds:.0f}", "")
 
 
@@ -85,20 +86,20 @@ def action_cameras(data: Path) -> Iterator[Figure]:
     folder, board = data / "calibration/pose2sim_4cam/intrinsics", parse_board("chessboard:4x7:60mm")
     for number, published in ACTION_CAMERAS.items():
         found = collect_folder(folder, board, patterns={"cam": f"int_cam{number:02d}_img/*.jpg"})
-        alone = fit_alone("cam", found.views["cam"], board)
+        alone = calibrate_single("cam", found.views["cam"], board)
         off = float(alone.camera.K[0, 0]) / published - 1
-        rms = alone.fit.scene.rms()
+        rms = alone.fit.problem.rms()
         yield Figure(f"action camera {number}: f", f"{100 * off:+.2f} % (RMS {rms:.3f} px)", "to 1.5 %")
 
 
 def tracks(data: Path) -> Iterator[Figure]:
-    scene, start = fifteen_cameras(data).scene, time.perf_counter()
-    found = adjust(scene, free_of(scene))
-    rms, seconds = rms_and_mean(found.scene)[0], time.perf_counter() - start
+    problem, start = fifteen_cameras(data).problem, time.perf_counter()
+    found = adjust(problem, free_of(problem))
+    rms, seconds = rms_and_mean(found.problem)[0], time.perf_counter() - start
     yield Figure("15 cameras, free points: RMS", f"{rms:.4f} px in {seconds:.0f} s", f"at most {FIFTEEN_RMS:.4f}, 60 s")
-    scene, start = caliscope(data).scene, time.perf_counter()
-    posed = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(scene.cameras)}
-    rms = rms_and_mean(adjust(scene, posed, rounds=0).scene)[0]
+    problem, start = caliscope(data).problem, time.perf_counter()
+    posed = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(problem.cameras)}
+    rms = rms_and_mean(adjust(problem, posed, rounds=0).problem)[0]
     seconds = time.perf_counter() - start
     yield Figure(
         "caliscope, free points, its intrinsics: RMS",
@@ -127,15 +128,15 @@ def rendered(boards: Path) -> Iterator[Figure]:
     yield Figure("rendered photographs", f"{len(found.frames)} frames, 4 cameras", "10 or more")
     noise = ", ".join(f"{name} {sigma:.3f}" for name, sigma in found.fit.sigma.items())
     yield Figure("noise of corners", f"{noise} px", "")
-    yield Figure("worst turn", f"{degrees:.4f} degrees", "at most 0.02")
-    yield Figure("worst place", f"{1e3 * metres:.3f} mm", "at most 0.2")
-    yield Figure("worst number", f"{np.abs(relative).max():.2f} deviations ({found.fit.names[worst]})", "at most 3")
-    yield Figure("chi-square of all numbers", f"{square:.0f} of {len(errors)}", "")
+    yield Figure("worst rotation", f"{degrees:.4f} degrees", "at most 0.02")
+    yield Figure("worst position", f"{1e3 * metres:.3f} mm", "at most 0.2")
+    yield Figure("worst parameter", f"{np.abs(relative).max():.2f} deviations ({found.fit.names[worst]})", "at most 3")
+    yield Figure("chi-square of all parameters", f"{square:.0f} of {len(errors)}", "")
     yield Figure("seconds", f"{seconds:.0f}", "")
 
 
 def of_folder(folder: Path, board: str, *, order: tuple[str, ...] | None = None) -> tuple[Calibration, float]:
-    """As `pat calibrate` does it; and the seconds it took."""
+    """The rig as by `pat calibrate`, and the seconds it took."""
     start, known = time.perf_counter(), parse_board(board)
     views = collect_folder(folder, known).views
     found = calibrate({name: views[name] for name in order or views}, known)
@@ -166,12 +167,12 @@ def main() -> None:
         "tracks": (tracks, options.data),
         "rendered": (rendered, options.boards),
     }
-    lines = ["| what | found | wanted |", "| --- | --- | --- |"]
+    lines = [markdown_header(["what", "found", "wanted"], align="l")]
     print(*lines, sep="\n")
     for name in options.only or tables:
         table, source = tables[name]
         for row in table(source) if source.is_dir() else [Figure(name, f"left out: no folder {source}", "")]:
-            lines.append("| " + " | ".join(row) + " |")
+            lines.append(markdown_row(row))
             print(lines[-1], flush=True)
     if options.out:
         write_text(options.out, "# How good calibration is\n\n" + "\n".join(lines) + "\n")

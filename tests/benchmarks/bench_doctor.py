@@ -4,8 +4,8 @@
 
 A case is a real pair and a random mistake made with its rig or its images. One that is no more than the rig's own
 misfit is drawn again: where lines move by less than 0.1 px, or by less than 3 times what the rig was off before, a
-mistake cannot be told from the drift of a rig. Shifts of a pixel or half of one are drawn for rigs alone that fit
-their own images to 0.17 px.
+mistake cannot be distinguished from the drift of a rig. Shifts of a pixel or half of one are drawn only for rigs that
+fit their own images to 0.17 px.
 """
 
 from __future__ import annotations
@@ -26,7 +26,8 @@ from arraygeom import Distortion, Pose, Rig, pixel_grid, sample
 from arraygeom.atomic import write_text
 from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.matches import match_cameras, seen_depths
-from calib.images.mistakes import TRANSPOSE, TURNS, on_cameras
+from calib.images.remedies import ROTATIONS, TRANSPOSE, on_cameras
+from pat.evaluation.tables import markdown_header, markdown_row
 from tests.calib.real import RealPair, every_pair
 
 Images = dict[str, Tensor]
@@ -38,7 +39,7 @@ MANY = 60
 
 @dataclass
 class Subject:
-    """A real pair that is in order, with its matched points and what the doctor says of it."""
+    """A real pair that is in order, with its matched points and misfit."""
 
     pair: RealPair
     matches: dict
@@ -110,8 +111,8 @@ def resized(rig: Rig, images: Images, g: Random) -> Made:
     return rig, images | changed
 
 
-def turned(rig: Rig, images: Images, g: Random) -> Made:
-    words = str(g.choice(list(TURNS)))
+def rotated(rig: Rig, images: Images, g: Random) -> Made:
+    words = str(g.choice(list(ROTATIONS)))
     return rig, images | {name: rotated_image(images[name], words) for name in some(rig.names, g)}
 
 
@@ -125,7 +126,7 @@ def rotated_image(image: Tensor, words: str) -> Tensor:
         lambda p: p.mT,
         lambda p: p.flip(-1, -2).mT,
     ]
-    return dict(zip(TURNS, changes))[words](image)
+    return dict(zip(ROTATIONS, changes))[words](image)
 
 
 def exchanged(rig: Rig, images: Images, g: Random) -> Made:
@@ -158,7 +159,7 @@ def undistorted(rig: Rig, name: str, image: Tensor) -> Tensor:
 MISTAKES: dict[str, Callable[[Rig, Images, Random], Made]] = {
     "nothing": nothing,
     "resized": resized,
-    "turned or mirrored": turned,
+    "rotated or mirrored": rotated,
     "cameras swapped": swapped,
     "pose inverted": inverted,
     "R transposed": transposed,
@@ -185,7 +186,7 @@ def subjects(data: Path) -> Iterator[Subject]:
         found = diagnose_matches(rig, {n: c.hw for n, c in cameras.items()}, matches)
         print(f"{pair.name:28s} {found.matches:4d} points, {found.before}", flush=True)
         if found.matches >= MANY:
-            yield Subject(pair._replace(rig=rig), matches, found.before.badness)
+            yield Subject(pair._replace(rig=rig), matches, found.before.penalised_misfit)
         else:
             print(f"left out: {pair.name}: few points")
 
@@ -202,7 +203,7 @@ def case(kind: str, pool: Sequence[Subject], g: Random) -> tuple[str, Diagnosis,
         same = all(images[n] is subject.pair.images[n] for n in images)
         matches = subject.matches if same else match_cameras(images)
         found = diagnose_matches(rig, sizes, matches)
-        visible = found.before.badness > max(subject.misfit + 0.1, 3 * subject.misfit)
+        visible = found.before.penalised_misfit > max(subject.misfit + 0.1, 3 * subject.misfit)
         if kind == "nothing" or visible or any(rig[n].hw != sizes[n] for n in sizes):
             return subject.pair.name, found, redrawn
     raise RuntimeError(f"no visible case of '{kind}'")
@@ -222,7 +223,7 @@ def confusions(data: Path, *, cases: int, seed: int, kinds: Sequence[str] = tupl
             label = found.named.kind
             if label != kind:
                 equal = kind in [r.kind for r in found.equal]
-                label += " (or the truth)" if equal else ""
+                label += " (or the true one)" if equal else ""
                 misses.append(f"{kind}: {name}: {found.verdict}; before {found.before}; after {found.after}")
                 totals["right or equal"] += equal
             totals["right"] += label == kind
@@ -230,10 +231,10 @@ def confusions(data: Path, *, cases: int, seed: int, kinds: Sequence[str] = tupl
             totals["all"] += 1
             named[label] += 1
         spoken = ", ".join(f"{label} {count}" for label, count in named.most_common())
-        lines.append(f"| {kind} | {cases} | {redrawn} | {spoken} |")
+        lines.append(markdown_row([kind, cases, redrawn, spoken]))
         print(lines[-1], flush=True)
-    head = "| mistake made | cases | drawn again | named |\n| --- | ---: | ---: | --- |\n"
-    return head + "\n".join(lines) + f"\n\n{dict(totals)}\n\n" + "\n".join(misses) + "\n"
+    head = markdown_header(["mistake made", "cases", "drawn again", "named"], align="lrrl")
+    return "\n".join([head, *lines]) + f"\n\n{dict(totals)}\n\n" + "\n".join(misses) + "\n"
 
 
 def main() -> None:
@@ -248,8 +249,8 @@ def main() -> None:
     text = confusions(options.data, cases=options.cases, seed=options.seed, kinds=options.only)
     print(text)
     if options.out:
-        told = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their images."
-        write_text(options.out, f"# Which mistakes the doctor names\n\n{told}\n\n{text}")
+        note = f"{options.cases} random cases of each mistake (seed {options.seed}) with real rigs and their images."
+        write_text(options.out, f"# Which remedies the doctor names\n\n{note}\n\n{text}")
 
 
 if __name__ == "__main__":

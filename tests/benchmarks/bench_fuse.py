@@ -1,6 +1,6 @@
 """Measures fusing a whole frame: `python -m tests.benchmarks.bench_fuse [--scale 0.5] [--threads 2]`.
 
-The array "wide field - narrow field" at a part of its size, with smooth random images: seconds of the survey and of
+The array "wide field - narrow field" at a part of its size, with smooth random images: seconds of the matching and of
 the network, what part of the latter convolutions take, and at what rate, beside the rate of this machine's matrix
 products with as many threads in the same run. `--full-runs` instead fuses the rendered frame of 4024x3036 under caps
 (`--caps 4GiB 8GiB 2GiB`; `pat systems run wide-narrow --full --max-memory ...`), in 4 to 6 minutes of a core each on
@@ -23,12 +23,16 @@ from torch.nn.functional import interpolate
 from torch.profiler import ProfilerActivity, profile
 from torch.utils.flop_counter import FlopCounterMode
 
-import pat.fusion.fuse
 from arraygeom import Rig
 from arraygeom.atomic import write_text
+from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
-from pat.fusion.tiles import survey_tiles, surveyed
+from pat.fusion.inputs import frame_inputs
+from pat.fusion.steps import steps_for
+from pat.fusion.tiles import fuse_tile
+from pat.fusion.views import Views
 from pat.media.images import read_image
+from pat.networks.pieces import Tile
 from pat.networks.weights import load_weights
 from pat.systems import load_system, run_system
 
@@ -63,34 +67,36 @@ def matmul_rate() -> float:
 
 
 def measure(scale: float) -> dict[str, str]:
-    """Survey and network by themselves, then convolutions within the latter."""
+    """Matching and network by themselves, then convolutions within the latter."""
     array, network = rig(scale), load_weights("mono-colour")
     hw = array["narrow"].hw
     images = {"narrow": image(1, hw, 0), "wide": image(3, array["wide"].hw, 1)}
-    own = images["narrow"][None]
-    beta = pat.fusion.fuse._prepare(network, array.pair("narrow", "wide"), images["wide"][None], None, None, "wide")
+    views = Views.of(array, images, alpha="narrow")
+    for step in steps_for(network, normalise=False):
+        views = step.do(views).views
+    frame = frame_inputs(network, views)
     small = rig(0.1)
     fuse(network, small, {n: image(i.shape[0], small[n].hw, 2) for n, i in images.items()}, alpha="narrow")
     begin = time.perf_counter()
-    beta = surveyed(network, own, beta, survey_tiles(network, hw))
-    surveying = time.perf_counter() - begin
-    whole = pat.fusion.fuse.Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
+    state = network.prepare(frame.inputs)
+    matching = time.perf_counter() - begin
+    whole = Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
     begin = time.perf_counter()
-    pat.fusion.fuse._fuse_tile(network, own, [beta], whole)
+    fuse_tile(network, frame, state, whole)
     fusing = time.perf_counter() - begin
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
-        pat.fusion.fuse._fuse_tile(network, own, [beta], whole)
+        fuse_tile(network, frame, state, whole)
     own_times = {event.key: event.self_cpu_time_total / 1e6 for event in profiled.key_averages()}
     convolving = sum(t for name, t in own_times.items() if "conv" in name)
     with FlopCounterMode(display=False) as counter:
-        pat.fusion.fuse._fuse_tile(network, own, [beta], whole)
+        fuse_tile(network, frame, state, whole)
     flops = sum(n for operation, n in counter.get_flop_counts()["Global"].items() if "conv" in str(operation))
     rate = matmul_rate()
     return {
         "alpha, pixels": f"{hw[1]}x{hw[0]}",
-        "survey (consensus)": f"{surveying:.2f} s",
+        "semi-global matching": f"{matching:.2f} s",
         "network": f"{fusing:.2f} s",
-        "both, of 4024x3036 in one piece": f"{(surveying + fusing) * 4024 * 3036 / (hw[0] * hw[1]):.0f} s",
+        "both, of 4024x3036 in one piece": f"{(matching + fusing) * 4024 * 3036 / (hw[0] * hw[1]):.0f} s",
         "convolutions in the network": f"{convolving:.2f} s, {convolving / sum(own_times.values()):.0%} of its time",
         "rate of the convolutions": f"{flops / convolving / 1e9:.0f} GFLOP/s",
         "rate of matrix products": f"{rate:.0f} GFLOP/s ({SIDE} squared)",
@@ -145,8 +151,7 @@ def main() -> None:
         put(f"wide-narrow, 4024x3036, under {cap}", text)
     if not given.full_runs:
         load = f"{given.threads} threads, load before: {os.getloadavg()[0]:.1f}\n"
-        rows = [f"| {name} | {value} |" for name, value in measure(given.scale).items()]
-        text = "\n".join([load, "| | |", "| --- | --- |", *rows])
+        text = f"{load}\n{markdown_table(['', ''], measure(given.scale).items(), align='l')}"
         print(text)
         put(f"A part of the frame, {given.threads} threads", text)
 

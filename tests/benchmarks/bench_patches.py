@@ -13,10 +13,10 @@ from pathlib import Path
 import torch
 
 from arraygeom import Camera, Pose, Rig, Sensor, intrinsics
-from pat.data import Patches, ScenePatches
+from pat.data import PatchGrid, ScenePatches
 from pat.data.patches import cut
 from pat.farm.backends import LayeredSettings
-from pat.synthesis.check import Limits
+from pat.synthesis.check import CheckLimits
 
 
 def rig() -> Rig:
@@ -40,10 +40,10 @@ def main() -> None:
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as folder:
         scene = Path(folder) / "scenes" / "000000"
-        LayeredSettings(oversampling=1).renderer(rig(), Limits()).render(0, scene)
+        LayeredSettings(oversampling=1).renderer(rig(), CheckLimits()).render(0, scene)
         size = sum(f.stat().st_size for f in scene.iterdir()) / 1e6
         begin = time.process_time()
-        cut(scene, Patches(), alpha="mono")
+        cut(scene, PatchGrid(), alpha="mono")
         cutting = time.process_time() - begin
         data = ScenePatches(folder)
         data[0]
@@ -51,7 +51,7 @@ def main() -> None:
         for i in range(len(data)):
             data[i]
         recording = time.process_time() - begin
-    count = Patches().count
+    count = PatchGrid().count
     print(f"a scene takes {size:.1f} MB of disk; reading it and cutting its {count} patches {cutting:.2f} s of a core")
     print(f"a patch: {1000 * cutting / count:.1f} ms to read and cut, {1000 * recording / count:.1f} ms to record")
 

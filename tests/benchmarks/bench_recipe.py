@@ -14,7 +14,6 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -24,12 +23,13 @@ import torch
 import tyro
 
 from arraygeom.atomic import write_text
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import load_weights
 from pat.synthesis.photos import PhotoBank
 from pat.training import loop, losses
 from pat.training.config import TrainConfig, load_config
 from pat.training.losses import validation
-from pat.training.samples import FIELDS, Sample, Source, photographs
+from pat.training.samples import FIELDS, Sample, SampleSource, photographs
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -54,8 +54,8 @@ VARIANTS = (
     Variant("loss: PSNR alone", {"loss": "psnr"}),
     Variant("loss: mean square", {"loss": "mse"}),
     Variant("no loss on the match", matching=False),
-    Variant("nothing carried within alpha", network={"carry_steps": ()}),
-    Variant("carried once, spacing 3", network={"carry_steps": (3,)}),
+    Variant("nothing carried within alpha", network={"propagation_steps": ()}),
+    Variant("carried once, spacing 3", network={"propagation_steps": (3,)}),
     Variant("luminance free", network={"keep_luminance": False}),
     Variant("window 3 px, 13 taps", network={"window": 3.0, "taps": 13}),
     Variant("head of 8 channels", network={"head_dim": 8}),
@@ -125,8 +125,8 @@ class Bench:
             facts = validation(load_weights(best), self.held_out)
         return Found(facts["psnr"], facts["matched"], seconds)
 
-    def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> Source:
-        return Source(bank, config, seed, FIELDS[config.field]())
+    def _source(self, config: TrainConfig, bank: PhotoBank, seed: int) -> SampleSource:
+        return SampleSource(bank, config, seed, FIELDS[config.field]())
 
 
 def unmatched(seen: object, given: Sample) -> torch.Tensor:
@@ -139,15 +139,14 @@ def lines(args: Args) -> Iterator[str]:
     h, w = args.hw
     yield f"mono-colour-small, {args.steps} steps of {args.batch} scenes of {h} x {w}, from nothing; one thread."
     yield f"Validated on {args.examined * args.batch} scenes of photographs held out.\n"
-    yield "| variant | PSNR, dB | to the base | matched within 1.5 px | seconds a step |"
-    yield "|---|---:|---:|---:|---:|"
+    yield markdown_header(["variant", "PSNR, dB", "to the base", "matched within 1.5 px", "seconds a step"])
     seeds: list[float] = []
-    row = partial("| {} | {:.2f} | {:+.2f} | {:.1%} | {:.2f} |".format)
     for number, variant in enumerate(VARIANTS):
         found = bench.trained(variant)
         if number < SEEDS:
             seeds.append(found.psnr)
-        yield row(variant.name, found.psnr, found.psnr - seeds[0], found.matched, found.seconds)
+        figures = f"{found.psnr:.2f}", f"{found.psnr - seeds[0]:+.2f}", f"{found.matched:.1%}", f"{found.seconds:.2f}"
+        yield markdown_row([variant.name, *figures])
     span = f"{min(seeds):.2f} to {max(seeds):.2f} dB"
     yield f"\nThe base with {SEEDS} seeds: {span}: differences of that size say nothing."
 

@@ -1,11 +1,11 @@
-"""What `pat rig refine` makes of rigs that were made worse: real pairs, the fast + slow array, rendered rigs.
+"""What `pat rig refine` recovers of perturbed rigs: real pairs, the fast + slow array, rendered rigs.
 
     python -m tests.benchmarks.bench_refine --draws 3 --out tests/benchmarks/RESULTS_refine.md
 
-Every camera is turned by 0.3 degrees and its principal point moved by 5 px, some way or other. Distances are medians
-over points that were held out, from their lines, in pixels of beta. *of points* is how far they are from the lines of
-an F of their own, fitted by MAGSAC++ to all points: less cannot be expected. *of the rig* is the rest, root mean
-square: what the nearest 85% of the points are off, less what they are off that F.
+Every camera is rotated by 0.3 degrees and its principal point moved by 5 px, in random directions. Distances are
+medians over held-out points, from their lines, in pixels of beta. *of points* is their distance from the lines of
+an F fitted by MAGSAC++ to all points: a lower bound. *of the rig* is the rest, root mean square of the nearest 85%
+of the points: their distance without that from this F.
 """
 
 from __future__ import annotations
@@ -23,24 +23,36 @@ from torch import Tensor
 from arraygeom import Link, Rig, View
 from arraygeom.atomic import write_text
 from arraygeom.pixels import coarse_grid
-from calib.images.from_images import start
+from calib.images.from_images import rig_from_images
 from calib.images.matches import Matches, fit_fundamental, line_distance, match_cameras
-from calib.images.refine import FREE, Agreement, Fit, agreement, line_distances, polish, refine, refine_matches, split
+from calib.images.refinement import (
+    FREE,
+    LineStatistics,
+    RefinementProblem,
+    line_distances,
+    line_statistics,
+    polish,
+    refine,
+    refine_matches,
+    split,
+)
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
-from pat.evaluation.ablation import Case, rendered_cases
+from pat.evaluation.ablation import AblationCase, rendered_cases
 from pat.evaluation.metrics import score
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.media.images import read_image
 from pat.networks.weights import load_weights
 from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
 from tests.calib.real import bumblebee, syntim
+from tests.calib.scenes import uninformed
 
 TURN, MOVE = math.radians(0.3), 5.0
 
 
 def worse(rig: Rig, g: torch.Generator) -> Rig:
-    """Every camera turned by 0.3 degrees, its principal point moved by 5 px."""
+    """Every camera rotated by 0.3 degrees, its principal point moved by 5 px."""
     changes = rig.parameters(free=["*.rotation", "*.centre"])
     drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
     return rig.perturbed({k: v / v.norm() * (TURN if k.endswith("rotation") else MOVE) for k, v in drawn.items()})
@@ -51,10 +63,7 @@ def median(values: Tensor) -> float:
 
 
 def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
-    yield (
-        "| real pair | points | of points | as published | made worse | refined | of the rig |\n| --- | "
-        + "---: | " * 6
-    )
+    yield markdown_header(["real pair", "points", "of points", "as published", "made worse", "refined", "of the rig"])
     for pair in (*syntim(data, ("Serfaty", "BatInria", "Billet", "SmRub", "Money", "Color", "Poly")), *bumblebee(data)):
         names = tuple(pair.images)
         rig = Rig({name: pair.rig[name] for name in names})
@@ -66,18 +75,18 @@ def real_pairs(data: Path, draws: int, g: torch.Generator) -> Iterator[str]:
         rest = [beyond(r[1], own) for r in results]
         cells = (pair.name, len(matches[names].alpha), f"{own.median:.2f}")
         published = f"{median(line_distances(rig, held_out)):.2f}"
-        yield "| " + " | ".join(map(str, (*cells, published, *map(_span, (before, after, rest))))) + " |"
+        yield markdown_row([*cells, published, *map(_span, (before, after, rest))])
 
 
-def own_agreement(pairs: dict) -> Agreement:
+def own_agreement(pairs: dict) -> LineStatistics:
     """How held-out points agree with an F fitted to all points."""
     _, held_out = split([pairs])
     (names, points), *_ = pairs.items()
-    return agreement(line_distance(held_out[names], fit_fundamental(points)))
+    return line_statistics(line_distance(held_out[names], fit_fundamental(points)))
 
 
-def beyond(found: Agreement, own: Agreement) -> float:
-    """What is left of a distance without that of the points themselves."""
+def beyond(found: LineStatistics, own: LineStatistics) -> float:
+    """A distance without that of the points themselves."""
     return math.sqrt(max(found.rms**2 - own.rms**2, 0.0))
 
 
@@ -87,11 +96,7 @@ def _span(values: list[float]) -> str:
 
 def fast_and_slow(data: Path) -> Iterator[str]:
     """F as published; as `pat rig refine` and `pat rig start` leave it, which find lenses; of the points' own."""
-    yield (
-        "| fast + slow | points held out | published F | F of all points | refined | started |\n| --- "
-        + "| ---: " * 5
-        + "|"
-    )
+    yield markdown_header(["fast + slow", "points held out", "published F", "F of all points", "refined", "started"])
     folder = data / "hfr_lfr"
     files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
     files |= {name: folder / SCENE / f"{name}_{SLOW_FRAME}.png" for name in SLOW}
@@ -101,52 +106,53 @@ def fast_and_slow(data: Path) -> Iterator[str]:
     rig = Rig(views, links={(FAST, name): Link(F) for name, F in published.items()})
     matches = match_cameras(images)
     _, held_out = split([matches])
-    rigs = refine_matches(rig, [matches]).rig, start(images).rig
+    rigs = refine_matches(rig, [matches]).rig, rig_from_images(images).rig
     for names in rig.links:
         points = {names: held_out[names]}
         own = own_agreement({names: matches[names]}).median
         before, *after = (median(line_distances(r, points)) for r in (rig, *rigs))
-        medians = " | ".join(f"{off:.2f}" for off in (before, own, *after))
-        yield f"| {names[1]} | {len(held_out[names].alpha)} | {medians} |"
+        medians = (f"{off:.2f}" for off in (before, own, *after))
+        yield markdown_row([names[1], len(held_out[names].alpha), *medians])
 
 
 def rendered_rigs(draws: int, g: torch.Generator, scenes: Path | None) -> Iterator[str]:
     """The sample array and scenes rendered before: their rigs are the truth, and so are the colours at alpha's view."""
-    head = "| rendered | draw | true rig | made worse | by points | and by the fusion's error | from images alone |"
-    yield head + "\n| --- | " + "---: | " * 6
+    yield markdown_header(
+        ["rendered", "draw", "true rig", "made worse", "by points", "and by the fusion's error", "from images alone"]
+    )
     network, sample = load_weights("mono-colour"), load_sample()
     found = rendered_cases(scenes) if scenes else ()
-    ours = Case("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))
+    ours = AblationCase("sample array", sample.rig, sample.images, sample.ground_truth, torch.empty(0))
     for case in chain([ours], found):
 
-        def psnr(rig: Rig, case: Case = case) -> float:
+        def psnr(rig: Rig, case: AblationCase = case) -> float:
             return score(fuse(network, rig, case.images, alpha=case.rig.names[0]).image.clamp(0, 1), case.ground_truth)[
                 0
             ]
 
-        true, alone = psnr(case.rig), psnr(start(case.images).rig)
+        true, alone = psnr(case.rig), psnr(rig_from_images(case.images).rig)
         for draw in range(1, draws + 1):
             bad = worse(case.rig, g)
             rigs = [bad, *(refine(bad, [case.images], attend=a).rig for a in (None, attend_with_statistics))]
             cells = [f"{p:.2f} dB" for p in (true, *map(psnr, rigs), alone)]
-            yield f"| {case.name} | {draw} | {' | '.join(cells)} |"
+            yield markdown_row([case.name, draw, *cells])
 
 
 def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
     """The fusion's error without any point, from rigs that are four fifths of the way back."""
-    yield "| sample array | four fifths back | by the fusion's error alone |\n| --- | ---: | ---: |"
+    yield markdown_header(["sample array", "four fifths back", "by the fusion's error alone"])
     sample = load_sample()
     points = match_cameras(sample.images)
     (names,) = points
     true = exact_points(sample.rig, names)
     for draw in range(1, draws + 1):
-        fit = Fit.of(worse(sample.rig, g), [points], free=FREE, sigma=None)
-        near = fit.prior()._replace(z=0.8 * fit.solve().z)
+        fit = RefinementProblem.of(worse(sample.rig, g), FREE, frames=[points])
+        near = uninformed(fit)._replace(z=0.8 * fit.solve().z)
         found, _ = polish(
             fit, near._replace(covariance=0.01 * near.covariance), [sample.images], attend_with_statistics
         )
         off = [median(line_distances(fit.after(z), {names: true})) for z in (near.z, found.z)]
-        yield f"| draw {draw} | {off[0]:.2f} px | {off[1]:.2f} px |"
+        yield markdown_row([f"draw {draw}", f"{off[0]:.2f} px", f"{off[1]:.2f} px"])
 
 
 def exact_points(rig: Rig, names: tuple[str, str]) -> Matches:
@@ -182,7 +188,7 @@ def main() -> None:
             print(line, flush=True)
             lines.append(line)
     if options.out:
-        write_text(options.out, "# What refining makes of rigs\n\n" + "\n".join(lines))
+        write_text(options.out, "# Refinement of rigs\n\n" + "\n".join(lines))
 
 
 if __name__ == "__main__":

@@ -23,6 +23,7 @@ import yaml
 
 from arraygeom import Camera, Pose, Rig, intrinsics
 from arraygeom.atomic import write_text
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.farm.folders import JobFolder
 from pat.farm.job import RenderConfig
 from pat.farm.run import render
@@ -63,7 +64,7 @@ def speed(name: str, facts: list[dict[str, Any]], seconds: float | None, workers
     """A row: scenes, scenes an hour by the clock (if it was theirs) and by their own seconds, and those."""
     each, cores = (mean(f[key] for f in facts) for key in ("seconds", "cpu_seconds"))
     whole = f"{3600 * len(facts) / seconds:.0f}" if seconds else ""
-    return f"| {name} | {len(facts)} | {whole} | {3600 * workers / each:.0f} | {each:.2f} | {cores:.2f} |"
+    return markdown_row([name, len(facts), whole, f"{3600 * workers / each:.0f}", f"{each:.2f}", f"{cores:.2f}"])
 
 
 def memory(facts: list[dict[str, Any]]) -> list[str]:
@@ -73,7 +74,7 @@ def memory(facts: list[dict[str, Any]]) -> list[str]:
         used = [f["memory_mb"] for f in facts if f["process"] == process]
         slope = float(np.polyfit(np.arange(len(used))[4:], used[4:], 1)[0]) if len(used) > 6 else float("nan")
         after = [f"{used[min(i, len(used)) - 1]:.0f}" for i in (1, 5, 10, 25, len(used))]
-        rows.append(f"| {len(used)} | {' | '.join(after)} | {max(used):.0f} | {slope:+.2f} |")
+        rows.append(markdown_row([len(used), *after, f"{max(used):.0f}", f"{slope:+.2f}"]))
     return rows
 
 
@@ -90,16 +91,16 @@ def report(scenes: int, slow_scenes: int, workers: int) -> str:
             f"`python -m tests.benchmarks.bench_render`: {workers} workers on {os.cpu_count()} cores, load before "
             f"{load:.1f}; two views of 512x384; {refused} seeds were refused by the check and cost time, too.",
             "",
-            "| | scenes | an hour, all counted | an hour, by s a scene | s a scene | core s a scene |",
-            "| --- | ---: | ---: | ---: | ---: | ---: |",
+            markdown_header(
+                ["", "scenes", "an hour, all counted", "an hour, by s a scene", "s a scene", "core s a scene"]
+            ),
             speed(names[0], fast, fast_seconds, workers),
             speed(f"{names[0]}, the scenes of the next row", fast[: len(slow)], None, workers),
             speed(names[1], slow, slow_seconds, workers),
             "",
             "MB of each worker after its scenes, none replaced:",
             "",
-            "| scenes | 1st | 5th | 10th | 25th | last | most | a scene adds |",
-            "| ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+            markdown_header(["scenes", "1st", "5th", "10th", "25th", "last", "most", "a scene adds"], align="r"),
             *memory(fast),
             "",
         ]

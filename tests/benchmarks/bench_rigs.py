@@ -17,9 +17,10 @@ import numpy as np
 import tyro
 
 from arraygeom.atomic import write_text
-from pat.evaluation.ablation import ALPHA, BETA, Case, layered_cases
+from pat.evaluation.ablation import ALPHA, BETA, AblationCase, layered_cases
 from pat.evaluation.baseline import classical
 from pat.evaluation.metrics import bootstrap_interval, score
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
@@ -56,7 +57,7 @@ class Args:
     """Markdown file for the table."""
 
 
-def ahead(networks: dict[str, FusionNetwork], case: Case) -> dict[str, float] | None:
+def ahead(networks: dict[str, FusionNetwork], case: AblationCase) -> dict[str, float] | None:
     """By how many dB each is ahead of the classical baseline; and the baseline's PSNR. None if nothing rectifies."""
     try:
         base = score(classical(case.rig, case.images, ALPHA, BETA), case.ground_truth).psnr
@@ -68,8 +69,7 @@ def ahead(networks: dict[str, FusionNetwork], case: Case) -> dict[str, float] | 
 
 def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
     yield f"{args.scenes} layered scenes of 240 x 320 a row; PSNR in dB, ahead of classical; [95% interval].\n"
-    yield "| rig | classical | " + " | ".join(f"{name} rigs | lost" for name in networks) + " |"
-    yield "|---" + "|---:" * (1 + 2 * len(networks)) + "|"
+    yield markdown_header(["rig", "classical", *(cell for name in networks for cell in (f"{name} rigs", "lost"))])
     reference: dict[str, float] = {}
     for kind, rigs in RIGS.items():
         cases = layered_cases(args.scenes, photos=args.photos, rigs=rigs, seed=7)
@@ -80,7 +80,7 @@ def lines(args: Args, networks: dict[str, FusionNetwork]) -> Iterator[str]:
             mean, (low, high) = float(np.mean(values)), bootstrap_interval(values)
             lost = reference.setdefault(name, mean) - mean
             cells += [f"{mean:+.2f} [{low:+.2f}, {high:+.2f}]", f"{lost:+.2f}"]
-        yield f"| {' | '.join(cells)} |"
+        yield markdown_row(cells)
 
 
 def main(args: Args) -> None:

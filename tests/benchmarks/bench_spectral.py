@@ -18,8 +18,9 @@ import tyro
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig
-from pat.evaluation.baseline import classical
+from pat.evaluation.baseline import classical, classical_baseline
 from pat.evaluation.metrics import score
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.media.colour import luminance
 from pat.networks.protocol import FusionNetwork
@@ -27,7 +28,6 @@ from pat.networks.weights import load_weights
 from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.rigs import RigDistribution
-from pat.systems.system import classical_baseline
 from pat.training.config import TrainConfig
 from pat.training.samples import photographs
 from pat.training.spectra import Spectra
@@ -109,9 +109,9 @@ def row(args: Args, networks: dict[str, FusionNetwork], places: int, random: int
 def main(args: Args) -> None:
     networks = {name: load_weights(name) for name in args.weights}
     print(f"{args.scenes} layered scenes of {HW[1]} x {HW[0]}, betas of half the resolution; mean PSNR / SSIM\n")
-    print("| bands | classical | " + " | ".join(networks) + " |\n|---" + "|---:" * (1 + len(networks)) + "|")
+    print(markdown_header(["bands", "classical", *networks]))
     for kind, (places, random) in KINDS.items():
-        print(f"| {kind} | {' | '.join(row(args, networks, places, random))} |", flush=True)
+        print(markdown_row([kind, *row(args, networks, places, random)]), flush=True)
 
 
 if __name__ == "__main__":

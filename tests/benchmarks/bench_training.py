@@ -32,7 +32,7 @@ from pat.networks.weights import Network
 from pat.training.config import TrainConfig, load_config
 from pat.training.loop import convolutions, in_bfloat16, new_network
 from pat.training.losses import Objective
-from pat.training.samples import FIELDS, Sample, Source
+from pat.training.samples import FIELDS, Sample, SampleSource
 
 
 @dataclass
@@ -87,7 +87,7 @@ def materialised(query: Tensor, key: Tensor, value: Tensor, index: Tensor) -> At
 def stored(given: Sample, folder: Path) -> list[Path]:
     """Index lists of a batch, one file a sample, as the official code keeps them."""
     h, w = given.alpha.shape[-2:]
-    found = given.looks[0].at(pixel_grid((h, w)).reshape(-1, 2))
+    found = given.fields[0].at(pixel_grid((h, w)).reshape(-1, 2))
     index = torch.where(found.mask, found.xy[..., 1] * w + found.xy[..., 0], -1.0).long()
     files = [folder / f"{i}.npy" for i in range(len(index))]
     for file, positions in zip(files, index):
@@ -95,8 +95,8 @@ def stored(given: Sample, folder: Path) -> list[Path]:
     return files
 
 
-def source(config: TrainConfig) -> Source:
-    return Source(sample_photographs(), config, 0, FIELDS[config.field]())
+def source(config: TrainConfig) -> SampleSource:
+    return SampleSource(sample_photographs(), config, 0, FIELDS[config.field]())
 
 
 def step(objective: Objective, given: Sample, adam: torch.optim.Optimizer) -> None:
@@ -138,18 +138,18 @@ def attention(objective: Objective, given: Sample, straight: Sample, repeats: in
     b, _, h, w = given.alpha.shape
     q, k, v = (torch.randn(b, 64, h, w, requires_grad=True) for _ in range(3))
     x = pixel_grid((h, w)).reshape(-1, 2)
-    found = given.looks[0].at(x)
+    found = given.fields[0].at(x)
     index = torch.where(found.mask, found.xy[..., 1] * w + found.xy[..., 0], -1.0).long()
 
     def ours(one: Sample) -> None:
-        attend(q, k, v, one.looks[0].at, samples=None, interpolation="nearest").square().sum().backward()
+        attend(q, k, v, one.fields[0].at, samples=None, interpolation="nearest").square().sum().backward()
 
     print("\nof which attention and where to look, forward and backward:")
     print(f"  official      {timed(lambda: materialised(q, k, v, index).value.square().sum().backward(), repeats)}")
     print(f"  ours, nearest {timed(lambda: ours(given), repeats)}")
     print(f"  ours, along   {timed(lambda: ours(straight), repeats)}")
-    print(f"  field of nearest pixels alone  {timed(lambda: given.looks[0].at(x), repeats)}")
-    print(f"  field of segments alone        {timed(lambda: straight.looks[0].at(x), repeats)}")
+    print(f"  field of nearest pixels alone  {timed(lambda: given.fields[0].at(x), repeats)}")
+    print(f"  field of segments alone        {timed(lambda: straight.fields[0].at(x), repeats)}")
 
 
 HOW = {"float32": (False, False), "bfloat16": (True, False), "compiled": (False, True)}

@@ -11,7 +11,8 @@ import time
 import torch
 from torch.utils.flop_counter import FlopCounterMode
 
-from pat.evaluation.stereo import rectified_fusion
+from pat.evaluation.protocols import rectified_fusion
+from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.weights import SHIPPED, load_weights
 
 HW = (384, 448)
@@ -23,7 +24,7 @@ def main() -> None:
     g = torch.Generator().manual_seed(0)
     alpha, beta = torch.rand(1, *HW, generator=g), torch.rand(3, HW[0] // 2, HW[1] // 2, generator=g)
     print(f"{HW[1]} x {HW[0]} pixels, one thread; seconds of the processor: median (least to most) of {REPEATS}\n")
-    print("| weights | parameters | GFLOP | seconds |\n|---|---:|---:|---:|")
+    print(markdown_header(["weights", "parameters", "GFLOP", "seconds"]))
     for path in sorted(SHIPPED.glob("*.safetensors")):
         network = load_weights(path)
         fuse = rectified_fusion(network)
@@ -36,7 +37,8 @@ def main() -> None:
             seconds.append(time.process_time() - began)
         parameters = sum(p.numel() for p in network.parameters())
         spread = f"{statistics.median(seconds):.2f} ({min(seconds):.2f} to {max(seconds):.2f})"
-        print(f"| {path.stem} | {parameters:,} | {counter.get_total_flops() / 1e9:.1f} | {spread} |", flush=True)
+        flops = f"{counter.get_total_flops() / 1e9:.1f}"
+        print(markdown_row([path.stem, f"{parameters:,}", flops, spread]), flush=True)
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def fox(data: Path) -> Iterator[RealPair]:
 
 
 def ball(data: Path) -> Iterator[RealPair]:
-    """Rendered views with exact cameras; one is turned by 90 degrees."""
+    """Rendered views with exact cameras; one is rotated by 90 degrees."""
     folder = data / "rigs" / "pycalib_gopro15" / "mvs"
     cameras, files = {}, {f"cam{i}": folder / f"cam{i}.png" for i in (0, 1, 2, 3)}
     for name, file in files.items():

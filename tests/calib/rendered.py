@@ -1,4 +1,4 @@
-"""Rendered photographs of a ChArUco board by an array whose every number is known.
+"""Rendered photographs of a ChArUco board by an array whose parameters are all known.
 
     python -m tests.calib.rendered --out out/boards
 
@@ -20,10 +20,10 @@ import torch
 from arraygeom import Camera, Pose, Rig, rotation_from_vector
 from arraygeom.sensor import Sensor
 from pat.synthesis.boards import inner_corners
-from pat.synthesis.scene import Board
-from tests.calib.boards_seen import camera, tensor
+from pat.synthesis.scene import BoardObject
+from tests.calib.board_scenes import camera, tensor
 
-SHEET = Board(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
+SHEET = BoardObject(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
 BOARD = "charuco:12x9:60mm:45mm:5x5_250"
 DEPTHS = 0.9, 2.6
 TILT = 40.0
@@ -46,7 +46,7 @@ def rig() -> Rig:
 
 
 def board_poses(cameras: Rig, count: int = POSES, *, seed: int = 0) -> list[Pose]:
-    """`world_from_board`: held by each camera in turn to some place of its image, in view of the others too."""
+    """`world_from_board`: in front of each camera in turn, at a random position, visible to the others too."""
     random = np.random.default_rng(seed)
     found: list[Pose] = []
     while len(found) < count:

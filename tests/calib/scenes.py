@@ -1,4 +1,4 @@
-"""Rigs, points and images whose truth is known."""
+"""Rigs, points and images with known ground truth."""
 
 import cv2
 import numpy as np
@@ -6,6 +6,7 @@ import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
 from calib.images.matches import Matches
+from calib.images.refinement import RefinementProblem, Solution
 
 HW = (240, 320)
 
@@ -22,7 +23,7 @@ def vector(*numbers) -> torch.Tensor:
 
 
 def unlike_pair(*, lens: bool = False) -> Rig:
-    """Two cameras with nothing in common: other sizes, focal lengths, principal points, turned, apart."""
+    """Two cameras with nothing in common: other sizes, focal lengths, principal points, rotated, apart."""
     first = Camera(
         K=intrinsics((300.0, 310.0), HW, (170.0, 110.0)),
         cam_from_world=Pose.from_centre(rotation_from_vector(vector(0.1, -0.2, 0.05)), vector(0.3, 0.1, -0.2)),
@@ -44,6 +45,13 @@ def rectified_pair() -> Rig:
     left = Camera(K=intrinsics(300.0, HW), cam_from_world=Pose.identity(), hw=HW)
     right = left.replace(cam_from_world=Pose(torch.eye(3).double(), vector(-0.2, 0, 0)))
     return Rig({"left": left, "right": right}, depth=(1.5, 8.0))
+
+
+def uninformed(fit: RefinementProblem) -> Solution:
+    """The prior of a fit as a solution: no change, give or take a standard deviation."""
+    n = sum(len(parameter.sigma) for parameter in fit.parameters)
+    z, covariance = torch.zeros(n, dtype=torch.float64), torch.eye(n, dtype=torch.float64)
+    return Solution(z, torch.ones(n, dtype=torch.bool), covariance)
 
 
 def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dict[tuple[str, str], Matches]:

@@ -7,21 +7,21 @@ import pytest
 import torch
 
 from arraygeom import Rig
-from calib.boards.calibrate import calibrate
 from calib.boards.collect import collect_folder
+from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.images.doctor import diagnose, diagnose_matches
 from calib.images.matches import match_cameras
-from calib.images.refine import refine_matches
+from calib.images.refinement import refine_matches
 from tests.benchmarks.bench_doctor import MISTAKES
 from tests.benchmarks.bench_refine import worse
-from tests.calib.boards_seen import errors_of, pose_errors
+from tests.calib.board_scenes import errors_of, pose_errors
 from tests.calib.real import bumblebee, syntim
 from tests.calib.rendered import BOARD, photograph
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["resized", "turned or mirrored", "cameras swapped", "pose inverted", "distortion"])
+@pytest.mark.parametrize("kind", ["resized", "rotated or mirrored", "cameras swapped", "pose inverted", "distortion"])
 def test_mistakes_with_a_stereo_head_are_named(shared_data, kind):
     (pair, *_) = bumblebee(shared_data, ("chair01",))
     rig, images = MISTAKES[kind](pair.rig, pair.images, np.random.default_rng(3))

@@ -1,32 +1,57 @@
-"""Corners that other tools' cameras saw, with the rigs and the reprojection errors those tools published."""
+"""Corners observed in other tools' data sets, with the published rigs and reprojection errors."""
 
 from __future__ import annotations
 
 import bz2
 import csv
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from arraygeom import Rig, triangulate
 from arraygeom.io import read_rig
-from calib.boards.bundle import FreePoints, Observations, Scene, parameter_names
+from calib.boards.bundle import BundleProblem, Observations, parameter_names
 from calib.boards.detect import Detection
-from calib.boards.intrinsics import Views
+from calib.boards.intrinsics import BoardViews
 
 CALISCOPE_BOARD = "charuco:4x5:54mm"
 CALISCOPE_RMS, FIFTEEN_RMS = 1.6625, 0.8070
 """The published rigs' own reprojection errors (root mean square, pixels) on the published corners."""
 
 
+@dataclass(frozen=True)
+class FreePoints:
+    """Independent points in the world, metres: the `Structure` of tracks without a board."""
+
+    X: Float[np.ndarray, "b 3"]
+    width: ClassVar[int] = 3
+
+    def __len__(self) -> int:
+        return len(self.X)
+
+    def world(self, seen: Observations) -> Float[np.ndarray, "n 3"]:
+        """The observed points in the world, metres."""
+        return self.X[seen.block]
+
+    def jacobian(self, seen: Observations) -> Float[np.ndarray, "n 3 3"]:
+        """The identity."""
+        return np.broadcast_to(np.eye(3), (len(seen.block), 3, 3))
+
+    def stepped(self, change: Float[np.ndarray, "b 3"]) -> FreePoints:
+        """The points after a change."""
+        return FreePoints(self.X + change)
+
+
 class Tracks(NamedTuple):
     """A published rig, and its corners as the images' own points."""
 
     rig: Rig
-    scene: Scene
+    problem: BundleProblem
 
 
 def fifteen_cameras(data: Path) -> Tracks:
@@ -44,7 +69,7 @@ def fifteen_cameras(data: Path) -> Tracks:
     observations = {
         name: Observations(np.flatnonzero(s), np.zeros((s.sum(), 3)), p[s]) for name, s, p in zip(rig.names, seen, x)
     }
-    return Tracks(rig, Scene(dict(rig.cameras), FreePoints(points), observations))
+    return Tracks(rig, BundleProblem(dict(rig.cameras), FreePoints(points), observations))
 
 
 def caliscope(data: Path) -> Tracks:
@@ -63,34 +88,34 @@ def caliscope(data: Path) -> Tracks:
         name: Observations(np.array([i for i, _, _ in s]), np.zeros((len(s), 3)), np.array([[x, y] for _, x, y in s]))
         for name, s in seen.items()
     }
-    return Tracks(rig, Scene(dict(rig.cameras), FreePoints(np.array(list(corners.values()))), observations))
+    return Tracks(rig, BundleProblem(dict(rig.cameras), FreePoints(np.array(list(corners.values()))), observations))
 
 
-def caliscope_views(data: Path) -> dict[str, Views]:
+def caliscope_views(data: Path) -> dict[str, BoardViews]:
     """The same corners as views of a board."""
     found: dict[str, dict[int, list]] = {}
     for row in _caliscope_rows(data):
         corner = int(row["keypoint_id"]), float(row["img_loc_x"]), float(row["img_loc_y"])
         found.setdefault(f"cam{row['cam_id']}", {}).setdefault(int(row["sync_index"]), []).append(corner)
     return {
-        name: Views((720, 1280), {k: _detection(corners) for k, corners in frames.items() if len(corners) >= 6})
+        name: BoardViews((720, 1280), {k: _detection(corners) for k, corners in frames.items() if len(corners) >= 6})
         for name, frames in sorted(found.items())
     }
 
 
-def free_of(scene: Scene, *, lens: int = 5) -> dict[str, np.ndarray]:
+def free_of(problem: BundleProblem, *, lens: int = 5) -> dict[str, np.ndarray]:
     """All numbers but the first camera's pose and the lens's later terms."""
     free = {}
-    for index, (name, c) in enumerate(scene.cameras.items()):
+    for index, (name, c) in enumerate(problem.cameras.items()):
         free[name] = np.ones(len(parameter_names(c)), dtype=bool)
         free[name][:6] = index > 0
         free[name][10 + lens :] = False
     return free
 
 
-def rms_and_mean(scene: Scene) -> tuple[float, float]:
+def rms_and_mean(problem: BundleProblem) -> tuple[float, float]:
     """Of the residuals' lengths, pixels."""
-    lengths = np.concatenate([np.linalg.norm(r, axis=1) for r in scene.residuals().values()])
+    lengths = np.concatenate([np.linalg.norm(r, axis=1) for r in problem.residuals().values()])
     return float(np.sqrt((lengths**2).mean())), float(lengths.mean())
 
 

@@ -22,7 +22,7 @@ _MIRRORED = "MIRROR"
 
 
 @dataclass(frozen=True)
-class Stage:
+class BuiltScene:
     """A scene in Blender: its objects in order, and what to do to light and paint it in a spectrum."""
 
     objects: list[Any]
@@ -34,9 +34,9 @@ class Stage:
             paint(spectrum)
 
 
-def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> Stage:
+def build(bpy: Any, scene: Scene, world: Any, scratch: Path) -> BuiltScene:
     """All objects and lights of a scene. `scratch` is a folder for files that are needed until the end."""
-    stage = Stage([], [])
+    stage = BuiltScene([], [])
     for i, thing in enumerate(scene.objects):
         item = _object(bpy, thing)
         item.pass_index = i + 1
@@ -68,7 +68,7 @@ def _object(bpy: Any, thing: Object) -> Any:
     return item
 
 
-def _light(bpy: Any, light: Light, stage: Stage) -> None:
+def _light(bpy: Any, light: Light, stage: BuiltScene) -> None:
     data = bpy.data.lights.new(light.kind, light.kind.upper())
     data.energy = light.power
     _set_size(data, light)
@@ -91,7 +91,7 @@ def _set_size(data: Any, light: Light) -> None:
 
 
 def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float, float]:
-    """The quaternion (w, x, y, z) that turns -z, where lamps shine, to a direction."""
+    """The quaternion (w, x, y, z) that rotates -z, the lamps' axis, to a direction."""
     d = np.asarray(direction) / np.linalg.norm(direction)
     if d[2] > 1 - 1e-9:
         return 0.0, 1.0, 0.0, 0.0
@@ -100,7 +100,7 @@ def _towards(direction: tuple[float, float, float]) -> tuple[float, float, float
     return w, x, y, z
 
 
-def _world(world: Any, given: World, stage: Stage) -> None:
+def _world(world: Any, given: World, stage: BuiltScene) -> None:
     background = world.node_tree.nodes["Background"]
 
     def paint(spectrum: Spectrum) -> None:
@@ -113,7 +113,7 @@ def _world(world: Any, given: World, stage: Stage) -> None:
 
 
 class _Nodes:
-    """A node tree, with short words for what is needed here."""
+    """A node tree, with shorthand for the operations used here."""
 
     def __init__(self, tree: Any):
         self.tree = tree
@@ -144,7 +144,7 @@ class _Nodes:
         return node.outputs[0]
 
 
-def _material(bpy: Any, thing: Object, stage: Stage, scratch: Path) -> Any:
+def _material(bpy: Any, thing: Object, stage: BuiltScene, scratch: Path) -> Any:
     material = thing.material
     made = bpy.data.materials.new(thing.name)
     compat.use_nodes(made)
@@ -174,8 +174,8 @@ def _principled(material: Material) -> dict[str, float]:
     }
 
 
-def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> tuple[Any, Any]:
-    """The output that has the paint, and the one that has the height of bumps (None for images)."""
+def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> tuple[Any, Any]:
+    """The outputs of colour and of bump height (None for images)."""
     if texture.kind in ("image", "board"):
         return _image(bpy, nodes, texture, stage, scratch), None
     height = _PATTERNS[texture.kind](nodes, texture)
@@ -187,7 +187,7 @@ def _texture(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: P
 
 
 def _set_ramp(ramp: Any, texture: Texture) -> None:
-    """One stop for each paint; patterns that have steps keep them."""
+    """One stop for each paint; stepped patterns keep their steps."""
     stepped = texture.kind in _STEPS
     ramp.interpolation = "CONSTANT" if stepped else "LINEAR"
     n = len(texture.paints)
@@ -204,8 +204,8 @@ def _paint_ramp(ramp: Any, paints: tuple[Paint, ...], spectrum: Spectrum) -> Non
         stop.color = (*colour(spectrum, paint.rgb, paint.nir), 1.0)
 
 
-def _place(nodes: _Nodes, texture: Texture, source: str = "Object", scale: float = 1.0) -> Any:
-    """Where on the texture: the object's coordinates (or those along its surface) times the scale, shifted."""
+def _coordinates(nodes: _Nodes, texture: Texture, source: str = "Object", scale: float = 1.0) -> Any:
+    """Texture coordinates: the object's (or those along its surface) times the scale, shifted."""
     where = nodes.new("TexCoord").outputs[source]
     return nodes.vector("MULTIPLY_ADD", where, (scale * texture.scale,) * 3, texture.offset)
 
@@ -214,7 +214,7 @@ def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
     if not texture.grain:
         return paint
     noise = nodes.new("TexNoise")
-    nodes.give(noise.inputs["Vector"], _place(nodes, texture, scale=4.0))
+    nodes.give(noise.inputs["Vector"], _coordinates(nodes, texture, scale=4.0))
     noise.inputs["Scale"].default_value = 1.0
     noise.inputs["Detail"].default_value = 3.0
     grain = nodes.number("MULTIPLY_ADD", compat.factor(noise), 3 * texture.grain, 1 - 1.5 * texture.grain)
@@ -224,10 +224,10 @@ def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
     return node.outputs[0]
 
 
-def _pattern(kind: str, source: str = "Object", **inputs: float) -> Callable[[_Nodes, Texture], Any]:
+def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Texture], Any]:
     def make(nodes: _Nodes, texture: Texture) -> Any:
         node = nodes.new(f"Tex{kind}")
-        nodes.give(node.inputs["Vector"], _place(nodes, texture, source))
+        nodes.give(node.inputs["Vector"], _coordinates(nodes, texture))
         for name, value in inputs.items():
             node.inputs[name].default_value = value
         if "Distortion" in node.inputs and texture.distortion:
@@ -239,7 +239,7 @@ def _pattern(kind: str, source: str = "Object", **inputs: float) -> Callable[[_N
 
 def _voronoi(nodes: _Nodes, texture: Texture) -> Any:
     node = nodes.new("TexVoronoi")
-    nodes.give(node.inputs["Vector"], _place(nodes, texture))
+    nodes.give(node.inputs["Vector"], _coordinates(nodes, texture))
     node.inputs["Scale"].default_value = 1.0
     split = nodes.new("SeparateXYZ")
     nodes.give(split.inputs[0], node.outputs["Color"])
@@ -248,7 +248,7 @@ def _voronoi(nodes: _Nodes, texture: Texture) -> Any:
 
 def _brick(nodes: _Nodes, texture: Texture) -> Any:
     node = nodes.new("TexBrick")
-    nodes.give(node.inputs["Vector"], _place(nodes, texture, "UV"))
+    nodes.give(node.inputs["Vector"], _coordinates(nodes, texture, "UV"))
     greys = {"Color1": 0.0, "Color2": 0.7, "Mortar": 1.0}
     for name, grey in greys.items():
         node.inputs[name].default_value = (grey, grey, grey, 1.0)
@@ -273,8 +273,8 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 }
 
 
-def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Path) -> Any:
-    image = _image(bpy, texture, scratch)
+def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> Any:
+    image = _loaded(bpy, texture, scratch)
     node = nodes.new("TexImage", image=image, extension=_MIRRORED)
     (w, h), (left, top) = _laid(image.size, texture)
     onto = (1 / w, -1 / h, 0), (left / w + texture.offset[0], 1 - top / h + texture.offset[1], 0)
@@ -294,7 +294,7 @@ def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: Stage, scratch: Pat
 
 
 def _laid(wh: tuple[int, int], texture: Texture) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Metres that an image covers, and where on it the surface's corner is. Boards are centred, true to scale."""
+    """Size of an image in metres, and the surface's corner on it. Boards are centred, true to scale."""
     if texture.board is None:
         return (1 / texture.scale, wh[1] / wh[0] / texture.scale), (0, 0)
     w, h = (n * texture.board.square / PIXELS for n in wh)
@@ -314,7 +314,7 @@ def _infrared(nodes: _Nodes, rgb: Any) -> Any:
     return joined.outputs[0]
 
 
-def _image(bpy: Any, texture: Texture, scratch: Path) -> Any:
+def _loaded(bpy: Any, texture: Texture, scratch: Path) -> Any:
     if texture.kind == "image":
         if not Path(texture.image).is_file():
             raise ValueError(f"{texture.image or 'a texture without a file'}: no such image for a texture")

@@ -1,4 +1,4 @@
-"""Rendering from a process that never imports bpy: worker processes, asked over pipes."""
+"""Rendering from a process that does not import bpy: worker processes, connected by pipes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _TAIL = 2000
 
 
 class RenderError(RuntimeError):
-    """A scene that could not be rendered: one line says why. `crashed` if the process died or hung."""
+    """A scene that could not be rendered: the message is one line. `crashed` if the process died or hung."""
 
     def __init__(self, message: str, *, crashed: bool = False):
         super().__init__(message)
@@ -65,7 +65,7 @@ class Worker:
     def render(
         self, scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings, timeout: float | None = None
     ) -> Rendered:
-        """As `render`, in this worker."""
+        """Like `render`, in this worker."""
         for name, camera in rig.cameras.items():
             lens_for(camera, name)
         with tempfile.TemporaryDirectory(prefix="pat-request-") as folder:
@@ -110,13 +110,13 @@ class Worker:
         code = process.wait()
         self._process = None
         self._log.seek(0)
-        said = [line for line in self._log.read()[-_TAIL:].splitlines() if line.strip()]
+        lines = [line for line in self._log.read()[-_TAIL:].splitlines() if line.strip()]
         cause = signal.Signals(-code).name if code < 0 else f"exit status {code}"
-        return RenderError(f"the rendering process died ({cause}){': ' + said[-1] if said else ''}", crashed=True)
+        return RenderError(f"the rendering process died ({cause}){': ' + lines[-1] if lines else ''}", crashed=True)
 
 
 def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings, timeout: float | None = None) -> Rendered:
-    """Render a scene into the folder `out`, which appears whole, in a process of its own.
+    """Render a scene into the folder `out`, atomically, in a process of its own.
 
     Raises ValueError for what cannot be rendered (one line: skew, a camera inside an object, a missing library),
     RenderError if the process dies or takes longer than `timeout` seconds.

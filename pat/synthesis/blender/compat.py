@@ -1,4 +1,4 @@
-"""All that differs between versions of Blender, found by looking at what is there; and the only import of bpy."""
+"""Differences between versions of Blender, by feature detection; and the only import of bpy."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def _not_installed(version: tuple[int, int]) -> str:
 
 
 def new_scene(bpy: Any) -> Any:
-    """An empty scene, everything at its default. All references to former data are dead."""
+    """An empty scene, everything at its default. References to former data become invalid."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
     scene = bpy.context.scene
     scene.world = bpy.data.worlds.new("world")
@@ -46,10 +46,10 @@ def new_scene(bpy: Any) -> Any:
     return scene
 
 
-def use_nodes(thing: Any) -> None:
+def use_nodes(item: Any) -> None:
     """Give a material or world its nodes, where they are not always there (before 5.0)."""
-    if thing.node_tree is None:
-        thing.use_nodes = True
+    if item.node_tree is None:
+        item.use_nodes = True
 
 
 def eevee(scene: Any) -> str:
@@ -86,9 +86,9 @@ def index_name(channels: Mapping[str, Any]) -> str:
     return next(name for name in _PASSES["index"] if name in channels)
 
 
-def make_linear(thing: Any) -> None:
+def make_linear(item: Any) -> None:
     """Make all keys of an object linear. Works with the layered actions of 4.4 and newer."""
-    animation = thing.animation_data
+    animation = item.animation_data
     channels = animation.action.layers[0].strips[0].channelbag(animation.action_slot)
     for curve in channels.fcurves:
         for key in curve.keyframe_points:

@@ -1,4 +1,4 @@
-"""What Blender can render of a camera: a pinhole with square axes; and how its image becomes the camera's."""
+"""The pinhole that Blender renders for a camera, and the resampling of its image to the camera's."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from scipy.ndimage import map_coordinates
 from torch import Tensor
 
 from arraygeom.camera import Camera, View
-from arraygeom.pixels import HW, map_homogeneous, pixel_grid
+from arraygeom.pixels import map_homogeneous, pixel_grid
 from arraygeom.pose import Pose
 from arraygeom.sampling import sample
 
 from ..surfaces import depth_between
 
 WIDEST = math.radians(80)
-"""The largest angle off axis that a plane image can cover at all sensibly."""
+"""The largest angle off axis that a plane image covers."""
 
 _MARGIN = 3
 _MOST_PIXELS = 64e6
@@ -36,12 +36,12 @@ class Lens(NamedTuple):
     def resampled(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
         """Colours, by cubic splines; 0 where the lens sees nothing.
 
-        (The bicubic kernel of `grid_sample` moves straight slopes by up to 0.05 pixels, splines do not.)
+        (The bicubic kernel of `grid_sample` shifts linear ramps by up to 0.05 pixels, splines do not.)
         """
         if self.x is None or self.valid is None:
             return image
-        places = self.x.movedim(-1, 0).flip(0).numpy()
-        planes = [map_coordinates(plane, places, order=3, mode="mirror") for plane in image.numpy()]
+        positions = self.x.movedim(-1, 0).flip(0).numpy()
+        planes = [map_coordinates(plane, positions, order=3, mode="mirror") for plane in image.numpy()]
         return torch.where(self.valid, torch.from_numpy(np.stack(planes)).clamp(min=0), 0.0)
 
     def nearest(self, image: Float[Tensor, "c h1 w1"]) -> Float[Tensor, "c h2 w2"]:
@@ -53,7 +53,7 @@ class Lens(NamedTuple):
         )
 
     def depth(self, depth: Float[Tensor, "h1 w1"], index: Int[Tensor, "h1 w1"]) -> Float[Tensor, "h2 w2"]:
-        """Depth along the very rays, exact on planes: beside edges the nearest pixel's surface is continued to them.
+        """Depth along the exact rays, exact on planes: beside edges the nearest pixel's surface is extrapolated.
 
         NaN where nothing is seen.
         """
@@ -99,7 +99,7 @@ def lens_for(camera: View, name: str) -> Lens:
 
 
 def _upright(camera: Camera, name: str) -> Camera:
-    """The same pinhole with K upper triangular: K = K' Q with a turn Q about the optical axis, which the pose takes."""
+    """The same pinhole with K upper triangular: K = K' Q with a rotation Q about the optical axis, part of the pose."""
     K = camera.K
     angle = torch.atan2(K[1, 0], K[1, 1])
     c, s = angle.cos(), angle.sin()
@@ -146,8 +146,3 @@ def _finest(plane: Float[Tensor, "h w 2"], valid: Bool[Tensor, "h w"]) -> Float[
     across, down = plane.diff(dim=1).norm(dim=-1), plane.diff(dim=0).norm(dim=-1)
     steps = torch.cat([across[valid[:, 1:] & valid[:, :-1]], down[valid[1:] & valid[:-1]]])
     return 1 / steps.quantile(0.1) if len(steps) < 1e6 else 1 / steps.kthvalue(len(steps) // 10).values
-
-
-def resized(camera: View, hw: HW) -> View:
-    """The camera with images of another size; as it is if they have that."""
-    return camera if camera.hw == hw else camera.resize(hw)

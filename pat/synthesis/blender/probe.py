@@ -1,6 +1,6 @@
-"""Whether EEVEE can run here. Without OpenGL 4.3 through EGL it aborts the whole process, so ask another one.
+"""Whether EEVEE can run here. Without OpenGL 4.3 through EGL it aborts the whole process, so test another one.
 
-The question is asked without Blender, by running this very file; it must import nothing but the standard library.
+This file is run as a script without Blender; it must import nothing but the standard library.
 """
 
 from __future__ import annotations

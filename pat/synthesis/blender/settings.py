@@ -5,18 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-from ..check import Limits
+from ..check import CheckLimits
 
 Pass = Literal["normals", "flow", "nir", "alpha"]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Optics:
-    """What a rig file does not say of a camera.
+    """Optics of a camera, which a rig file does not hold.
 
     `pixel_pitch` is the width of a pixel in metres; with fx it gives the focal length, hence the aperture of an
     `f_number`. `focus` is the distance in metres that is sharp. `shutter` is the exposure time in seconds, centred
-    on the moment of the frame. Without `f_number` everything is sharp, without `shutter` nothing is smeared.
+    on the moment of the frame. Without `f_number` everything is sharp, without `shutter` there is no motion blur.
     """
 
     f_number: float | None = None
@@ -55,7 +55,7 @@ class RenderSettings:
     passes: tuple[Pass, ...] = ()
     duration: float = 0.0
     optics: dict[str, Optics] = field(default_factory=dict)
-    limits: Limits = field(default_factory=Limits)
+    limits: CheckLimits = field(default_factory=CheckLimits)
 
     @classmethod
     def preset(cls, name: str, **changes: Any) -> RenderSettings:

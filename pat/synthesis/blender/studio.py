@@ -1,4 +1,4 @@
-"""A built scene, photographed: cameras set, renders run, passes read."""
+"""Renders of a built scene: cameras set, renders run, passes read."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from arraygeom.camera import Camera
 
 from ..scene import Motion, Scene
 from . import compat
-from .build import Spectrum, Stage, build
+from .build import BuiltScene, Spectrum, build
 from .settings import Optics, RenderSettings
 
 NOTHING = 1e9
-"""Depths beyond this are where Blender hit nothing."""
+"""Depths beyond this mean that the ray hit nothing."""
 
 _FLIP = np.diag([1.0, -1.0, -1.0])
 _SENSOR = 36.0
@@ -32,7 +32,7 @@ _EXPOSURE = (0, 1, 2)
 
 
 class Studio:
-    """Blender with one scene in it. Frames of any pinhole at any time can be asked for."""
+    """Blender with one scene loaded: renders frames of any pinhole at any time."""
 
     def __init__(self, scene: Scene, settings: RenderSettings, scratch: Path):
         self.scene, self.settings, self.scratch = scene, settings, scratch
@@ -41,7 +41,7 @@ class Studio:
         self.camera = self.bpy.data.objects.new("camera", self.bpy.data.cameras.new("camera"))
         self.blender.collection.objects.link(self.camera)
         self.blender.camera = self.camera
-        self.stage: Stage = build(self.bpy, scene, self.blender.world, scratch)
+        self.stage: BuiltScene = build(self.bpy, scene, self.blender.world, scratch)
         self._quality()
 
     def colours(self, camera: Camera, time: float, optics: Optics, spectrum: Spectrum) -> dict[str, Tensor]:
@@ -58,17 +58,17 @@ class Studio:
         self._expose(time, None)
         self._aim(camera, Optics())
         self.blender.render.engine = "CYCLES"
-        kept = cycles.samples, cycles.use_denoising
+        former = cycles.samples, cycles.use_denoising
         cycles.samples, cycles.use_denoising = 1, False
         layer.material_override = self._plain()
         try:
             return self._shoot()
         finally:
-            cycles.samples, cycles.use_denoising = kept
+            cycles.samples, cycles.use_denoising = former
             layer.material_override = None
 
     def close(self) -> None:
-        """Let Blender forget what it kept for the next image: until then a thread of it spins, half a core."""
+        """Drop Blender's persistent data: until then one of its threads spins, half a core."""
         self.blender.render.use_persistent_data = False
 
     # Settings --------------------------------------------------------------------------------------------
@@ -126,7 +126,7 @@ class Studio:
     # One image -----------------------------------------------------------------------------------------
 
     def _expose(self, time: float, shutter: float | None) -> None:
-        """Put objects where they are at a time, or key them over the exposure: from frame 0 to 2, 1 the middle."""
+        """Place objects for a time, or animate them over the exposure: from frame 0 to 2, 1 the middle."""
         render = self.blender.render
         moving = False
         for item, thing in zip(self.stage.objects, self.scene.objects):
@@ -184,15 +184,15 @@ def read_layers(path: Path) -> dict[str, Tensor]:
 
 @contextmanager
 def quietly() -> Iterator[None]:
-    """Without what Blender prints, which goes past Python's own standard output."""
+    """Suppress Blender's output, which bypasses Python's standard output."""
     sys.stdout.flush()
-    kept, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    former, sink = os.dup(1), os.open(os.devnull, os.O_WRONLY)
     try:
         os.dup2(sink, 1)
         yield
     finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        os.dup2(former, 1)
+        os.close(former)
         os.close(sink)
 
 

@@ -41,7 +41,7 @@ _SCRATCH = "pat-render-"
 
 
 class Shot(NamedTuple):
-    """One frame to take: of which camera, when, and how long until the next."""
+    """One frame to render: camera, number, time and interval to the next, seconds."""
 
     camera: str
     number: int
@@ -50,7 +50,7 @@ class Shot(NamedTuple):
 
 
 def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) -> Rendered:
-    """As `pat.synthesis.blender.render`, in this process: it imports bpy. Raises ValueError."""
+    """Like `pat.synthesis.blender.render`, in this process, which imports bpy. Raises ValueError."""
     out = Path(out)
     if out.exists():
         raise ValueError(f"{out} exists: give a new folder, or remove it first")
@@ -111,10 +111,10 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
         camera = rig[shot.camera]
         assert isinstance(camera, Camera)
         centre = camera.centre.detach().cpu().double().numpy()
-        for thing in scene.objects:
-            if inside(thing, centre, shot.time):
+        for item in scene.objects:
+            if inside(item, centre, shot.time):
                 raise ValueError(
-                    f"camera '{shot.camera}' is inside the object '{thing.name}' at {shot.time:g} s: move one of them"
+                    f"camera '{shot.camera}' is inside the object '{item.name}' at {shot.time:g} s: move one of them"
                 )
 
 
@@ -128,7 +128,7 @@ def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> RenderedFrame:
     index = exact[compat.index_name(exact)].round().int()
     depth = torch.where(exact["Depth.Z"] < NOTHING, exact["Depth.Z"], torch.inf)
     if not (index > 0).any():
-        raise ValueError(f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: turn it or move it")
+        raise ValueError(f"camera '{shot.camera}' sees nothing of the scene at {shot.time:g} s: rotate it or move it")
     frame = RenderedFrame(
         time=shot.time,
         rgb=lens.resampled(_stack(colours, "Combined", "RGB")),
@@ -164,7 +164,7 @@ def _further(
 
 
 def _is_exact(settings: RenderSettings, optics: Optics) -> bool:
-    """Whether an image's own depth and normals are exact: no blur, no bumps asked for, and rendered by Cycles."""
+    """Whether an image's own depth and normals are exact: no blur, no normals asked for, and rendered by Cycles."""
     blurred = optics.f_number is not None or optics.shutter is not None
     return not blurred and settings.engine == "cycles" and "normals" not in settings.passes
 
@@ -180,7 +180,7 @@ def _stack(channels: dict[str, Tensor], name: str, letters: str) -> Tensor:
 
 @contextmanager
 def _staged(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that takes its name when all is written."""
+    """A folder beside `out` that is renamed to it when complete."""
     out.parent.mkdir(parents=True, exist_ok=True)
     folder = out.with_name(f".{out.name}-{uuid4().hex[:8]}.part")
     folder.mkdir()
@@ -199,9 +199,9 @@ def _studio(scene: Scene, settings: RenderSettings) -> Iterator[Studio]:
 
 @contextmanager
 def _scratch() -> Iterator[Path]:
-    """A folder in memory, where there is such a thing, for what Blender writes and we read at once.
+    """A temporary folder, in memory if possible, for the files that Blender writes.
 
-    Its name tells whose it is: those of processes that were killed are removed.
+    Its name holds the process number: those of processes that were killed are removed.
     """
     where = _SHARED_MEMORY if os.access(_SHARED_MEMORY, os.W_OK) else None
     for left in _SHARED_MEMORY.glob(f"{_SCRATCH}*") if where else ():

@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 from arraygeom import Band
-from pat.media.colour import luminance
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
-from pat.sensors import Clip, Linear, Noise, Spectral, record
-from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded
+from pat.sensors import Clip, Noise, Spectral, record
+from pat.systems.stage import SystemScene
+from pat.systems.system import SystemRecording
 
 TITLE = "four mono cameras, three filters, four exposures: more range than any one of them has"
 REDUCED = 2 / 5
@@ -27,8 +27,8 @@ OVER = 3.0
 """How far above alpha's white the brightest surface is."""
 
 
-def record_scene(stage: Stage) -> Recording:
-    """One frame. The truth is in alpha's exposure, not cut at white."""
+def record_scene(stage: SystemScene) -> SystemRecording:
+    """One frame. The ground truth is in alpha's exposure, not clipped at white."""
     rig, alpha = stage.rig, stage.alpha
     raw, bands, lights = {}, {}, {}
     for name in rig.names:
@@ -40,16 +40,16 @@ def record_scene(stage: Stage) -> Recording:
         raw[name] = [record(seen, (Noise(ELECTRONS, READ), Clip()), stage.generator(name)).image[0]]
         if name != alpha:
             bands[name] = banded(light(stage, alpha), sensor.response)[0]
-    return Recording(raw, [coded(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
+    return SystemRecording(raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
 
 
-def light(stage: Stage, name: str) -> Tensor:
+def light(stage: SystemScene, name: str) -> Tensor:
     """Linear colours of what a camera sees, 1 being alpha's white."""
     count, g = stage.scene.present.shape[1], stage.generator("light")
     lit = DARKEST ** torch.rand(count, generator=g)
     lit[1], lit[2] = 1.0, DARKEST
     strength = stage.seen(name, stage.painted(lit.sqrt().tolist()))[0].square()
-    return record(stage.seen(name)[0], (Linear(),), g).image * strength * OVER
+    return linear_from_srgb(stage.seen(name)[0]) * strength * OVER
 
 
 def banded(linear: Tensor, response: object) -> Tensor:

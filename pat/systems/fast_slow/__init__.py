@@ -8,11 +8,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pat.media.colour import luminance
-from pat.sensors import Clip, Linear, Noise, record
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
+from pat.sensors import Clip, Noise, record
 from pat.systems.exposures import banded
-from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded
+from pat.systems.stage import SystemScene
+from pat.systems.system import SystemRecording
 
 TITLE = "fast mono alpha, three slow cameras with filters, not synchronised; an object moves"
 REDUCED = 1 / 4
@@ -22,7 +22,7 @@ SPEED = 18.0
 """Of the object, per cent of alpha's width in the time of a slow frame."""
 
 
-def record_scene(stage: Stage) -> Recording:
+def record_scene(stage: SystemScene) -> SystemRecording:
     """Eleven frames of alpha, and of each beta those of that time."""
     rig, generator = stage.rig, stage.generator("record")
     times = {name: frame_times(stage, name) for name in rig.names}
@@ -31,26 +31,26 @@ def record_scene(stage: Stage) -> Recording:
     ground_truth = []
     for name in rig.names:
         for time in times[name]:
-            lit = record(stage.seen(name, stage.moved(layer, velocity * time))[0], (Linear(),), generator).image
+            lit = linear_from_srgb(stage.seen(name, stage.moved(layer, velocity * time))[0])
             own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
             raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
             if name == stage.alpha:
                 bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
-                ground_truth.append(coded(torch.cat(bands)))
-    return Recording(raw, ground_truth)
+                ground_truth.append(srgb_from_linear(torch.cat(bands)))
+    return SystemRecording(raw, ground_truth)
 
 
-def frame_times(stage: Stage, name: str) -> list[float]:
-    """When a camera records, seconds, for as long as alpha does."""
+def frame_times(stage: SystemScene, name: str) -> list[float]:
+    """The times at which a camera records, seconds, for as long as alpha does."""
     own, alpha = (stage.rig[n].sensor for n in (name, stage.alpha))
     rate, last = own.frame_rate or 1.0, (FRAMES - 1) / (alpha.frame_rate or 1.0)
     return [t for i in range(FRAMES) if (t := own.time_offset + i / rate) <= last + 0.5 / rate]
 
 
-def object_velocity(stage: Stage) -> tuple[Tensor, int]:
-    """Metres a second in alpha's frame, and which layer moves: a thing that covers about a seventh of the image."""
-    things = stage.shares() * (~stage.scene.solid[0])
-    layer = int((things - 0.14).abs().argmin())
+def object_velocity(stage: SystemScene) -> tuple[Tensor, int]:
+    """Metres a second in alpha's frame, and which layer moves: one that covers about a seventh of the image."""
+    free = stage.shares() * (~stage.scene.solid[0])
+    layer = int((free - 0.14).abs().argmin())
     depth = float(stage.seen(stage.alpha)[1].median())
     camera = stage.camera(stage.alpha)
     across = SPEED / 100 * camera.hw[1] * 30.0 * depth / float(camera.K[0, 0, 0])

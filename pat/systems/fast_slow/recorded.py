@@ -5,37 +5,37 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from arraygeom import HomographyDisplacement, Rig, Sensor
 from arraygeom.atomic import write_text
-from pat.fusion.results import Frame, save_frame, save_panels
+from pat.evaluation.tables import markdown_table
+from pat.fusion.results import Frame, save_frame
 from pat.fusion.sequence import SequenceFusion, flicker
-from pat.media.colour import luminance_of
+from pat.media.colour import luminance_of, srgb_image
+from pat.media.figures import save_panels
 from pat.media.images import read_image
 from pat.media.video import write_video
 from pat.networks.weights import load_weights
-from pat.sensors import Clip, Coded, Exposure, record
-from pat.systems.showcase import FAST, SCENE, SLOW, Array, fast_and_slow_array
-from pat.systems.system import Result
+from pat.systems.showcase import FAST, SCENE, SLOW, FastSlowArray, bright_gain, fast_and_slow_array
+from pat.systems.system import SystemResult
 
 FAST_FRAMES, SLOW_FRAMES = range(141, 148), (4, 5)
 RATES = {FAST: 227.0, **dict.fromkeys(SLOW, 30.0)}
 DETAIL = (slice(300, 800), slice(600, 1200))
-"""Rows and columns around the thing that moves."""
+"""Rows and columns around the moving object."""
 
 
-def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], None]) -> Result:
-    """Fuse the seven frames with and without carrying colour; write images, a video and scores.md.
+def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], None]) -> SystemResult:
+    """Fuse the seven frames with and without propagating colour; write images, a video and scores.md.
 
-    Frame 141 is taken to be of the time of slow frame 4, and the rates to be the paper's: offsets are not published.
+    Frame 141 is taken to be simultaneous with slow frame 4, and the rates to be the paper's: offsets are not published.
     """
     say("fitting the lines of each pair to points seen in both images")
     array = fast_and_slow_array(folder)
     rig, frames = clocked(array.rig), recorded_frames(folder)
     field = HomographyDisplacement(array.displacement)
-    job = SequenceFusion(load_weights(weights), rig, frames, FAST, looks=field, match_levels=True)
+    job = SequenceFusion(load_weights(weights), rig, frames, FAST, field=field, match_levels=True)
     keys = job.timeline.key_frames()
     say(f"fusing key frames {', '.join(str(FAST_FRAMES[k.alpha]) for k in keys)}, then all")
     colours = {key.alpha: job.colour(key) for key in keys}
@@ -45,7 +45,7 @@ def run_recorded(folder: Path, out: Path, *, weights: str, say: Callable[[str], 
     table = _table(fused, alone, frames[FAST])
     written = _write(out, array, frames, fused, alone)
     write_text(out / "scores.md", table)
-    return Result(table, [*written, out / "scores.md"])
+    return SystemResult(table, [*written, out / "scores.md"])
 
 
 def clocked(rig: Rig) -> Rig:
@@ -56,29 +56,24 @@ def clocked(rig: Rig) -> Rig:
 
 
 def recorded_frames(folder: Path) -> dict[str, list[Tensor]]:
-    """The frames, taken to be linear, coded as sRGB; alpha's brightest 0.5% in the first frame are brought to white."""
+    """The frames, taken to be linear, sRGB-encoded; alpha's brightest 0.5% in the first frame are brought to white."""
     raw = {FAST: [read_image(folder / SCENE / f"{i}.png") for i in FAST_FRAMES]}
     raw |= {name: [read_image(folder / SCENE / f"{name}_{i}.png") for i in SLOW_FRAMES] for name in SLOW}
-    first = luminance_of(raw[FAST][0]).flatten()
-    gain = 1 / float(first.sort().values[int(0.995 * len(first))])
-    return {n: [_coded(p, gain if n == FAST else 1.0) for p in images] for n, images in raw.items()}
-
-
-def _coded(image: Tensor, gain: float) -> Tensor:
-    return record(luminance_of(image)[None], (Exposure(gain), Clip(), Coded()), torch.Generator()).image[0]
+    gains = {FAST: bright_gain(raw[FAST][0])}
+    return {n: [srgb_image(luminance_of(p) * gains.get(n, 1.0)) for p in images] for n, images in raw.items()}
 
 
 def _table(fused: list[Frame], alone: list[Frame], greys: list[Tensor]) -> str:
-    carried, single = (1000 * flicker([f.image for f in frames], greys) for frames in (fused, alone))
+    frames = {"each frame alone": alone, "colour propagated": fused}
+    rows = [(name, f"{1000 * flicker([f.image for f in found], greys):.2f}") for name, found in frames.items()]
     return (
-        "| | flicker x 1000 |\n| --- | ---: |\n"
-        f"| each frame alone | {single:.2f} |\n| colour carried | {carried:.2f} |\n\n"
+        f"{markdown_table(['', 'flicker x 1000'], rows)}\n"
         "Flicker is the mean change of chroma from frame to frame where nothing moves.\n"
     )
 
 
 def _write(
-    out: Path, array: Array, frames: dict[str, list[Tensor]], fused: list[Frame], alone: list[Frame]
+    out: Path, array: FastSlowArray, frames: dict[str, list[Tensor]], fused: list[Frame], alone: list[Frame]
 ) -> list[Path]:
     for number, frame in zip(FAST_FRAMES, fused):
         save_frame(frame, out / "frames", name=str(number))

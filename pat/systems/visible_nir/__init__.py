@@ -1,18 +1,18 @@
-"""Visible - near infrared: alpha sees 800 to 1000 nm, beta colours; neither sees the same materials alike.
+"""Visible - near infrared: alpha sees 800 to 1000 nm, beta colours; the same materials differ in each.
 
-The weights know nothing of the near infrared. Here each surface reflects it in a way of its own: the farthest (the
-sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes the visible
-image alone. The truth is alpha's brightness with the colour differences that beta's colours have at alpha's view.
+The weights were not trained on near infrared. Here each surface has a near-infrared reflectance of its own: the
+farthest (the sky) is dark, some are brighter than in visible light, in some the pattern is reversed. Distance hazes
+the visible image alone. The ground truth is alpha's brightness with the colour differences of beta at alpha's view.
 """
 
 from __future__ import annotations
 
 import torch
 
-from pat.media.colour import from_luma_chroma, to_luma_chroma
-from pat.sensors import Clip, Linear, Noise, record
-from pat.systems.stage import Stage
-from pat.systems.system import Recording, coded
+from pat.media.colour import from_luma_chroma, linear_from_srgb, srgb_from_linear, to_luma_chroma
+from pat.sensors import Clip, Noise, record
+from pat.systems.stage import SystemScene
+from pat.systems.system import SystemRecording
 
 TITLE = "near infrared alpha, colour beta: the same materials look different"
 REDUCED = 1 / 5
@@ -21,19 +21,19 @@ HAZE = 0.002
 """Part of the light lost in a metre."""
 
 
-def record_scene(stage: Stage) -> Recording:
+def record_scene(stage: SystemScene) -> SystemRecording:
     """One frame."""
     generator = stage.generator("record")
-    infrared = record(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1], (Linear(),), generator).image
+    infrared = linear_from_srgb(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1])
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
     colour = record(other, (Noise(6_000, 3), Clip()), generator).image
-    ground_truth = from_luma_chroma(coded(infrared[0]), to_luma_chroma(coded(own[0]))[1])
-    return Recording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
+    ground_truth = from_luma_chroma(srgb_from_linear(infrared[0]), to_luma_chroma(srgb_from_linear(own[0]))[1])
+    return SystemRecording({"nir": [nir[0]], "colour": [colour[0]]}, [ground_truth.clamp(0, 1)])
 
 
-def infrared_weights(stage: Stage) -> torch.Tensor:
-    """Of each layer: how its near infrared comes of its visible colours, and brighter or darker by how much."""
+def infrared_weights(stage: SystemScene) -> torch.Tensor:
+    """For each layer: weights of its visible colours in its near infrared, and an offset."""
     count, g = stage.scene.present.shape[1], stage.generator("infrared")
     mixture = torch.rand(count, 3, generator=g)
     contrast = torch.where(torch.rand(count, 1, generator=g) < 0.25, -0.6, 0.9)
@@ -45,6 +45,6 @@ def infrared_weights(stage: Stage) -> torch.Tensor:
 
 
 def hazed(image: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """Linear light of a visible image, with the air's own light in it by distance."""
-    clear = record(image, (Linear(),), torch.Generator()).image
+    """Linear light of a visible image, with the airlight added by distance."""
+    clear = linear_from_srgb(image)
     return torch.lerp(torch.full_like(clear, 0.6), clear, torch.exp(-HAZE * depth))

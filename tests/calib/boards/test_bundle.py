@@ -1,4 +1,4 @@
-"""Bundle adjustment: derivatives, the truth recovered, gross errors without a say, a covariance that is true."""
+"""Bundle adjustment: derivatives, recovered ground truth, robustness to outliers, a correct covariance."""
 
 from dataclasses import replace
 
@@ -11,24 +11,24 @@ from scipy.stats import chi2
 from arraygeom import Pose, Rig
 from calib.boards.bundle import (
     BoardPoses,
-    Expected,
-    FreePoints,
+    BundleProblem,
+    IntrinsicsPrior,
     Observations,
-    Scene,
     _changed,
     adjust,
     camera_jacobian,
-    intrinsic_numbers,
+    intrinsic_values,
     normal_equations,
     parameter_names,
 )
-from calib.boards.calibrate import calibrate
+from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
+from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
 from tests.calib.tracks import (
     CALISCOPE_BOARD,
     CALISCOPE_RMS,
     FIFTEEN_RMS,
+    FreePoints,
     caliscope,
     caliscope_views,
     fifteen_cameras,
@@ -37,20 +37,20 @@ from tests.calib.tracks import (
 )
 
 
-def shaken(scene, size, seed=0):
-    """The scene with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a coefficient."""
+def shaken(problem, size, seed=0):
+    """The problem with all that is free moved: by `size` times 0.01 rad, 0.01 m, 5 px, 0.02 of a coefficient."""
     random = np.random.default_rng(seed)
     cameras = {}
-    for (name, c), mask in zip(scene.cameras.items(), free_of(scene, lens=2).values()):
+    for (name, c), mask in zip(problem.cameras.items(), free_of(problem, lens=2).values()):
         scale = np.array([0.01] * 6 + [5.0] * 4 + [0.02] * (len(mask) - 10))
         cameras[name] = _changed(c, torch.from_numpy(size * mask * scale * random.normal(size=len(mask))))
-    change = size * 0.01 * random.normal(size=(len(scene.structure), 6))
-    return Scene(cameras, scene.structure.stepped(change), scene.seen)
+    change = size * 0.01 * random.normal(size=(len(problem.structure), 6))
+    return BundleProblem(cameras, problem.structure.stepped(change), problem.seen)
 
 
 @pytest.fixture(scope="module")
 def small():
-    """Two cameras, eight boards, noise of 0.1 px; the truth."""
+    """Two cameras, eight boards, noise of 0.1 px; the ground truth."""
     rig = four_cameras()
     rig = Rig({name: rig[name] for name in ("mono", "colour")})
     boards = board_poses(8, spread=0.2)
@@ -90,31 +90,33 @@ def test_derivatives_of_blocks(kind):
         assert np.abs(numeric - found[..., i]).max() < 1e-8
 
 
-def test_perfect_corners_give_back_the_truth():
+def test_perfect_corners_recover_the_ground_truth():
     rig, boards = four_cameras(), board_poses(10)
     ground_truth = scene_of(rig, boards, see(rig, boards))
     fit = adjust(shaken(ground_truth, 1.0), free_of(ground_truth))
     assert fit.converged
-    assert fit.scene.rms() < 1e-6
-    for name, c in fit.scene.cameras.items():
+    assert fit.problem.rms() < 1e-6
+    for name, c in fit.problem.cameras.items():
         assert float((c.K - rig[name].K).abs().max()) < 1e-4
         assert float((c.t - rig[name].t).abs().max()) < 1e-7
 
 
 def test_the_least_squares_are_scipys(small):
     """The same minimum and the same covariance as a general solver finds without Schur complement or autodiff."""
-    _, _, scene = small
-    free = free_of(scene)
-    fit = adjust(scene, free)
+    _, _, problem = small
+    free = free_of(problem)
+    fit = adjust(problem, free)
     counts = [int(mask.sum()) for mask in free.values()]
 
     def moved(change):
         cameras = {}
-        for (name, c), mask, part in zip(fit.scene.cameras.items(), free.values(), np.split(change, np.cumsum(counts))):
+        for (name, c), mask, part in zip(
+            fit.problem.cameras.items(), free.values(), np.split(change, np.cumsum(counts))
+        ):
             full = np.zeros(len(mask))
             full[mask] = part
             cameras[name] = _changed(c, torch.from_numpy(full))
-        return Scene(cameras, fit.scene.structure.stepped(change[sum(counts) :].reshape(-1, 6)), scene.seen)
+        return BundleProblem(cameras, fit.problem.structure.stepped(change[sum(counts) :].reshape(-1, 6)), problem.seen)
 
     def residuals(change):
         return np.concatenate([(r / fit.sigma[n]).ravel() for n, r in moved(change).residuals().items()])
@@ -125,61 +127,63 @@ def test_the_least_squares_are_scipys(small):
     assert np.sqrt(fit.covariance.diagonal()) == pytest.approx(deviations, rel=0.05)
 
 
-def test_what_is_expected_pulls_as_hard_as_it_says(small):
-    """The fit with an expectation is the weighted mean of the fit without and the expectation."""
-    _, _, scene = small
-    free = free_of(scene)
-    alone = adjust(scene, free)
+def test_a_prior_has_its_stated_weight(small):
+    """The fit with a prior is the weighted mean of the fit without and the prior."""
+    _, _, problem = small
+    free = free_of(problem)
+    alone = adjust(problem, free)
     at = list(alone.names).index("mono.focal.0")
     deviation = float(np.sqrt(alone.covariance[at, at]))
-    mean = intrinsic_numbers(alone.scene.cameras["mono"])
+    mean = intrinsic_values(alone.problem.cameras["mono"])
     mean[6] += 2 * deviation
     information = np.zeros((len(mean), len(mean)))
     information[6, 6] = deviation**-2
-    held = adjust(replace(alone.scene, expected={"mono": Expected(mean, information)}), free)
-    moved = float(held.scene.cameras["mono"].K[0, 0] - alone.scene.cameras["mono"].K[0, 0])
+    held = adjust(replace(alone.problem, priors={"mono": IntrinsicsPrior(mean, information)}), free)
+    moved = float(held.problem.cameras["mono"].K[0, 0] - alone.problem.cameras["mono"].K[0, 0])
     assert moved == pytest.approx(deviation, rel=0.05)
     assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)
 
 
-def test_gross_errors_have_no_say(small):
-    _, _, scene = small
-    clean = adjust(scene, free_of(scene))
-    x = scene.seen["mono"].x.copy()
+def test_outliers_have_no_influence(small):
+    _, _, problem = small
+    clean = adjust(problem, free_of(problem))
+    x = problem.seen["mono"].x.copy()
     x[::40] += np.random.default_rng(1).uniform(20, 60, x[::40].shape)
-    spoilt = Scene(scene.cameras, scene.structure, {**scene.seen, "mono": scene.seen["mono"]._replace(x=x)})
-    fit = adjust(spoilt, free_of(scene))
+    spoilt = BundleProblem(
+        problem.cameras, problem.structure, {**problem.seen, "mono": problem.seen["mono"]._replace(x=x)}
+    )
+    fit = adjust(spoilt, free_of(problem))
     deviations = np.sqrt(clean.covariance.diagonal())
     for i, name in enumerate(clean.names):
         camera_name, kind, index = name.split(".")
         if kind == "focal":
-            a, b = (f.scene.cameras[camera_name].K[int(index), int(index)] for f in (fit, clean))
+            a, b = (f.problem.cameras[camera_name].K[int(index), int(index)] for f in (fit, clean))
             assert abs(float(a - b)) < 1.5 * deviations[i]
     assert fit.sigma["mono"] == pytest.approx(0.1, rel=0.25)
 
 
-def test_a_scale_that_nothing_tells_has_no_covariance(small):
-    _, _, scene = small
-    points = FreePoints(scene.structure.world(scene.seen["mono"])[:60])
+def test_an_unobservable_scale_has_no_covariance(small):
+    _, _, problem = small
+    points = FreePoints(problem.structure.world(problem.seen["mono"])[:60])
     seen = {}
-    for name, c in scene.cameras.items():
+    for name, c in problem.cameras.items():
         x, _, valid = c.project(torch.from_numpy(points.X))
         index = np.flatnonzero(valid.numpy())
         seen[name] = Observations(index, np.zeros((len(index), 3)), x.numpy()[index])
-    poses = {name: np.arange(len(parameter_names(c))) < 6 for name, c in scene.cameras.items()}
+    poses = {name: np.arange(len(parameter_names(c))) < 6 for name, c in problem.cameras.items()}
     poses["mono"][:] = False
-    assert adjust(Scene(scene.cameras, points, seen), poses, rounds=1).covariance is None
+    assert adjust(BundleProblem(problem.cameras, points, seen), poses, rounds=1).covariance is None
 
 
 def test_fixed_numbers_stay_bit_identical(small):
-    _, _, scene = small
-    free = free_of(scene, lens=0)
+    _, _, problem = small
+    free = free_of(problem, lens=0)
     free["colour"][6:8] = False
-    fit = adjust(shaken(scene, 0.1), free, rounds=1)
-    started = shaken(scene, 0.1).cameras
-    assert torch.equal(fit.scene.cameras["mono"].R, started["mono"].R)
-    assert torch.equal(fit.scene.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
-    assert torch.equal(fit.scene.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients)
+    fit = adjust(shaken(problem, 0.1), free, rounds=1)
+    started = shaken(problem, 0.1).cameras
+    assert torch.equal(fit.problem.cameras["mono"].R, started["mono"].R)
+    assert torch.equal(fit.problem.cameras["colour"].K.diagonal(), started["colour"].K.diagonal())
+    assert torch.equal(fit.problem.cameras["colour"].distortion.coefficients, started["colour"].distortion.coefficients)
 
 
 @pytest.mark.slow
@@ -206,8 +210,8 @@ def test_the_covariance_is_true():
 
 @pytest.mark.slow
 def test_fifteen_cameras_fit_better_than_published(shared_data):
-    scene = fifteen_cameras(shared_data).scene
-    rms, mean = rms_and_mean(adjust(scene, free_of(scene)).scene)
+    problem = fifteen_cameras(shared_data).problem
+    rms, mean = rms_and_mean(adjust(problem, free_of(problem)).problem)
     print("rms", rms, "mean", mean)
     assert rms < FIFTEEN_RMS
     assert mean < 0.6
@@ -219,14 +223,14 @@ def test_caliscopes_tracks_fit_better_than_published(shared_data):
 
     Least squares lower the RMS; the robust fit lowers the mean, and leaves larger residuals to a few frames.
     """
-    published = caliscope(shared_data).scene
+    published = caliscope(shared_data).problem
     free = {name: np.arange(15) < (6 if i else 0) for i, name in enumerate(published.cameras)}
     squares, robust = (adjust(published, free, rounds=rounds) for rounds in (0, 4))
-    before, after = rms_and_mean(published), rms_and_mean(squares.scene)
-    print("before", before, "least squares", after, "robust", rms_and_mean(robust.scene))
+    before, after = rms_and_mean(published), rms_and_mean(squares.problem)
+    print("before", before, "least squares", after, "robust", rms_and_mean(robust.problem))
     assert before[0] == pytest.approx(CALISCOPE_RMS, abs=1e-3)
     assert after[0] < before[0]
-    assert rms_and_mean(robust.scene)[1] < before[1]
+    assert rms_and_mean(robust.problem)[1] < before[1]
 
 
 @pytest.mark.slow
@@ -247,8 +251,8 @@ def test_world_points_of_boards_are_their_poses():
 
 def test_the_step_solves_the_whole_system(small):
     """Schur's complement against the full matrix."""
-    _, _, scene = small
-    equations = normal_equations(scene, free_of(scene), {"mono": 0.1, "colour": 0.1})
+    _, _, problem = small
+    equations = normal_equations(problem, free_of(problem), {"mono": 0.1, "colour": 0.1})
     c, (b, d) = len(equations.g), equations.h.shape
     full = np.zeros((c + b * d, c + b * d))
     full[:c, :c] = equations.H
@@ -259,6 +263,6 @@ def test_the_step_solves_the_whole_system(small):
     scale = 1 / np.sqrt(full.diagonal())
     right = np.concatenate([equations.g, equations.h.ravel()])
     expected = scale * np.linalg.solve(full * scale[:, None] * scale, scale * right)
-    cameras, blocks = equations.solved(0.0)
+    cameras, blocks = equations.solve(0.0)
     found = np.concatenate([cameras, blocks.ravel()])
     assert np.abs((found - expected) / scale).max() < 1e-4

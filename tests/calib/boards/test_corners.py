@@ -7,9 +7,9 @@ import torch
 
 from arraygeom import Pose, rotation_from_vector
 from calib.boards.corners import refine_corners, smooth_map
-from calib.boards.rehearsal import photograph
+from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import camera, tensor
+from tests.calib.board_scenes import camera, tensor
 
 CAMERA = camera(600.0, (480, 640), lens=(-0.25, 0.08, 0.001, -0.001, 0.0))
 CLEAR = {"chessboard:9x6:25mm": 0.5, "charuco:9x7:25mm": 0.125}
@@ -17,7 +17,7 @@ RANDOM = np.random.default_rng(0)
 
 
 def seen(text, *, noise=1.5):
-    """A photograph of a board, where its corners are, and their places in squares."""
+    """An image of a board, its true corners, and their positions in squares."""
     board = parse_board(text)
     R = rotation_from_vector(torch.deg2rad(tensor(24.0, -28.0, 9.0)))
     pose = Pose(R, tensor(0.01, -0.005, 0.34) - R @ tensor(*board.points.mean(0)))

@@ -7,9 +7,9 @@ import torch
 
 from arraygeom import Pose, rotation_from_vector
 from calib.boards.detect import detect, explain, other_size, to_grey
-from calib.boards.rehearsal import photograph
+from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import camera, tensor
+from tests.calib.board_scenes import camera, tensor
 
 CAMERA = camera(700.0, (480, 640), lens=(-0.3, 0.1, 0.001, -0.001, 0.0))
 

@@ -1,4 +1,4 @@
-"""`pat calibrate` on photographs: real sets as good as known, mistakes in one line with nothing written."""
+"""`pat calibrate` on photographs: real sets with the published accuracy, mistakes in one line with nothing written."""
 
 import shutil
 
@@ -8,12 +8,12 @@ import pytest
 
 from arraygeom import Pose, Rig
 from arraygeom.io import read_rig
-from calib.boards.calibrate import calibrate, fit_alone
 from calib.boards.collect import collect_folder
-from calib.boards.rehearsal import fine_rays, photograph
+from calib.boards.rig import calibrate, calibrate_single
+from calib.boards.simulation import fine_rays, photograph
 from calib.boards.target import parse_board
 from pat.cli.main import main
-from tests.calib.boards_seen import board_poses, camera, errors_of, four_cameras, pose_errors
+from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors
 
 BOARD = "charuco:9x7:60mm"
 
@@ -51,7 +51,7 @@ def fails(folder, capsys, *more, board=BOARD) -> str:
 
 @pytest.fixture
 def mine(photos, tmp_path):
-    """A copy of the photographs to spoil."""
+    """A copy of the images to corrupt."""
     return shutil.copytree(photos, tmp_path / "photos")
 
 
@@ -83,7 +83,9 @@ def test_no_board(mine, capsys):
 
 
 def test_wrong_size(mine, capsys):
-    assert "markers up to number 30 are seen and the board has 0 to 9" in fails(mine, capsys, board="charuco:5x4:60mm")
+    assert "markers up to number 30 are visible and the board has 0 to 9" in fails(
+        mine, capsys, board="charuco:5x4:60mm"
+    )
 
 
 def test_mirrored(mine, capsys):
@@ -116,7 +118,7 @@ def test_other_mistakes(mine, capsys):
     assert "no such folder of images" in fails(mine / "none", capsys)
     assert "--camera: 'left' is not NAME=FILE" in fails(mine, capsys, "--camera", "left")
     assert "0 < near <= far" in fails(mine, capsys, "--depth", "3", "1")
-    assert "is not understood: write it like" in fails(mine, capsys, board="charuko:8x6:30mm")
+    assert "is not recognised: write it like" in fails(mine, capsys, board="charuko:8x6:30mm")
 
 
 def test_videos(mine):
@@ -134,7 +136,7 @@ def test_videos(mine):
 
 @pytest.mark.slow
 def test_photographs_of_four_cameras(tmp_path):
-    """Through prints, lenses, noise and the detector: the truth within 3.5 deviations for each of some fifty numbers.
+    """Through prints, lenses, noise and detector: ground truth within 3.5 deviations for each of some 50 parameters.
 
     Sixteen boards and corners good to 0.1 px know the poses to about 0.1 degree and half a millimetre.
     """
@@ -190,7 +192,7 @@ def test_bumblebees_pairs(shared_data, tmp_path, capsys):
         assert float(rig[name].K[0, 0]) == pytest.approx(float(published[name].K[0, 0]), rel=0.003)
     ours, theirs = (r.pair("left", "right").beta_from_alpha for r in (rig, published))
     assert float(ours.t.norm()) == pytest.approx(float(theirs.t.norm()), rel=0.003)
-    print("turned by", float((ours.R - theirs.R).norm()) / 2**0.5)
+    print("rotated by", float((ours.R - theirs.R).norm()) / 2**0.5)
     assert float((ours.R - theirs.R).norm()) / 2**0.5 < np.radians(0.35), "eleven small boards know it to 0.1 degrees"
 
 
@@ -208,6 +210,6 @@ def test_action_cameras(camera_name, focal, shared_data):
     folder = shared_data / "calibration/pose2sim_4cam/intrinsics"
     board = parse_board("chessboard:4x7:60mm")
     found = collect_folder(folder, board, patterns={"cam": f"{camera_name}/*.jpg"})
-    alone = fit_alone("cam", found.views["cam"], board)
-    print(camera_name, alone.camera.K, alone.fit.scene.rms(), len(found.views["cam"].seen), found.notes, alone.notes)
+    alone = calibrate_single("cam", found.views["cam"], board)
+    print(camera_name, alone.camera.K, alone.fit.problem.rms(), len(found.views["cam"].seen), found.notes, alone.notes)
     assert float(alone.camera.K[0, 0]) == pytest.approx(focal, rel=0.015)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from calib.boards.detect import detect
-from calib.boards.rehearsal import printed
 from calib.boards.run import write_board
+from calib.boards.simulation import printed
 from calib.boards.target import Charuco, draw_board, parse_board
 
 
@@ -43,20 +43,20 @@ def test_points_are_numbered_as_opencv_numbers_them():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("charuko:8x6:30mm", "is not understood: write it like"),
-        ("charuco", "is not understood"),
+        ("charuko:8x6:30mm", "is not recognised: write it like"),
+        ("charuco", "is not recognised"),
         ("chessboard:9by6:25mm", "'9by6' is not a count"),
         ("chessboard:9x6:25", "'25' is not a length like 30mm"),
         ("chessboard:9x6:0mm", "'0mm' is not a length"),
         ("chessboard:2x6:25mm", "2x6 is out of range"),
-        ("chessboard:9x6:25mm:4x4", "'4x4' is too much"),
+        ("chessboard:9x6:25mm:4x4", "'4x4' is unexpected"),
         ("charuco:8x6:30mm:30mm", "do not fit into squares"),
         ("charuco:8x6:30mm:9x9", "no dictionary '9x9'"),
         ("charuco:40x40:30mm:4x4_50", "has the 800 markers it needs"),
-        ("charuco:8x6:30mm:22mm:blue", "'blue' is not understood"),
+        ("charuco:8x6:30mm:22mm:blue", "'blue' is not recognised"),
     ],
 )
-def test_wrong_names_say_what_is_wrong(text, message):
+def test_wrong_names_are_explained(text, message):
     with pytest.raises(ValueError, match=re.escape(message)):
         parse_board(text)
 

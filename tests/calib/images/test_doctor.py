@@ -1,4 +1,4 @@
-"""Every usual mistake made with rigs whose truth is known, and named."""
+"""Every usual mistake made with rigs whose ground truth is known, and the name it is given."""
 
 import dataclasses
 import json
@@ -9,7 +9,7 @@ import torch
 
 from arraygeom import Link, Pose, Rig, View
 from calib.images.doctor import diagnose, diagnose_matches
-from calib.images.mistakes import TRANSPOSE, on_cameras, swap
+from calib.images.remedies import TRANSPOSE, on_cameras, swap
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
@@ -44,7 +44,7 @@ MISTAKES = {
     "units": each(posed(lambda p: Pose(p.R, 1000 * p.t))),
     "x and y exchanged": each(lambda c: c.replace(K=TRANSPOSE @ c.K @ TRANSPOSE)),
     "resized": one(lambda c: c.resize((c.hw[0] // 2, c.hw[1] // 2)).replace(hw=c.hw)),
-    "turned or mirrored": lambda rig: rig.turn("second", 2),
+    "rotated or mirrored": lambda rig: rig.turn("second", 2),
 }
 
 
@@ -60,7 +60,7 @@ def test_mistake_is_named_and_undone(kind):
     found = diagnose_matches(MISTAKES[kind](rig), sizes(rig), points)
     assert found.named.kind == kind, found.verdict
     assert not found.healthy
-    assert found.after.misfit < 0.1 < found.before.badness
+    assert found.after.misfit < 0.1 < found.before.penalised_misfit
     again = diagnose_matches(found.repaired, sizes(rig), points)
     assert again.healthy, again.verdict
 
@@ -133,7 +133,7 @@ def test_an_f_of_which_one_side_counts_from_one():
     assert math.isnan(found.before.front)
 
 
-@pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "turned or mirrored")])
+@pytest.mark.parametrize(("hw", "kind"), [((120, 160), "resized"), ((320, 240), "rotated or mirrored")])
 def test_images_of_another_size(hw, kind):
     rig = unlike_pair()
     true = rig.resize("first", hw) if kind == "resized" else rig.turn("first", 1)

@@ -3,8 +3,8 @@
 import pytest
 
 from arraygeom import Rig
-from calib.images.from_images import start
-from calib.images.refine import line_distances
+from calib.images.from_images import rig_from_images
+from calib.images.refinement import line_distances
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, seen_points, texture
@@ -12,16 +12,16 @@ from tests.calib.scenes import rectified_images, rectified_pair, seen_points, te
 
 def test_lines_and_map_come_from_images_alone():
     images = rectified_images()
-    found = start(images)
+    found = rig_from_images(images)
     points = seen_points(rectified_pair(), near=3.0, far=5.5, noise=0.0)
     assert line_distances(found.rig, points).abs().median() < 0.5
-    assert found.off["left", "right"] < 0.3
+    assert found.distance["left", "right"] < 0.3
     assert found.rig.pair("left", "right").link.H is not None
     assert 3 < found.displacement["left", "right"] < 12
 
 
 def test_focal_lengths_are_used_where_they_help():
-    found = start(rectified_images(), focal={"left": 310.0, "right": 290.0})
+    found = rig_from_images(rectified_images(), focal={"left": 310.0, "right": 290.0})
     points = seen_points(rectified_pair(), near=3.0, far=5.5, noise=0.0)
     assert line_distances(found.rig, points).abs().median() < 0.5
 
@@ -29,11 +29,11 @@ def test_focal_lengths_are_used_where_they_help():
 def test_bad_input_is_one_clear_line():
     images = rectified_images()
     with pytest.raises(ValueError, match="two cameras or more"):
-        start({"left": images["left"]})
+        rig_from_images({"left": images["left"]})
     with pytest.raises(ValueError, match="do the cameras see the same things"):
-        start(images | {"right": texture(seed=5)})
+        rig_from_images(images | {"right": texture(seed=5)})
     with pytest.raises(ValueError, match="no camera with an image"):
-        start(images, focal={"middle": 300.0})
+        rig_from_images(images, focal={"middle": 300.0})
 
 
 def test_command_line(tmp_path, capsys):

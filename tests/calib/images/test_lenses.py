@@ -1,4 +1,4 @@
-"""Lenses of cameras known by F alone: found where lines bend, left out where they do not."""
+"""Lenses of cameras known by F alone: found where they distort lines, left out where they do not."""
 
 import functools
 
@@ -19,10 +19,10 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.images.doctor import diagnose_matches
-from calib.images.lenses import bending, uncalibrated_lenses, with_lenses
-from calib.images.matches import Matches, fit_fundamental, match_cameras, straightened
-from calib.images.photometric import Views, photometric_errors
-from calib.images.refine import Refined, line_distances, refine_matches
+from calib.images.lenses import largest_distortion, with_lenses
+from calib.images.matches import Matches, fit_fundamental, match_cameras, undistort_matches
+from calib.images.photometric import PhotometricFrame, photometric_errors
+from calib.images.refinement import Refinement, line_distances, refine_matches
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import read_image
@@ -41,6 +41,10 @@ def pair(k1: float) -> Rig:
     return Rig(dict(zip(NAMES, cameras)))
 
 
+def lenses(rig: Rig) -> set[str]:
+    return {name for name, view in rig.cameras.items() if isinstance(view, LensView) and view.distortion is not None}
+
+
 def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], Matches]:
     """Points at 2 to 7 m, one in twenty wrong."""
     (names, (x, y)), *_ = seen_points(rig, count=count, near=2.0, far=7.0, noise=noise).items()
@@ -50,7 +54,7 @@ def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], 
 
 
 @functools.cache
-def found_by_points() -> tuple[dict[tuple[str, str], Matches], Rig, Refined]:
+def found_by_points() -> tuple[dict[tuple[str, str], Matches], Rig, Refinement]:
     """Points, the rig of them with no regard to lenses, and what refining finds."""
     points = matches(pair(-0.25))
     rig = known_by_f(points)
@@ -72,8 +76,8 @@ def test_lines_that_bend_are_followed(tmp_path):
     assert found.accepted
     assert found.held_out[1].median < 0.06 < 0.12 < found.held_out[0].median
     assert median(found.rig, exact) < 0.03 < 0.12 < median(rig, exact)
-    assert set(uncalibrated_lenses(found.rig)) == set(NAMES)
-    assert "lenses bend lines; without them F does not fit: a by up to" in found.as_text()
+    assert lenses(found.rig) == set(NAMES)
+    assert "F does not fit without lens distortion: a by up to" in found.as_text()
     found.rig.save(tmp_path / "rig.yaml")
     again = Rig.load(tmp_path / "rig.yaml")
     assert torch.allclose(line_distances(again, exact), line_distances(found.rig, exact), atol=1e-9)
@@ -81,7 +85,7 @@ def test_lines_that_bend_are_followed(tmp_path):
 
 def test_a_map_for_fusion_comes_with_the_lens():
     pair_found = found_by_points()[2].rig.pair(*NAMES)
-    x, y = straightened(pair_found, matches(pair(-0.25), noise=0.0, wrong=False)[NAMES])
+    x, y = undistort_matches(pair_found, matches(pair(-0.25), noise=0.0, wrong=False)[NAMES])
     assert (apply_homography(pair_found.homography, x).x - y).norm(dim=-1).median() < 40
     assert (apply_homography(resize_matrix(HW, HW), x).x - y).norm(dim=-1).median() > 60
 
@@ -89,7 +93,7 @@ def test_a_map_for_fusion_comes_with_the_lens():
 def test_no_lens_is_made_up():
     points = matches(pair(0.0))
     found = refine_matches(known_by_f(points), [points])
-    assert uncalibrated_lenses(found.rig) == {}
+    assert lenses(found.rig) == set()
     assert median(found.rig, points) < 0.06
 
 
@@ -105,18 +109,18 @@ def test_a_lens_that_is_known_is_kept_and_improved():
 
 def test_bending_is_what_no_straight_camera_does():
     rig = with_lenses(Rig({n: View(hw=HW) for n in NAMES}, links={NAMES: Link(torch.eye(3).double())}), NAMES)
-    assert float(bending(rig["a"])) < 1e-6
+    assert float(largest_distortion(rig["a"])) < 1e-6
     view = rig["a"].replace(distortion=Distortion("brown-conrady", vector(0.05, 0, 0, 0)))
     corner = torch.tensor([[0.0, 0.0]], dtype=torch.float64)
     moved = float((view.undistort(corner)[0] - corner).norm())
-    assert 0.1 * moved < float(bending(view)) < 0.7 * moved
+    assert 0.1 * moved < float(largest_distortion(view)) < 0.7 * moved
 
 
 def test_the_doctor_takes_lenses_of_uncalibrated_cameras_as_they_are():
     points, _, found = found_by_points()
-    told = diagnose_matches(found.rig, dict.fromkeys(NAMES, HW), points)
-    assert told.healthy
-    assert told.before.off < 0.1
+    diagnosis = diagnose_matches(found.rig, dict.fromkeys(NAMES, HW), points)
+    assert diagnosis.healthy
+    assert diagnosis.before.off < 0.1
 
 
 def test_the_fusions_error_sees_through_lenses():
@@ -128,7 +132,7 @@ def test_the_fusions_error_sees_through_lenses():
     views = with_lenses(
         Rig({n: View(hw=rig[n].hw) for n in rig.names}, links={("left", "right"): Link(F, H)}), rig.names
     )
-    ready = Views.of(images)
+    ready = PhotometricFrame.of(images)
 
     def error(change):
         changed = views.perturbed({"right.distortion": change})
@@ -145,7 +149,7 @@ def test_the_fusions_error_sees_through_lenses():
 
 @pytest.mark.slow
 def test_the_papers_array_through_the_commands(shared_data, tmp_path, capsys):
-    """Published F's are 1.5 to 2 px off; no F fits these images to less than 0.4: their lenses bend."""
+    """Published F's are 1.5 to 2 px off; no F fits these images to less than 0.4: their lenses distort."""
     folder = shared_data / "hfr_lfr"
     files = {FAST: folder / SCENE / f"{FAST_FRAME}.png"}
     links = {}
@@ -156,7 +160,7 @@ def test_the_papers_array_through_the_commands(shared_data, tmp_path, capsys):
     Rig({n: View(hw=tuple(p.shape[1:])) for n, p in images.items()}, links=links).save(tmp_path / "published.yaml")
     arguments = [f"--image={name}={file}" for name, file in files.items()]
     main(["rig", "refine", str(tmp_path / "published.yaml"), *arguments, "--out", str(tmp_path / "better.yaml")])
-    assert "lenses bend lines" in capsys.readouterr().out
+    assert "F does not fit without lens distortion" in capsys.readouterr().out
     main(["rig", "start", *arguments, "--out", str(tmp_path / "started.yaml")])
     points = match_cameras(images)
     for file in ("better.yaml", "started.yaml"):

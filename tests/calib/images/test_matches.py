@@ -1,4 +1,4 @@
-"""Matched points and what they tell, against rigs that are known."""
+"""Matched points and quantities derived from them, against known rigs."""
 
 import cv2
 import numpy as np
@@ -7,15 +7,9 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
 from calib.images.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
+from tests.calib.scenes import texture
 
 HW = (240, 320)
-
-
-def texture(hw=HW, seed=0):
-    """Blobs of many sizes, (1, H, W)."""
-    noise = np.random.default_rng(seed).standard_normal(hw).astype(np.float32)
-    image = sum(cv2.GaussianBlur(noise, (0, 0), s) * s for s in (1.5, 3, 6))
-    return torch.from_numpy((image - image.min()) / np.ptp(image))[None]
 
 
 def rig_of(depth=(1.0, 9.0)) -> Rig:
@@ -62,7 +56,7 @@ def test_lines_choose_matches():
     assert 300 <= len(near_lines(both, F, within=1).alpha) < 330
 
 
-def test_a_link_is_made_better_and_its_map_reaches_the_points():
+def test_a_link_is_refined_and_its_map_reaches_the_points():
     rig = rig_of()
     F, matches = rig.pair("left", "right").fundamental, seen_points(rig, noise=0.2)
     shift = torch.tensor([[1.0, 0, 2.0], [0, 1, -2.0], [0, 0, 1]], dtype=torch.float64)
@@ -86,7 +80,7 @@ def test_a_link_needs_points_that_agree():
         fit_link(matches, other)
 
 
-def test_depths_hold_what_was_matched():
+def test_depths_contain_the_matched_points():
     rig = rig_of()
     near, far = seen_depths(rig.pair("left", "right"), seen_points(rig, noise=0.1))
     assert 1.7 < near < 2.0

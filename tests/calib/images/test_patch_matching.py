@@ -5,7 +5,7 @@ import numpy as np
 import torch
 
 from calib.images.matches import match_points
-from calib.images.patch_matching import sharpened
+from calib.images.patch_matching import refine_points
 from tests.calib.scenes import texture
 
 A = np.array([[0.93, -0.08], [0.11, 1.04]])
@@ -29,20 +29,22 @@ def test_points_return_to_where_they_are_seen():
     alpha, beta = warped()
     x = points()
     ground_truth = x @ A.T + SHIFT
-    found = sharpened(alpha, beta, x, ground_truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1))).y
+    found = refine_points(
+        alpha, beta, x, ground_truth + RANDOM.normal(0, 0.5, x.shape), np.tile(np.eye(2), (60, 1, 1))
+    ).y
     off = np.linalg.norm(found - ground_truth, axis=1)
     assert np.median(off) < 0.05
     assert (off < 0.15).mean() > 0.95
 
 
-def test_what_is_not_alike_is_left_alone():
+def test_uncorrelated_patches_are_rejected():
     alpha, _ = warped()
     other = (texture((240, 320), seed=9)[0].numpy() * 255).astype(np.uint8)
     x = points()
     y = x + SHIFT
-    found = sharpened(alpha, other, x, y, np.tile(A, (60, 1, 1))).y
+    found = refine_points(alpha, other, x, y, np.tile(A, (60, 1, 1))).y
     assert (found == y).all(1).mean() > 0.9
-    assert sharpened(alpha, other, x[:0], y[:0], np.zeros((0, 2, 2))).y.shape == (0, 2)
+    assert refine_points(alpha, other, x[:0], y[:0], np.zeros((0, 2, 2))).y.shape == (0, 2)
 
 
 def test_matches_are_better_for_it():
@@ -60,10 +62,10 @@ def test_deviations_tell_good_points_from_bad_ones():
     noisy = [(p + RANDOM.normal(0, 0.7, p.shape)).round().clip(0, 255).astype(np.uint8) for p in flat]
     x = points()
     ground_truth = x @ A.T + SHIFT
-    found = sharpened(*noisy, x, ground_truth + RANDOM.normal(0, 0.3, x.shape), np.tile(A, (60, 1, 1)))
+    found = refine_points(*noisy, x, ground_truth + RANDOM.normal(0, 0.3, x.shape), np.tile(A, (60, 1, 1)))
     left = (x[:, 0] < 140) & (ground_truth[:, 0] < 140) & np.isfinite(found.deviation)
     right = (x[:, 0] > 180) & (ground_truth[:, 0] > 180)
     assert np.median(found.deviation[right]) > 4 * np.median(found.deviation[left])
     assert np.median(np.linalg.norm(found.y - ground_truth, axis=1)[left]) < 3 * np.median(found.deviation[left])
     alike, *_ = warped()
-    assert np.isinf(sharpened(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean() > 0.9
+    assert np.isinf(refine_points(alike, alike[::-1], x, x, np.tile(np.eye(2), (60, 1, 1))).deviation).mean() > 0.9

@@ -7,8 +7,8 @@ from arraygeom.segments import Positions, Segments
 
 
 def random_case(seed: int, *, dtype=torch.float64) -> tuple[dict, dict]:
-    """Differentiable tensors and the other arguments of one random call: sizes, masks, kinds of look and
-    all."""
+    """Differentiable tensors and the other arguments of one random call: sizes, masks, and kinds of
+    sampling locations."""
     g = torch.Generator().manual_seed(seed)
 
     def pick(low: int, high: int) -> int:

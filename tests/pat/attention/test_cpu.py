@@ -1,15 +1,17 @@
 """The compiled CPU backend: equal to the reference in values and gradients, to the bit the same for any
 thread count."""
 
+import hashlib
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import attend, attend_with_statistics
+from pat.attention import attend, attend_with_statistics, kernels
 from tests.pat.attention.cases import call, gradients, random_case, relative
 
 
@@ -39,7 +41,7 @@ def test_random_cases_in_float32(seeds):
 
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
 @pytest.mark.parametrize(("d", "dv"), [(64, 130), (107, 64)])
-def test_more_samples_and_channels_than_are_worked_off_at_once(interpolation, d, dv):
+def test_more_samples_and_channels_than_are_processed_at_once(interpolation, d, dv):
     torch.manual_seed(d)
     tensors = {
         name: torch.randn(1, *shape, dtype=torch.float64)
@@ -75,6 +77,12 @@ def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     for name in tensors:
         assert here[name].dtype == stored[name].dtype
         assert relative(here[name], there[name]) < 4 * rounding, name
+
+
+def test_the_cache_of_compiled_code_watches_every_file_of_the_kernels():
+    sources = b"".join(path.read_bytes() for path in sorted(Path(kernels.__file__).parent.glob("*.py")))
+    for entry in (kernels.forward, kernels.backward, kernels.scatter):
+        assert entry._cache._cache_file._source_stamp == hashlib.sha256(sources).hexdigest()
 
 
 def big_case(dtype=torch.float32):
@@ -142,7 +150,7 @@ def test_gradcheck_also_twice():
 
 @pytest.mark.parametrize("backend", ["cpu", "reference"])
 @pytest.mark.parametrize("interpolation", ["nearest", "bilinear"])
-def test_pixels_with_nowhere_to_look_give_and_pass_nothing(backend, interpolation):
+def test_pixels_without_samples_give_and_pass_zeros(backend, interpolation):
     q, key, value = (torch.randn(1, 4, 3, 3, dtype=torch.float64, requires_grad=True) for _ in range(3))
     xy = torch.full((3, 3, 2, 2), -5.0, dtype=torch.float64)
     xy[0, 0] = torch.nan

@@ -42,9 +42,14 @@ def test_equals_the_reference(seed, deterministic):
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
 def test_16_bit_inputs_are_accumulated_in_float32(dtype):
     tensors, options = moved(*random_case(3, dtype=torch.float32))
-    stored = {n: t.detach().to(dtype) if n in ("query", "key", "value") else t for n, t in tensors.items()}
-    exact = {n: t.detach().float() for n, t in stored.items()}
+    stored = {
+        n: t.detach().to(dtype).requires_grad_() if n in ("query", "key", "value") else t for n, t in tensors.items()
+    }
+    exact = {n: t.detach().float().requires_grad_() for n, t in stored.items()}
     found = call(attend_with_statistics, stored, options, backend="triton")
     expected = call(attend_with_statistics, exact, options, backend="reference")
     assert found.value.dtype == dtype
-    assert relative(found.value, expected.value) <= torch.finfo(dtype).eps
+    rounding = torch.finfo(dtype).eps
+    assert relative(found.value, expected.value) <= rounding
+    here, there = gradients(found, stored, seed=0), gradients(expected, exact, seed=0)
+    assert all(relative(here[name], there[name]) < 4 * rounding for name in tensors)

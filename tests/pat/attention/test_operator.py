@@ -1,11 +1,14 @@
-"""What the public face accepts and refuses."""
+"""What the public functions accept and refuse."""
+
+import importlib
 
 import pytest
 import torch
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import torch_op as operator
 
+operator = importlib.import_module("pat.attention.attend")
+"""The module; the package exports the function of that name."""
 Q, K, V = torch.zeros(1, 4, 2, 3), torch.zeros(1, 4, 5, 6), torch.zeros(1, 2, 5, 6)
 
 

@@ -1,6 +1,7 @@
 """The formula against a loop written by hand, against textbook row attention, and against finite
 differences."""
 
+import importlib
 import math
 
 import pytest
@@ -8,7 +9,7 @@ import torch
 from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom.segments import Positions, Segments
-from pat.attention import attend, attend_with_statistics, reference, torch_op
+from pat.attention import attend, attend_with_statistics, reference
 from tests.pat.attention.cases import call, random_case
 
 
@@ -116,8 +117,8 @@ def test_a_function_asked_in_chunks_equals_the_whole(monkeypatch, backend, expli
     y, x = torch.meshgrid(torch.arange(6.0).double(), torch.arange(7.0).double(), indexing="ij")
     at_once = Segments(torch.stack([x, y], -1) * scale, torch.stack([x, y], -1) * scale + 1.7, x > 0)
     expected = attend(q, key, value, at_once, samples=4, bias=bias, backend="reference")
-    monkeypatch.setattr(torch_op, "CHUNK_SAMPLES", 60)
-    monkeypatch.setattr(torch_op, "CHUNK_PIXELS", 20)
+    monkeypatch.setattr(importlib.import_module("pat.attention.attend"), "CHUNK_SAMPLES", 60)
+    monkeypatch.setattr(importlib.import_module("pat.attention.attend"), "CHUNK_PIXELS", 20)
     out = attend(q, key, value, look, samples=4, bias=bias, backend=backend)
     torch.testing.assert_close(out, expected)
     inputs = (q, key, value, scale)

@@ -16,7 +16,7 @@ import yaml
 
 from arraygeom import Rig
 from pat.cli.main import Pat, command_paths, main
-from pat.cli.options import FIELD_NAMES, FIELDS, WEIGHT_NAMES, field_named
+from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
@@ -214,7 +214,7 @@ def test_help_and_completion_import_no_torch(words):
     code = f"""
 import sys
 from pat.cli.main import Pat, command_paths, main
-from pat.cli.options import FIELD_NAMES, FIELDS, WEIGHT_NAMES, field_named
+from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 try: main({list(words)})
 except SystemExit as stop: assert not stop.code
 assert not {{"torch", "numpy", "scipy", "numba", "arraygeom", "rich"}} & set(sys.modules), sys.modules
@@ -237,6 +237,7 @@ def test_every_command_has_help_that_reads_well(path, capsys):
 
 
 def test_names_are_those_of_the_package():
+    from arraygeom.fields.default import FIELDS
     from pat.networks.weights import shipped
 
     assert tuple(sorted(shipped())) == WEIGHT_NAMES

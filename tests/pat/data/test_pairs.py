@@ -1,11 +1,10 @@
-import numpy as np
 import pytest
 import torch
 
-from pat.data import flickr_pairs, folder_pairs, kitti_pairs, middlebury_pairs, syntim_pairs
+from pat.data import folder_pairs, middlebury_pairs
 from pat.media.images import write_image
 
-READERS = [middlebury_pairs, kitti_pairs, flickr_pairs, folder_pairs, syntim_pairs]
+READERS = [middlebury_pairs, folder_pairs]
 
 
 def write(path, value=0.5, *, channels=3):
@@ -40,7 +39,7 @@ def test_pairs_are_found_by_their_names(tmp_path, left, right, name):
     (pair,) = folder_pairs(tmp_path, max_disparity=30.0)
     assert pair.name == name
     assert (float(pair.left.mean()), float(pair.right.mean())) == (0, 1)
-    assert (pair.max_disparity, pair.disparity, pair.calibration) == (30, None, None)
+    assert (pair.max_disparity, pair.disparity) == (30, None)
 
 
 def test_middlebury_disparities_are_scaled_by_the_collection(tmp_path):
@@ -53,65 +52,6 @@ def test_middlebury_disparities_are_scaled_by_the_collection(tmp_path):
     torch.testing.assert_close(pair.disparity.value, torch.tensor([[0.0, 10.0, 85.0]]))
     assert pair.disparity.valid.tolist() == [[False, True, True]]
     assert pair.max_disparity == 85
-
-
-def test_kitti_calibration_is_relative_to_left(tmp_path):
-    write(tmp_path / "left.png")
-    write(tmp_path / "right.png")
-    K, t = np.array([[700.0, 0, 600], [0, 700, 170], [0, 0, 1]]), np.array([0.06, 0.001, 0.002])
-    rows = [
-        f"P{k}: " + " ".join(map(str, (K @ np.c_[np.eye(3), x]).ravel()))
-        for k, x in enumerate((t, t, t, t - [0.5, 0, 0]))
-    ]
-    (tmp_path / "calib.txt").write_text("\n".join(rows))
-    (pair,) = kitti_pairs(tmp_path)
-    torch.testing.assert_close(pair.calibration.t, torch.tensor([-0.5, 0, 0]), atol=1e-6, rtol=0)
-    torch.testing.assert_close(pair.calibration.K_left, torch.tensor(K).float())
-
-
-SYNTIM = """Intrinsic parameters:
-Image center: u0 = {0:.6f}, v0 = 7.000000
-Scale factor:
-au = 100.000000, av = 110.000000
-Image size: dimx = 16, dimy = 12
-Focale: 1.0
-Extrinsic parameters:
-Rotation:
-{{{{{1:.6f}, {2:.6f}, {3:.6f}}},
- {{{4:.6f}, {5:.6f}, {6:.6f}}},
- {{{7:.6f}, {8:.6f}, {9:.6f}}}}}
-Translation:
-{{{10:.6f}, {11:.6f}, {12:.6f}}}
-"""
-
-
-def turn(angle):
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-
-
-def test_syntim_cameras_are_relative_to_left_and_in_metres(tmp_path):
-    poses = [(turn(0.3), np.array([-500.0, 20, 100])), (turn(-0.2), np.array([400.0, 0, 150]))]
-    for side, number, (R, t) in zip("gd", "01", poses):
-        write(tmp_path / f"Cube{number}_OG0.png")
-        (tmp_path / f"cam_Cube_{side}").write_text(SYNTIM.format(8.5, *R.ravel(), *t))
-    (pair,) = syntim_pairs(tmp_path)
-    assert pair.name == "Cube_OG0"
-    world = np.array([30.0, -40, 2000])
-    in_left, in_right = (R.T @ (world - t) / 1000 for R, t in poses)
-    K_left, _, R, t = (x.double().numpy() for x in pair.calibration)
-    np.testing.assert_allclose(R @ in_left + t, in_right, atol=1e-5)
-    np.testing.assert_allclose(K_left, [[100, 0, 8.5], [0, 110, 7], [0, 0, 1]])
-
-
-def test_a_damaged_syntim_calibration_is_named(tmp_path):
-    for number in "01":
-        write(tmp_path / f"Cube{number}_OG0.png")
-    with pytest.raises(FileNotFoundError, match="cam_Cube_g"):
-        next(syntim_pairs(tmp_path))
-    (tmp_path / "cam_Cube_g").write_text("u0 = 1.5")
-    with pytest.raises(ValueError, match=r"cam_Cube_g: has 1 decimal numbers, wanted 17"):
-        next(syntim_pairs(tmp_path))
 
 
 def test_true_disparity_takes_left_to_right(shared_data):

@@ -1,4 +1,4 @@
-"""Patches of rendered scenes: their rigs foretell what they show, and what is wrong with a folder is told."""
+"""Patches of rendered scenes: their rigs predict what they show, and errors name the folder."""
 
 import shutil
 
@@ -8,12 +8,9 @@ import torch
 from torch.utils.data import DataLoader
 
 from arraygeom import Camera, Epipolar, NearestVoxels, Pose, Rig, Sensor, intrinsics, rotation_from_vector
-from arraygeom.distortion import Distortion
 from arraygeom.fields import look
-from pat.cli.main import main
 from pat.data import (
-    Patches,
-    RenderedScenes,
+    PatchGrid,
     ScenePatches,
     SceneShuffle,
     agreement,
@@ -23,14 +20,14 @@ from pat.data import (
     scene_folders,
     write_indices,
 )
-from pat.data.patches import cut, reduced_depth, select
-from pat.data.scenes import _bounds
+from pat.data.patches import cut
+from pat.data.windows import reduced_depth, select
 from pat.farm.backends import LayeredSettings
 from pat.media.images import read_image
-from pat.sensors import BoxBlur, Case, Clip, Resample
-from pat.synthesis.check import Limits, look_across
+from pat.sensors import BoxBlur, Clip, DegradationCase, Resample
+from pat.synthesis.check import CheckLimits
 
-SMALL = Patches(hw=(32, 48), grid=(2, 3), reduce=2)
+SMALL = PatchGrid(hw=(32, 48), grid=(2, 3), reduce=2)
 
 
 def make_rig(width: int = 128) -> Rig:
@@ -50,7 +47,7 @@ def make_rig(width: int = 128) -> Rig:
 def rendered(tmp_path_factory):
     """Three layered scenes of patterns; copy what you break."""
     root = tmp_path_factory.mktemp("data")
-    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), CheckLimits())
     for seed in range(3):
         renderer.render(seed, root / "scenes" / f"{seed:06d}")
     return root
@@ -67,15 +64,15 @@ def generator(seed: int = 0) -> torch.Generator:
 
 
 def test_the_papers_windows_reach_from_edge_to_edge():
-    corners = Patches().corners((1536, 2048))
-    assert len(corners) == Patches().count == 49
+    corners = PatchGrid().corners((1536, 2048))
+    assert len(corners) == PatchGrid().count == 49
     assert corners[0] == (0, 0)
     assert corners[-1] == (1536 - 128, 2048 - 384)
-    assert Patches.like_the_papers((1536, 2048)) == Patches()
+    assert PatchGrid.like_the_papers((1536, 2048)) == PatchGrid()
     with pytest.raises(ValueError, match="patches of 384x128 do not fit into an image of 300x200"):
-        Patches().corners((200, 300))
+        PatchGrid().corners((200, 300))
     with pytest.raises(ValueError, match="cannot be reduced 3 times"):
-        Patches(reduce=3)
+        PatchGrid(reduce=3)
 
 
 def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(rendered):
@@ -87,34 +84,6 @@ def test_points_of_the_whole_image_are_where_the_patches_cameras_project_them(re
         torch.testing.assert_close(select(stack.rig, i)["mono"].project(X).x, wanted)
     assert stack.rgb["mono"].shape == (6, 3, 16, 24)
     assert stack.rgb["colour"].shape[0] == 6
-
-
-def test_depth_and_cameras_of_patches_foretell_the_other_view(rendered):
-    batch = RenderedScenes(rendered, patches=SMALL).sample(12, generator())
-    across = look_across(batch)
-    assert across.visible.float().mean() > 0.6
-    error = (across.image - batch.images[0]).abs().amax(1)[across.visible]
-    assert error.median() < 0.02
-    shifted = batch.images[0].roll(1, -1)
-    assert (across.image - shifted).abs().amax(1)[across.visible].mean() > 1.3 * error.mean()
-
-
-def test_samples_are_seeded_and_mix_scenes(rendered):
-    one, two, other = (RenderedScenes(rendered, patches=SMALL).sample(8, generator(s)) for s in (1, 1, 2))
-    assert torch.equal(one.images[0], two.images[0])
-    assert not torch.equal(one.images[0], other.images[0])
-    assert one.K[0].shape == (8, 3, 3)
-    assert len({round(float(d.max()), 4) for d in one.depth[0]}) > 3
-
-
-def test_training_scenes_are_of_pinholes_and_know_what_is_there(broken):
-    depth = torch.tensor([[[2.0, torch.inf], [torch.nan, 5.0]], [[torch.inf, torch.inf], [3.0, torch.nan]]])
-    assert _bounds(depth).tolist() == [[2, 5], [3, 3]]
-    rig = make_rig()
-    lens = Distortion("brown-conrady", torch.tensor([-0.1, 0.01, 0, 0]).double())
-    rig.with_camera("mono", rig["mono"].replace(distortion=lens)).save(broken / "scenes/000000/rig.yaml")
-    with pytest.raises(ValueError, match="'mono' has a lens model"):
-        RenderedScenes(broken)
 
 
 def test_reduced_depth_is_exact_on_planes_and_takes_sides_at_edges():
@@ -145,13 +114,13 @@ def test_patches_are_recorded_as_responses_say_and_anew_each_epoch(rendered):
         data[18]
 
 
-def test_a_batch_says_where_to_look(rendered):
+def test_segments_of_a_batch_contain_the_true_points(rendered):
     data = ScenePatches(rendered, patches=SMALL)
     loader = DataLoader(data, batch_size=6, sampler=SceneShuffle(data), collate_fn=collate)
     batch = next(iter(loader))
     assert batch.images["mono"].shape == (6, 1, 16, 24)
     pair = batch.rig.pair("mono", "colour")
-    (where,) = batch.looks(Epipolar())
+    (where,) = batch.on_grid(Epipolar())
     X = pair.cameras[0].unproject(torch.tensor([12.0, 8.0]).double().expand(6, 1, 2), batch.depth[:, 8:9, 12].double())
     found = where.at(torch.tensor([[12.0, 8.0]]))
     seen = pair.cameras[1].project(X).x[:, 0].float()
@@ -174,7 +143,7 @@ def test_the_rig_follows_the_chains(rendered):
 
 
 def test_cases_degrade_alpha_or_the_betas(rendered):
-    cases = (Case("alpha", alpha=(BoxBlur(5),)), Case("beta", beta=(BoxBlur(5),)))
+    cases = (DegradationCase("alpha", alpha=(BoxBlur(5),)), DegradationCase("beta", beta=(BoxBlur(5),)))
     data = ScenePatches(rendered, patches=SMALL, chains={}, cases=cases)
     plain = ScenePatches(rendered, patches=SMALL, chains={})
     changed = [
@@ -191,7 +160,7 @@ def test_shuffling_takes_every_patch_once_and_few_scenes_at_a_time(rendered):
     assert order != sorted(order)
 
 
-def test_folders_without_whole_scenes_are_told(broken, tmp_path):
+def test_folders_without_whole_scenes_are_reported(broken, tmp_path):
     with pytest.raises(FileNotFoundError, match="no such folder"):
         scene_folders(tmp_path / "none")
     (tmp_path / "empty").mkdir()
@@ -202,7 +171,7 @@ def test_folders_without_whole_scenes_are_told(broken, tmp_path):
         ScenePatches(broken)
 
 
-def test_scenes_that_cannot_be_read_are_told(broken):
+def test_scenes_that_cannot_be_read_are_reported(broken):
     file = broken / "scenes/000001/colour-0000.npz"
     file.write_bytes(file.read_bytes()[:500])
     data = ScenePatches(broken, patches=SMALL)
@@ -211,16 +180,16 @@ def test_scenes_that_cannot_be_read_are_told(broken):
         data[6]
 
 
-def test_images_of_changing_size_are_told(broken):
+def test_images_of_changing_size_are_reported(broken):
     shutil.rmtree(broken / "scenes/000002")
-    LayeredSettings(oversampling=1).renderer(make_rig(160), Limits()).render(2, broken / "scenes/000002")
+    LayeredSettings(oversampling=1).renderer(make_rig(160), CheckLimits()).render(2, broken / "scenes/000002")
     with pytest.raises(
         ValueError, match=r"000002: has images of other sizes than the first \(mono 160x96, .*mono 128x96"
     ):
         ScenePatches(broken, patches=SMALL)[12]
 
 
-def test_names_that_the_rig_lacks_are_told(rendered):
+def test_names_that_the_rig_lacks_are_reported(rendered):
     with pytest.raises(ValueError, match="no camera 'mno'; did you mean 'mono'"):
         ScenePatches(rendered, alpha="mno")
     with pytest.raises(ValueError, match="no camera 'color'; did you mean 'colour'"):
@@ -228,6 +197,8 @@ def test_names_that_the_rig_lacks_are_told(rendered):
 
 
 def test_show_and_info_on_the_command_line(rendered, tmp_path, capsys):
+    from pat.cli.main import main
+
     sensors = tmp_path / "sensors.yaml"
     sensors.write_text("mono: [{spectral: luminance}, clip, coded]\ncolour: [{box-blur: 3}, clip, coded]\n")
     main(["data", "show", str(rendered), "--out", str(tmp_path / "x.png"), "--samples", "2", "--sensors", str(sensors)])
@@ -254,7 +225,7 @@ def test_index_files_give_back_what_was_written(tmp_path):
     assert index_files(tmp_path, "moved") == tuple(moved)
 
 
-def test_index_files_that_are_not_as_documented_are_told(tmp_path):
+def test_index_files_that_are_not_as_documented_are_reported(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"xxs_a\.npy: no such index file"):
         read_indices(tmp_path, "a", (2, 3))
     np.save(tmp_path / "xxs_a.npy", np.zeros((6, 4), np.int16))

@@ -1,4 +1,4 @@
-"""Ablation: the same scenes for every family; calibrated wins; what cannot be served is said."""
+"""Ablation: the same scenes for every family; calibrated wins; unsupported families are named."""
 
 import csv
 import json
@@ -11,7 +11,7 @@ import torch
 from pat.evaluation.ablation import (
     ALPHA,
     BETA,
-    Row,
+    AblationRow,
     ablate,
     families,
     layered_cases,
@@ -21,13 +21,13 @@ from pat.evaluation.ablation import (
 )
 from pat.evaluation.baseline import classical
 from pat.evaluation.metrics import score
+from pat.media.colour import linear_from_srgb
 from pat.media.images import read_image
 from pat.networks.paper import PAT, PATConfig
 from pat.networks.weights import load_weights
-from pat.sensors import Linear, record
 from pat.synthesis.rendered import RenderedFrame, save_frame
 
-CHOSEN = ("calibrated", "rectified assumption", "turned by 1 deg", "centre off by 10 px", "local 5x5", "dense")
+CHOSEN = ("calibrated", "rectified assumption", "rotated by 1 deg", "centre off by 10 px", "local 5x5", "dense")
 
 
 @pytest.fixture(scope="module")
@@ -48,7 +48,7 @@ def test_every_family_is_there():
     names = list(families())
     assert names[0] == "calibrated"
     assert {"rectified assumption", "homography + displacement", "nearest voxels", "local 5x5", "dense"} <= {*names}
-    assert sum(name.startswith(("turned by", "centre off")) for name in names) == 6
+    assert sum(name.startswith(("rotated by", "centre off")) for name in names) == 6
 
 
 def test_perturbed_rigs_are_off_by_what_they_say(case):
@@ -56,22 +56,22 @@ def test_perturbed_rigs_are_off_by_what_they_say(case):
     all_families, g = families(), torch.Generator().manual_seed(0)
     beta = case.rig[BETA]
     for degrees in (0.1, 0.3, 1.0):
-        moved = all_families[f"turned by {degrees:g} deg"].believed(case.rig, g)[BETA]
+        moved = all_families[f"rotated by {degrees:g} deg"].assumed(case.rig, g)[BETA]
         chord = (moved.R - beta.R).norm() / 8**0.5
         assert float(2 * chord.asin().rad2deg()) == pytest.approx(degrees, rel=1e-3)
         torch.testing.assert_close(moved.centre, beta.centre)
     for pixels in (1.0, 3.0, 10.0):
-        moved = all_families[f"centre off by {pixels:g} px"].believed(case.rig, g)[BETA]
+        moved = all_families[f"centre off by {pixels:g} px"].assumed(case.rig, g)[BETA]
         assert float((moved.K - beta.K).norm()) == pytest.approx(pixels)
 
 
-def test_what_cannot_be_served_is_said_and_the_rest_is_ordered(case, tmp_path):
+def test_unsupported_families_are_named_and_the_rest_is_ordered(case, tmp_path):
     chosen = {name: family for name, family in families().items() if name in CHOSEN}
     rows = {row.family: row for row in ablate(load_weights("mono-colour"), [case], out=tmp_path, chosen=chosen)}
-    assert rows["local 5x5"].note == rows["dense"].note == "explicit positions: GuidedPAT looks along segments"
+    assert rows["local 5x5"].note == rows["dense"].note == "explicit positions: GuidedPAT samples along segments"
     calibrated = rows["calibrated"].psnr
     assert calibrated > rows["rectified assumption"].psnr + 1
-    assert calibrated > rows["turned by 1 deg"].psnr
+    assert calibrated > rows["rotated by 1 deg"].psnr
     assert calibrated > rows["centre off by 10 px"].psnr
     assert calibrated > rows["alpha alone"].psnr + 2
     with (tmp_path / "ablation.csv").open() as file:
@@ -82,7 +82,7 @@ def test_what_cannot_be_served_is_said_and_the_rest_is_ordered(case, tmp_path):
     assert read_image(tmp_path / "ablation.png").shape[0] == 3
 
 
-def test_the_papers_network_is_served_every_family(tmp_path):
+def test_the_papers_network_supports_every_family(tmp_path):
     case = next(layered_cases(1, hw=(32, 48), seed=1))
     chosen = {name: families()[name] for name in ("calibrated", "nearest voxels", "local 5x5", "dense")}
     rows = ablate(PAT(PATConfig(dim=4)), [case], out=tmp_path, chosen=chosen)
@@ -90,14 +90,14 @@ def test_the_papers_network_is_served_every_family(tmp_path):
 
 
 def test_rows_are_grouped_by_focal_ratio():
-    rows = [Row("a", 1.2, "calibrated", 30.0, 0.9), Row("b", 2.5, "calibrated", 34.0, 0.9)]
-    rows += [Row("a", 1.2, "other", 29.0, 0.8), Row("b", 2.5, "other", note="cannot")]
+    rows = [AblationRow("a", 1.2, "calibrated", 30.0, 0.9), AblationRow("b", 2.5, "calibrated", 34.0, 0.9)]
+    rows += [AblationRow("a", 1.2, "other", 29.0, 0.8), AblationRow("b", 2.5, "other", note="cannot")]
     lines = markdown(rows).splitlines()
     assert "| calibrated | 32.00 (30.00 to 34.00) | 0.9000 | +0.00 | 30.00 |  | 34.00 |  |  |  |" in lines
-    assert "| other | 29.00 (nan to nan) | 0.8000 | -1.00 | 29.00 |  |  |  |  | 1 scenes left out |" in lines
+    assert "| other | 29.00 (nan to nan) | 0.8000 | -1.00 | 29.00 |  |  |  |  | 1 scenes omitted |" in lines
 
 
-def test_the_true_depth_is_nowhere_off(case):
+def test_the_true_depth_has_no_error(case):
     assert point_errors(case, case.depth) == (0, 1)
     error, within = point_errors(case, torch.full_like(case.depth, torch.nan))
     assert math.isnan(error)
@@ -112,12 +112,12 @@ def test_rendered_folders(tmp_path, case):
     with pytest.raises(ValueError, match="holds no rendered scene"):
         rendered_cases(tmp_path)
     (folder / "scene.yaml").write_text("")
-    with pytest.raises(ValueError, match=r"one is not whole \(render.json is missing\): render it"):
+    with pytest.raises(ValueError, match=r"one is incomplete \(render.json is missing\): render it"):
         rendered_cases(tmp_path)
     case.rig.save(folder / "rig.yaml")
     images = {ALPHA: case.ground_truth, BETA: case.images[BETA]}
     for name, image in images.items():
-        linear = record(image[None], [Linear()], torch.Generator()).image[0]
+        linear = linear_from_srgb(image)
         index = torch.ones(image.shape[1:], dtype=torch.long)
         save_frame(folder / f"{name}.npz", RenderedFrame(time=0.0, rgb=linear, depth=case.depth, index=index))
     frames = {name: [{"file": f"{name}.npz", "time": 0.0}] for name in images}

@@ -3,9 +3,11 @@ import numpy as np
 import pytest
 import torch
 
-from pat.data import StereoPair, middlebury_pairs, mono_colour_task
-from pat.evaluation.baseline import _rectified_plane, _regressed, classical_fusion, classical_fusion_calibrated
+from arraygeom import Camera, Pair, Pose
+from pat.data import StereoPair, middlebury_pairs
+from pat.evaluation.baseline import _rectified_plane, _regressed, classical_calibrated, classical_fusion
 from pat.evaluation.metrics import score
+from pat.evaluation.protocols import mono_colour_task
 from pat.media.colour import luminance, to_luma_chroma
 
 
@@ -83,8 +85,14 @@ def rotation(*vector):
     return torch.from_numpy(cv2.Rodrigues(np.array(vector))[0])
 
 
-def camera(focal, hw):
-    return torch.tensor([[focal, 0, (hw[1] - 1) / 2], [0, focal * 1.02, (hw[0] - 1) / 2], [0, 0, 1]]).double()
+def camera(focal, hw, R=None, t=(0.0, 0.0, 0.0)):
+    K = torch.tensor([[focal, 0, (hw[1] - 1) / 2], [0, focal * 1.02, (hw[0] - 1) / 2], [0, 0, 1]]).double()
+    pose = Pose(torch.eye(3).double() if R is None else R, torch.tensor(t).double())
+    return Camera(K=K, cam_from_world=pose, hw=hw)
+
+
+def pair_of(alpha, beta, depth):
+    return Pair(alpha, beta, tuple(torch.tensor(d).double() for d in depth))
 
 
 POSES = {
@@ -98,9 +106,10 @@ POSES = {
 @pytest.mark.parametrize("pose", POSES)
 def test_rectifying_puts_points_on_one_row_and_disparities_in_range(pose):
     R, t = POSES[pose][0].numpy(), np.array(POSES[pose][1])
-    hw, near, far = (96, 160), 2.0, 6.0
-    K_alpha, K_beta = camera(200.0, hw).numpy(), camera(120.0, (70, 100)).numpy()
-    plane = _rectified_plane(K_alpha, K_beta, R, t, hw=hw, depth=(near, far))
+    near, far = 2.0, 6.0
+    pair = pair_of(camera(200.0, (96, 160)), camera(120.0, (70, 100), *POSES[pose]), (near, far))
+    K_alpha, K_beta = (c.K.numpy() for c in pair.cameras)
+    plane = _rectified_plane(pair, (near, far))
     rng = np.random.default_rng(0)
     pixels = np.c_[rng.uniform(0, 159, 200), rng.uniform(0, 95, 200), np.ones(200)]
     points = pixels @ np.linalg.inv(K_alpha).T * rng.uniform(near, far, (200, 1))
@@ -120,7 +129,8 @@ def test_rectifying_puts_points_on_one_row_and_disparities_in_range(pose):
 def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
     R, t = POSES[pose][0], torch.tensor(POSES[pose][1]).double()
     hw, beta_hw = (96, 160), (80, 120)
-    K_alpha, K_beta = camera(200.0, hw), camera(140.0, beta_hw)
+    pair = pair_of(camera(200.0, hw), camera(140.0, beta_hw, *POSES[pose]), (2.0, 6.0))
+    K_alpha, K_beta = (c.K for c in pair.cameras)
     normal, distance = torch.tensor([0.1, 0.2, -1.0]).double(), 3.0
     H = K_beta @ (R - t[:, None] * normal / distance) @ K_alpha.inverse()
     ground_truth = patches(*hw)
@@ -133,7 +143,7 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
     )
     beta = torch.from_numpy(beta).permute(2, 0, 1)
     alpha = luminance(ground_truth)
-    result = classical_fusion_calibrated(alpha, beta, K_alpha, K_beta, R, t, depth=(2.0, 6.0))
+    result = classical_calibrated(alpha, beta, pair)
     seen = cv2.warpPerspective(np.ones(beta_hw, np.uint8), H.inverse().numpy(), hw[::-1]) > 0
     seen = torch.from_numpy(cv2.erode(seen.astype(np.uint8), np.ones((9, 9)), borderValue=1)) > 0
     error = (result - ground_truth)[:, seen].square().mean().sqrt()
@@ -152,11 +162,9 @@ def test_a_slanted_plane_seen_by_unrectified_cameras_is_coloured(pose):
     ],
 )
 def test_rigs_that_cannot_be_rectified_are_refused(t, depth, complaint):
-    K = camera(200.0, (24, 32))
+    pair = pair_of(camera(200.0, (24, 32)), camera(200.0, (24, 32), t=t), depth)
     with pytest.raises(ValueError, match=complaint):
-        classical_fusion_calibrated(
-            torch.rand(1, 24, 32), torch.rand(3, 24, 32), K, K, torch.eye(3), torch.tensor(t), depth=depth
-        )
+        classical_calibrated(torch.rand(1, 24, 32), torch.rand(3, 24, 32), pair)
 
 
 def test_teddy_keeps_its_colours(shared_data):

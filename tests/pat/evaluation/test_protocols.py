@@ -1,7 +1,8 @@
 import pytest
 import torch
 
-from pat.data import StereoPair, mono_colour_task, reduce_by
+from pat.data import StereoPair
+from pat.evaluation.protocols import mono_colour_task, reduce_by
 from pat.media.colour import luminance
 
 

@@ -8,22 +8,19 @@ import torch
 from arraygeom import pixel_grid
 from pat.data import Disparity, StereoPair, middlebury_pairs
 from pat.evaluation.metrics import score
+from pat.evaluation.protocols import BASELINES, controls, rectified_fusion
 from pat.evaluation.stereo import (
-    BASELINES,
-    Row,
-    controls,
+    StereoRow,
     depth_markdown,
     evaluate_pairs,
     evaluate_sets,
     falls,
     markdown,
-    rectified_fusion,
     sets_markdown,
     structure_kept,
     summarise,
-    write_csv,
-    write_markdown,
 )
+from pat.evaluation.tables import write_csv
 from pat.media.images import read_image, write_image
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
@@ -72,7 +69,11 @@ def test_a_result_that_cannot_be_scored_names_method_and_pair(result, complaint)
         evaluate_pairs(pairs(1), {"ours": lambda *_: result}, [2])
 
 
-ROWS = [Row("a", 2, "ours", 30.0, 0.9), Row("a", 4, "ours", 28.0, 0.8), Row("b", 2, "ours", 34.0, 0.96)]
+ROWS = [
+    StereoRow("a", 2, "ours", 30.0, 0.9),
+    StereoRow("a", 4, "ours", 28.0, 0.8),
+    StereoRow("b", 2, "ours", 34.0, 0.96),
+]
 
 
 def test_summaries_are_means_by_rate_and_method():
@@ -88,15 +89,13 @@ def depth_errors(cells):
 
 
 def test_tables_hold_every_row(tmp_path):
-    write_csv(tmp_path / "t.csv", ROWS)
+    write_csv(tmp_path / "t.csv", StereoRow._fields, ROWS)
     with (tmp_path / "t.csv").open() as file:
         again = [
-            Row(r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]), *depth_errors(r))
+            StereoRow(r["pair"], int(r["rate"]), r["method"], float(r["psnr"]), float(r["ssim"]), *depth_errors(r))
             for r in csv.DictReader(file)
         ]
     assert again == ROWS
-    write_markdown(tmp_path / "t.md", ROWS)
-    assert (tmp_path / "t.md").read_text() == markdown(ROWS)
     assert markdown(ROWS).splitlines() == [
         "| beta reduced 2x | ours |",
         "| --- | ---: |",
@@ -114,20 +113,18 @@ def test_tables_hold_every_row(tmp_path):
 class Matcher:
     """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
+    halo, beta_halo, multiple, bytes_per_pixel, equal_resolution, joins_bands = 0, 2, 1, 1.0, True, "no"
 
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
 
-    def normalisation(self, alpha, beta, look):
-        return look
-
-    def survey(self, alpha, beta, look):
+    def prepare(self, inputs):
         return None
 
-    def __call__(self, alpha, betas, looks):
-        self.betas.append([(b.shape[1], float(b.mean())) for b in betas])
-        self.looks = looks
+    def __call__(self, inputs, state=None):
+        alpha, betas = inputs.alpha, inputs.betas
+        self.betas.append([(b.image.shape[1], float(b.image.mean())) for b in betas])
+        self.field = betas[0].field
         grid = (
             pixel_grid(tuple(alpha.shape[-2:])).movedim(-1, 0)[None]
             - torch.tensor([self.disparity, 0.0])[:, None, None]
@@ -168,14 +165,15 @@ def test_controls_take_the_reference_away():
     assert abs(foreign - right) > 0.02
     assert shuffled == right
     x = pixel_grid((16, 24)).reshape(-1, 2)
-    looked = network.looks[0].at(x)
+    looked = network.field.at(x)
     assert sorted(looked.end.round().tolist()) == sorted(x.tolist())
     assert (looked.end - x).norm(dim=-1).mean() > 5
 
 
 def test_falls_are_means_and_the_least():
     rows = [
-        Row(p, 2, m, v, 0.9) for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
+        StereoRow(p, 2, m, v, 0.9)
+        for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
     ]
     assert falls(rows, names=["no"]) == "- no: 4.00 dB below fusion, at least 3.00 dB\n"
 
@@ -211,18 +209,16 @@ def test_controls_fall_on_real_pairs(shared_data):
 class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_pitch, joins_bands = 0, 2, 1, 1.0, True, "no"
+    halo, beta_halo, multiple, bytes_per_pixel, equal_resolution, joins_bands = 0, 2, 1, 1.0, True, "no"
 
-    def normalisation(self, alpha, beta, look):
-        return look
-
-    def survey(self, alpha, beta, look):
+    def prepare(self, inputs):
         return None
 
-    def __call__(self, alpha, betas, looks):
-        found = looks[0].at(torch.tensor([[20.0, 7.0]]))
+    def __call__(self, inputs, state=None):
+        alpha, (beta,) = inputs.alpha, inputs.betas
+        found = beta.field.at(torch.tensor([[20.0, 7.0]]))
         self.start, self.end = found.start[0].tolist(), found.end[0].tolist()
-        self.beta = tuple(betas[0].shape)
+        self.beta = tuple(beta.image.shape)
         none = alpha[:, 0] * 0
         return FusionOutput(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
 
@@ -250,12 +246,16 @@ def test_sets_are_read_by_their_own_rules_and_shown_apart(tmp_path):
 
 
 def test_lost_structure_is_named():
-    rows = [Row("p", 2, "alpha", 20, 0.9), Row("p", 2, "fusion", 30, 0.9), Row("q", 2, "alpha", 20, 0.9)]
-    rows.append(Row("q", 2, "fusion", 30, 0.91))
+    rows = [
+        StereoRow("p", 2, "alpha", 20, 0.9),
+        StereoRow("p", 2, "fusion", 30, 0.9),
+        StereoRow("q", 2, "alpha", 20, 0.9),
+    ]
+    rows.append(StereoRow("q", 2, "fusion", 30, 0.91))
     assert structure_kept(rows) == "SSIM of fusion is at least that of alpha in 2 of 2 cases."
     rows[1] = rows[1]._replace(ssim=0.8999)
     assert structure_kept(rows).endswith("1 of 2 cases; **below it**: p 2x.")
 
 
 def test_beta_as_it_is_has_its_own_header():
-    assert markdown([Row("a", 1, "ours", 30.0, 0.9)]).startswith("| beta as it is | ours |")
+    assert markdown([StereoRow("a", 1, "ours", 30.0, 0.9)]).startswith("| beta as it is | ours |")

@@ -5,8 +5,9 @@ import math
 import pytest
 import torch
 
-import pat.fusion.fuse
+import pat.fusion.steps
 import pat.fusion.tiles
+import pat.networks.pieces
 from arraygeom import (
     Camera,
     Distortion,
@@ -23,18 +24,22 @@ from arraygeom import (
     rotation_from_vector,
 )
 from calib.images.matches import match_points, seen_depths
-from pat.data.pairs import flickr_pairs, kitti_pairs
+from pat.data.pairs import folder_pairs
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.steps import pitch_ratio, quarter_turns, without_lenses
-from pat.fusion.tiles import REACH, SLACK, Tile, plan, tiles_of, working_memory
+from pat.fusion.inputs import FrameInputs
+from pat.fusion.steps import quarter_turns, resolution_ratio, without_lenses
+from pat.fusion.tiles import REACH, SLACK, tiles_within, working_memory
+from pat.fusion.views import Views
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT
 from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
 from pat.networks.guided import GuidedPAT, GuidedPATConfig
 from pat.networks.paper import PAT, PATConfig
+from pat.networks.pieces import Tile, matching_pieces, tiles_of
+from pat.networks.protocol import Inputs
 from pat.networks.weights import load_weights
 
 
@@ -87,41 +92,41 @@ def test_tiled_equals_whole(kind, dtype, bound, monkeypatch):
     whole = fuse(network, rig, images, alpha="mono")
     tiles = list(tiles_of(hw, 160, network.halo))
     assert any(t.outer[3] - t.outer[2] < hw[1] for t in tiles)
-    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: tiles)
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: tiles)
     tiled = fuse(network, rig, images, alpha="mono")
     assert (tiled.image - whole.image).abs().max() < bound
     assert torch.equal(tiled.depth.isnan(), whole.depth.isnan())
     assert (tiled.confidence - whole.confidence).abs().max() < bound
     assert torch.allclose(1 / tiled.depth, 1 / whole.depth, atol=10 * bound, equal_nan=True)
     monkeypatch.setattr(type(network), "halo", 16)
-    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: list(tiles_of(hw, 160, 16)))
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 160, 16)))
     assert (fuse(network, rig, images, alpha="mono").image - whole.image).abs().max() > bound
 
 
-def test_a_survey_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
+def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(monkeypatch):
     sample, network = load_sample(), load_weights("mono-colour")
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
-    monkeypatch.setattr(pat.fusion.tiles, "SURVEYED", 150_000)
-    monkeypatch.setattr(pat.fusion.tiles, "SURVEY_REACH", 128)
-    assert len(pat.fusion.tiles.survey_tiles(network, sample.rig["mono"].hw)) > 1
+    monkeypatch.setattr(pat.networks.pieces, "MATCHED_AT_ONCE", 150_000)
+    monkeypatch.setattr(pat.networks.pieces, "MATCHING_HALO", 128)
+    assert len(matching_pieces(sample.rig["mono"].hw, network.multiple)) > 1
     pieces = fuse(network, sample.rig, images, alpha="mono")
     ground_truth = sample.ground_truth
     assert score(pieces.image.clamp(0, 1), ground_truth).psnr > score(whole.image.clamp(0, 1), ground_truth).psnr - 0.1
     off = (pieces.image - whole.image).abs().amax(0)
     assert (off > 0.005).float().mean() < 1e-3
     hw = sample.rig["mono"].hw
-    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: list(tiles_of(hw, 192, REACH)))
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 192, REACH)))
     tiled = fuse(network, sample.rig, images, alpha="mono")
     assert (tiled.image - pieces.image).abs().max() < 1e-5
     assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("folder", "pairs"), [("kitti", kitti_pairs), ("flickr1024/train", flickr_pairs)])
-def test_halos_are_wide_enough_for_the_weights(folder, pairs, shared_data):
+@pytest.mark.parametrize("folder", ["kitti", "flickr1024/train"])
+def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
     """Tiles of real images equal the whole with the weights that are shipped."""
-    pair, network = next(pairs(shared_data / folder)), load_weights("mono-colour")
+    pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour")
     images = {"left": luminance(pair.left), "right": pair.right}
     rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
     field = Rectified(alpha_is="left", max_disparity=pair.max_disparity)
@@ -129,7 +134,9 @@ def test_halos_are_wide_enough_for_the_weights(folder, pairs, shared_data):
     h, w = rig["left"].hw
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(
-            pat.fusion.fuse, "plan", lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), REACH))
+            pat.fusion.tiles,
+            "tiles_within",
+            lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), REACH)),
         )
         tiled = fuse(network, rig, images, alpha="left", field=field)
     assert (tiled.image - whole.image).abs().max() < 1e-5
@@ -152,15 +159,21 @@ def test_images_are_asked_for_once_and_only_when_they_are_needed():
     assert sorted(asked) == ["colour", "mono"]
 
 
+def alpha_alone(hw):
+    """The inputs of a frame without betas, which takes no memory."""
+    return FrameInputs(Inputs(torch.zeros(1).expand(1, 1, *hw), ()), [], hw)
+
+
 def test_memory_decides_the_tiles():
     network, hw = network_of("PAT"), (3000, 4000)
-    assert plan(network, hw, [], None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
-    tiles = plan(network, hw, [], 2.0**31)
+    frame = alpha_alone(hw)
+    assert tiles_within(network, frame, None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
+    tiles = tiles_within(network, frame, 2.0**31)
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
     assert area * network.bytes_per_pixel <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
     with pytest.raises(ValueError, match="need at least 83 MiB"):
-        plan(network, hw, [], 2.0**20)
+        tiles_within(network, frame, 2.0**20)
 
 
 def test_tiles_are_those_with_the_least_work():
@@ -170,10 +183,11 @@ def test_tiles_are_those_with_the_least_work():
     def work(tiles):
         return sum((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
 
-    ours = plan(network, hw, [], limit)
+    frame = alpha_alone(hw)
+    ours = tiles_within(network, frame, limit)
     side = int(math.sqrt(limit / SLACK / network.bytes_per_pixel)) - 2 * REACH
     assert work(ours) < 0.95 * work(tiles_of(hw, side, REACH))
-    assert all(working_memory(network, t, []) <= limit for t in ours)
+    assert all(working_memory(network, frame.inputs, t) <= limit for t in ours)
 
 
 def test_the_plan_is_told_before_the_work():
@@ -188,13 +202,12 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
     """Beta sees ten times alpha's field: what fusing gives is the same, and what is worked on is small."""
     hw, wide = (64, 96), (300, 440)
     rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
-    pair = rig.pair("mono", "colour")
-    beta = pat.fusion.fuse._prepare(network, pair, texture(3, wide)[None], None, None, "colour")
-    assert beta.image.shape[-1] * beta.image.shape[-2] < 0.6 * 9 * math.prod(wide)
     images = {"mono": texture(1, hw), "colour": texture(3, wide)}
+    views = pat.fusion.steps.EqualResolution(network).do(Views.of(rig, images, alpha="mono")).views
+    assert math.prod(views.images["colour"].shape[1:]) < 0.6 * 9 * math.prod(wide)
     cut = fuse(network, rig, images, alpha="mono")
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(pat.fusion.fuse, "_common_part", lambda pair, image, field, network: (pair, image))
+        patched.setattr(pat.fusion.steps.EqualResolution, "_cropped", lambda step, views, name: views)
         whole = fuse(network, rig, images, alpha="mono")
     # What the views have in common sets the levels at which they are compared: that is where the two differ.
     assert (cut.image - whole.image).abs().mean() < 2e-2
@@ -204,16 +217,16 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
     hw, beta_hw = (34, 300), (30, 210)
     network, rig = network_of("PAT"), rig_of(hw, beta_hw)
     images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
-    monkeypatch.setattr(pat.fusion.fuse, "plan", lambda *_: list(tiles_of(hw, 64, network.halo)))
-    whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fusion.fuse._fuse_tile
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 64, network.halo)))
+    whole, made, fuse_tile = fuse(network, rig, images, alpha="mono"), [], pat.fusion.tiles.fuse_tile
 
-    def counted(network, own, betas, tile):
+    def counted(network, frame, state, tile):
         if len(made) == 3:
             raise KeyboardInterrupt
         made.append(tile)
-        return fuse_tile(network, own, betas, tile)
+        return fuse_tile(network, frame, state, tile)
 
-    monkeypatch.setattr(pat.fusion.fuse, "_fuse_tile", counted)
+    monkeypatch.setattr(pat.fusion.tiles, "fuse_tile", counted)
     with pytest.raises(KeyboardInterrupt):
         fuse(network, rig, images, alpha="mono", store=tmp_path)
     made.clear()
@@ -227,8 +240,8 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
 
 def test_pitch_is_the_ratio_of_pixels():
     rig = rig_of((60, 80), (60, 80), focal=100.0, beta_focal=50.0)
-    assert abs(pitch_ratio(rig.pair("mono", "colour")) - 0.5) < 0.01
-    assert abs(pitch_ratio(rig.pair("colour", "mono")) - 2.0) < 0.04
+    assert abs(resolution_ratio(rig.pair("mono", "colour")) - 0.5) < 0.01
+    assert abs(resolution_ratio(rig.pair("colour", "mono")) - 2.0) < 0.04
 
 
 def test_colour_comes_from_where_the_field_says():

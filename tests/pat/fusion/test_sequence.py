@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
-from pat.fusion.optical_flow import carried, flow_between
+from pat.fusion.optical_flow import warped, flow_between
 from pat.fusion.sequence import SequenceFusion, Source, Timeline, flicker, fuse_sequence, mixed
 from pat.networks.weights import load_weights
 from tests.pat.fusion import moving
@@ -60,9 +60,9 @@ def test_flow_finds_a_shift_and_its_trust_the_border():
     flow = flow_between(a, b * 0.97)
     inside = flow.step[:, 10:-10, 10:-10]
     assert (inside - torch.tensor([-5.0, -2.0])[:, None, None]).abs().median() < 0.1
-    assert flow.trust[10:-10, 10:-10].median() > 0.9
-    assert flow.trust[:, :4].max() == 0
-    assert (carried(b, flow.step) - a)[:, 10:-10, 10:-10].abs().mean() < 0.01
+    assert flow.weight[10:-10, 10:-10].median() > 0.9
+    assert flow.weight[:, :4].max() == 0
+    assert (warped(b, flow.step) - a)[:, 10:-10, 10:-10].abs().mean() < 0.01
 
 
 def test_colours_mix_by_confidence_and_disagreement_is_doubt():

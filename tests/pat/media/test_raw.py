@@ -7,10 +7,10 @@ import torch
 
 from arraygeom import Rig, Sensor, View
 from pat.fusion.views import read_views
-from pat.media.colour import linear_from_srgb, luminance
+from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.images import write_image
 from pat.media.raw import as_bright, demosaiced, develop, developed
-from pat.sensors import Coded
+from pat.sensors import Mosaic
 
 HW = (48, 64)
 
@@ -22,10 +22,6 @@ def light(*, channels=3, white=1.0):
     return (0.1 + 0.8 * fine).clamp(0.02, 1) * white
 
 
-def coded(linear):
-    return Coded().apply(linear[None], torch.Generator())[0]
-
-
 def counts(linear, *, bits, black, shift=0):
     full = 2**bits - 1
     values = black + linear.numpy().astype(np.float64) * (full - black)
@@ -33,11 +29,7 @@ def counts(linear, *, bits, black, shift=0):
 
 
 def mosaic(rgb, pattern):
-    """One of three channels at each pixel."""
-    raw = torch.empty(1, *rgb.shape[1:])
-    for i, letter in enumerate(pattern):
-        raw[0, i // 2 :: 2, i % 2 :: 2] = rgb["RGB".index(letter), i // 2 :: 2, i % 2 :: 2]
-    return raw
+    return Mosaic(pattern).apply(rgb[None], torch.Generator())[0]
 
 
 def save(path, values):
@@ -88,11 +80,13 @@ def test_exposures_and_gains_are_brought_to_alphas():
     alpha, scene = Sensor(exposure=0.01), light(channels=3, white=0.2)
     wide = Sensor(exposure=0.04, gain=(0.5, 1.0, 0.8), coding="linear")
     recorded = scene * 4 * torch.tensor([0.5, 1.0, 0.8])[:, None, None]
-    torch.testing.assert_close(develop(recorded, wide, like=alpha), coded(scene), atol=1e-5, rtol=0)
+    torch.testing.assert_close(develop(recorded, wide, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0)
     srgb = Sensor(exposure=0.02, gain=2.0)
-    torch.testing.assert_close(develop(coded(4 * scene), srgb, like=alpha), coded(scene), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        develop(srgb_from_linear(4 * scene), srgb, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0
+    )
     no_exposure = Sensor(gain=2.0, coding="linear")
-    torch.testing.assert_close(develop(2 * scene, no_exposure, like=alpha), coded(scene), atol=1e-5, rtol=0)
+    torch.testing.assert_close(develop(2 * scene, no_exposure, like=alpha), srgb_from_linear(scene), atol=1e-5, rtol=0)
 
 
 def test_ordinary_images_pass_unchanged():
@@ -130,7 +124,7 @@ def test_exr_is_written_and_holds_the_floats(tmp_path):
 def test_a_image_is_as_bright_as_the_light_that_alpha_measured():
     """The right chroma on alpha's values is too bright where colours are strong; then it is the truth again."""
     linear = light() ** torch.tensor([1.0, 3.0, 0.5]).view(3, 1, 1)
-    ground_truth, alpha = coded(linear), coded(luminance(linear))
+    ground_truth, alpha = srgb_from_linear(linear), srgb_from_linear(luminance(linear))
     fused = ground_truth - luminance(ground_truth) + alpha
     assert (fused - ground_truth).abs().max() > 0.02
     measured = developed(Sensor(response="mono", coding="linear"))

@@ -4,11 +4,12 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pair, Pose, Rectified, Rig, View, intrinsics
+from arraygeom.fields.grid import FieldOnGrid
 from pat import from_pretrained
 from pat.fusion.fuse import fuse
-from pat.fusion.steps import together
+from pat.fusion.steps import co_located
 from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
-from pat.networks.protocol import Look
+from pat.networks.protocol import Inputs
 from pat.networks.weights import save_weights
 
 from .test_spectral_mix import texture
@@ -24,20 +25,20 @@ def network():
     return made.eval()
 
 
-def look(disparity):
-    return Look.along(Rectified(disparity), Pair(View(hw=HW), View(hw=HW)))
+def field(disparity):
+    return FieldOnGrid.of(Rectified(disparity), Pair(View(hw=HW), View(hw=HW)))
 
 
 def test_permuting_betas_of_one_band_permutes_the_output_bands(network):
-    alpha, bands, looks = (
+    alpha, bands, fields = (
         torch.rand(2, 1, *HW),
         list(torch.rand(4, 2, 1, *HW)),
-        [look(d) for d in (6.0, 9.0, 12.0, 4.0)],
+        [field(d) for d in (6.0, 9.0, 12.0, 4.0)],
     )
     order = [2, 0, 1, 3]
     with torch.no_grad():
-        first = network(alpha, bands, looks)
-        second = network(alpha, [bands[i] for i in order], [looks[i] for i in order])
+        first = network(Inputs.of(alpha, bands, fields))
+        second = network(Inputs.of(alpha, [bands[i] for i in order], [fields[i] for i in order]))
     assert first.image.shape == (2, 4, *HW)
     assert torch.equal(second.image, first.image[:, order])
     assert all(torch.equal(second.confidence[k], first.confidence[i]) for k, i in enumerate(order))
@@ -49,9 +50,9 @@ def test_permuting_the_bands_of_a_beta_permutes_the_output_bands(network, count)
     hw, order = (64, 96), torch.randperm(count, generator=torch.Generator().manual_seed(count)).tolist()
     scene = torch.cat([texture(count, (64, 104), seed=i) for i in range(2)])
     alpha, beta = scene[:, :1, :, :-8] * 0.4 + scene[:, 1:2, :, :-8] * 0.6, scene[..., 8:]
-    there = [Look.along(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))]
+    there = [FieldOnGrid.of(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))]
     with torch.no_grad():
-        first, second = (network(alpha, [b], there) for b in (beta, beta[:, order]))
+        first, second = (network(Inputs.of(alpha, [b], there)) for b in (beta, beta[:, order]))
     assert torch.equal(second.image, first.image[:, order])
     assert torch.equal(second.position[0], first.position[0])
     assert len(first.confidence) == 1
@@ -92,10 +93,10 @@ def test_bands_come_out_in_the_order_of_their_cameras(network):
 
 def test_which_cameras_are_put_together():
     rig, fields = rig_of("abcd", [1, 2, 1, 1]), dict.fromkeys("abcd")
-    assert together(rig, "abcd", fields, "all") == [["a", "c", "d"], ["b"]]
-    assert together(rig, "abcd", fields, "neighbours") == [["a"], ["b"], ["c", "d"]]
-    assert together(rig, "abcd", fields, "no") == [["a"], ["b"], ["c"], ["d"]]
-    assert together(rig, "abcd", fields | {"c": Rectified(5.0)}, "all") == [["a", "d"], ["b"], ["c"]]
+    assert co_located(rig, "abcd", fields, "all") == [["a", "c", "d"], ["b"]]
+    assert co_located(rig, "abcd", fields, "neighbours") == [["a"], ["b"], ["c", "d"]]
+    assert co_located(rig, "abcd", fields, "no") == [["a"], ["b"], ["c"], ["d"]]
+    assert co_located(rig, "abcd", fields | {"c": Rectified(5.0)}, "all") == [["a", "d"], ["b"], ["c"]]
     smaller = Rig({**rig.cameras, "c": rig["c"].resize((32, 48))}, depth=rig.depth)
     assert together(smaller, "abcd", fields, "all") == [["a", "d"], ["b"], ["c"]]
 

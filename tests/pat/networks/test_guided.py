@@ -4,16 +4,17 @@ import pytest
 import torch
 
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
+from arraygeom.fields.grid import FieldOnGrid
 from pat.media.colour import luminance
 from pat.networks.guided import GuidedPAT, GuidedPATConfig, window_around
-from pat.networks.protocol import Look
+from pat.networks.protocol import Inputs
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8))
 HW = (32, 48)
 
 
-def rectified(beta_hw: tuple[int, int] = HW) -> Look:
-    return Look.along(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
+def rectified(beta_hw: tuple[int, int] = HW) -> FieldOnGrid:
+    return FieldOnGrid.of(Rectified(10.0), Pair(View(hw=HW), View(hw=beta_hw)))
 
 
 def lively(network: GuidedPAT) -> GuidedPAT:
@@ -26,7 +27,7 @@ def test_luminance_is_alphas():
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
     alpha, beta = torch.rand(2, 1, *HW), torch.rand(2, 3, 32, 64)
-    fused = network(alpha, [beta], [rectified((32, 64))])
+    fused = network(Inputs.of(alpha, [beta], [rectified((32, 64))]))
     assert (luminance(fused.image) - alpha).abs().max() < 1e-5
     assert (fused.image - alpha).abs().max() > 1e-2
 
@@ -36,8 +37,8 @@ def test_three_filtered_cameras_serve_as_one():
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
-    one = network(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()])
-    three = network(alpha, [grey] * 3, [rectified()] * 3)
+    one = network(Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
+    three = network(Inputs.of(alpha, [grey] * 3, [rectified()] * 3))
     assert (one.image - three.image).abs().max() < 1e-5
     assert len(three.confidence) == 3
 
@@ -45,7 +46,7 @@ def test_three_filtered_cameras_serve_as_one():
 def test_bands_must_add_up():
     network = GuidedPAT(SMALL)
     with pytest.raises(ValueError, match="2 bands in all, this network makes 3"):
-        network(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()])
+        network(Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()]))
 
 
 def test_the_window_stays_around_the_match():
@@ -64,28 +65,33 @@ def test_gradients_reach_the_rig():
     camera = Camera(K=intrinsics(60.0, HW), cam_from_world=Pose.identity(), hw=HW)
     beta = camera.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), translation))
     depth = tuple(torch.tensor(d, dtype=torch.float64) for d in (1.0, 8.0))
-    fused = network(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [Look.along(Epipolar(), Pair(camera, beta, depth))])
+    fused = network(
+        Inputs.of(
+            torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [FieldOnGrid.of(Epipolar(), Pair(camera, beta, depth))]
+        )
+    )
     fused.image.square().sum().backward()
     assert translation.grad is not None
     assert translation.grad.isfinite().all()
     assert translation.grad.abs().max() > 0
 
 
-def test_nowhere_to_look_is_no_confidence():
+def test_no_valid_segment_is_no_confidence():
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
-    nowhere = Look(lambda x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), 4)
-    fused = network(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere])
+    pair = Pair(View(hw=HW), View(hw=HW))
+    nowhere = FieldOnGrid.of(lambda _, x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), pair)
+    fused = network(Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere]))
     assert fused.confidence[0].max() == 0
     assert fused.image.isfinite().all()
 
 
-def test_without_a_head_the_image_is_what_was_found_and_carried():
+def test_without_a_head_the_image_is_what_was_matched_and_propagated():
     torch.manual_seed(0)
     network = GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8), head_dim=0, keep_luminance=False))
     assert not [name for name in network.state_dict() if name.startswith(("head", "propagate"))]
     alpha, beta = torch.rand(1, 1, *HW), torch.rand(1, 3, *HW)
-    torch.nn.init.constant_(network.trust[2].bias, 20.0)
-    fused, (seen,) = network.explain(alpha, [beta], [rectified()])
+    torch.nn.init.constant_(network.confidence[2].bias, 20.0)
+    fused, (seen,) = network.explain(Inputs.of(alpha, [beta], [rectified()]))
     assert seen.logit.max() > 15
     assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)

@@ -4,14 +4,15 @@ import pytest
 import torch
 
 from arraygeom import Pair, Rectified, Rig, View, look
+from arraygeom.fields.grid import FieldOnGrid
 from pat.attention import attend
 from pat.networks.paper import PAT, PATConfig
-from pat.networks.protocol import Look
+from pat.networks.protocol import Inputs
 
 
-def looks(network: PAT, alpha: torch.Tensor, betas: list[torch.Tensor]) -> list[Look]:
+def fields(network: PAT, alpha: torch.Tensor, betas: list[torch.Tensor]) -> list[FieldOnGrid]:
     hw = [tuple(p.shape[-2:]) for p in (alpha, *betas)]
-    return [Look.along(Rectified(8, alpha_is="left"), Pair(View(hw=hw[0]), View(hw=b))) for b in hw[1:]]
+    return [FieldOnGrid.of(Rectified(8, alpha_is="left"), Pair(View(hw=hw[0]), View(hw=b))) for b in hw[1:]]
 
 
 def test_the_rectified_field_is_parallax_attention():
@@ -42,7 +43,7 @@ def test_any_number_of_betas_of_any_sizes(scale):
     network = PAT(PATConfig(betas=3, dim=8, scale=scale))
     alpha = torch.rand(1, 1, 12, 20)
     betas = [torch.rand(1, 3, 12, 20), torch.rand(1, 1, 7, 11), torch.rand(1, 3, 24, 30)]
-    fused = network(alpha, betas, looks(network, alpha, betas))
+    fused = network(Inputs.of(alpha, betas, fields(network, alpha, betas)))
     assert fused.image.shape == (1, 3, 12 * scale, 20 * scale)
     assert [p.shape for p in fused.position] == [(1, 2, 12, 20)] * 3
     fused.image.sum().backward()
@@ -55,18 +56,18 @@ def test_the_residual_path_keeps_alpha():
     for residual, expected in ((True, alpha.expand(-1, 3, -1, -1)), (False, torch.zeros(1, 3, 12, 20))):
         network = PAT(PATConfig(dim=8, residual=residual))
         torch.nn.init.zeros_(network.post[-1].weight)
-        assert torch.equal(network(alpha, betas, looks(network, alpha, betas)).image, expected)
+        assert torch.equal(network(Inputs.of(alpha, betas, fields(network, alpha, betas))).image, expected)
 
 
 def test_wrong_numbers_are_refused():
     network = PAT(PATConfig(betas=2, dim=8))
     alpha, beta = torch.rand(1, 1, 12, 20), torch.rand(1, 3, 12, 20)
     with pytest.raises(ValueError, match="made for 2 betas, got 1"):
-        network(alpha, [beta], looks(network, alpha, [beta]))
+        network(Inputs.of(alpha, [beta], fields(network, alpha, [beta])))
     with pytest.raises(ValueError, match="1 or 3 channels"):
-        network(alpha, [beta, beta[:, :2]], looks(network, alpha, [beta, beta]))
+        network(Inputs.of(alpha, [beta, beta[:, :2]], fields(network, alpha, [beta, beta])))
 
 
 def test_samples_follow_the_longest_segment():
     rig = Rig({"a": View(hw=(10, 40)), "b": View(hw=(10, 40))})
-    assert Look.along(Rectified(12.0), rig.pair("a", "b")).samples == 13
+    assert FieldOnGrid.of(Rectified(12.0), rig.pair("a", "b")).samples == 13

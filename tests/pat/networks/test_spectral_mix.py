@@ -5,8 +5,7 @@ import torch
 from torch.nn.functional import interpolate
 
 from arraygeom import Pair, Rectified, View
-from pat.networks.guided import segments_of
-from pat.networks.protocol import Look
+from arraygeom.fields.grid import FieldOnGrid
 from pat.networks.semi_global import box_mean
 from pat.networks.spectral_mix import SpectralMix, coarse_mix
 
@@ -82,8 +81,8 @@ def test_the_combination_is_found_before_anything_is_matched():
     hw = (96, 160)
     scene = texture(3, (hw[0], hw[1] + 12))
     alpha, beta = seen_in(scene[..., :-12]), scene[..., 12:]
-    look = Look.along(Rectified(24.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
-    segments, blocks = (segments_of(look, hw, step, alpha.double()) for step in (2, 4))
+    field = FieldOnGrid.of(Rectified(24.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))
+    segments, blocks = (field.of_blocks(side) for side in (2, 4))
     mix = coarse_mix(alpha, beta, segments, blocks, 2)
     assert (mix.weights[0] - WEIGHTS).abs().max() < 0.06
     assert float(mix.gain) > 0.9

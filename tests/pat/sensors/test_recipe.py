@@ -6,12 +6,13 @@ from arraygeom.sensor import Band, Curve
 from pat.sensors import (
     STEPS,
     BoxBlur,
-    Case,
     Clip,
     Crop,
+    DecodeSRGB,
     Defocus,
+    DegradationCase,
     Demosaic,
-    Linear,
+    EncodeSRGB,
     Noise,
     Quantise,
     Resample,
@@ -41,10 +42,14 @@ blue:
 """
 
 
+def test_former_names_of_the_srgb_conversions_are_read():
+    assert read_chain(["linear", "coded"]) == read_chain(["decode-srgb", "encode-srgb"]) == (DecodeSRGB(), EncodeSRGB())
+
+
 def test_a_file_says_what_each_camera_does():
     chains = read_chains(yaml.safe_load(TEXT))
     assert chains["mono"] == (
-        *(Linear(), Spectral("luminance"), Defocus(3.0, 2.8, 25.0, "gaussian"), Resample(0.5)),
+        *(DecodeSRGB(), Spectral("luminance"), Defocus(3.0, 2.8, 25.0, "gaussian"), Resample(0.5)),
         *(Noise(8000.0, 3.0, "poisson"), Clip(), Quantise(12)),
     )
     assert chains["blue"] == (
@@ -62,7 +67,7 @@ def test_the_papers_cases_as_a_list():
         {"name": "blur and reduce beta", "beta": [{"box-blur": 5}, *reduced]},
     ]
     assert read_cases(listed) == paper_cases()
-    assert read_cases([{"name": "one", "alpha": [{"box-blur": 3}]}]) == (Case("one", alpha=(BoxBlur(3),)),)
+    assert read_cases([{"name": "one", "alpha": [{"box-blur": 3}]}]) == (DegradationCase("one", alpha=(BoxBlur(3),)),)
 
 
 def test_every_step_has_a_name():

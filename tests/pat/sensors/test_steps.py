@@ -8,15 +8,15 @@ from arraygeom.pose import Pose
 from arraygeom.sensor import Band, Curve
 from pat.sensors import (
     BoxBlur,
-    Case,
     Clip,
-    Coded,
+    DecodeSRGB,
+    DegradationCase,
     DiscBlur,
+    EncodeSRGB,
     Exposure,
     Gamma,
     GaussianBlur,
     Jitter,
-    Linear,
     Noise,
     Quantise,
     Resample,
@@ -41,8 +41,8 @@ def run(image: torch.Tensor, *steps, seed: int = 0) -> torch.Tensor:
 
 def test_linear_and_coded_are_inverses_and_match_the_standard():
     x = torch.linspace(0, 1, 101, dtype=torch.float64).view(1, 1, 1, -1)
-    torch.testing.assert_close(run(x, Linear(), Coded()), x, atol=1e-12, rtol=0)
-    assert run(torch.full((1, 1, 1, 1), 0.5), Linear()).item() == pytest.approx(0.214041, abs=1e-6)
+    torch.testing.assert_close(run(x, DecodeSRGB(), EncodeSRGB()), x, atol=1e-12, rtol=0)
+    assert run(torch.full((1, 1, 1, 1), 0.5), DecodeSRGB()).item() == pytest.approx(0.214041, abs=1e-6)
 
 
 @pytest.mark.parametrize("counts", ["gaussian", "poisson"])
@@ -189,7 +189,7 @@ def test_jitter_changes_each_image_by_about_what_is_asked():
 @pytest.mark.parametrize(
     "step",
     [
-        *(Linear(), Coded(), Exposure(1.7), Spectral("luminance"), Spectral(Band(560, 50))),
+        *(DecodeSRGB(), EncodeSRGB(), Exposure(1.7), Spectral("luminance"), Spectral(Band(560, 50))),
         *(BoxBlur(3), GaussianBlur(0.8), DiscBlur(1.3), Resample(0.5), Resample((5, 9)), Resample(2.0, "bicubic")),
         *(Noise(500, 3), Jitter()),
     ],
@@ -237,4 +237,9 @@ def test_mistakes_are_told():
     with pytest.raises(ValueError, match="full_well > 0"):
         Noise(0)
     with pytest.raises(ValueError, match="must keep the size"):
-        augment(noise_image(1, 1, 8, 8), noise_image(1, 3, 8, 8), [Case("halve", beta=(Resample(0.5),))], generator())
+        augment(
+            noise_image(1, 1, 8, 8),
+            noise_image(1, 3, 8, 8),
+            [DegradationCase("halve", beta=(Resample(0.5),))],
+            generator(),
+        )

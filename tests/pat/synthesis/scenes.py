@@ -28,7 +28,7 @@ def unlike_cameras(width: int = 64) -> Rig:
         "oblong": Camera(K=plain, cam_from_world=posed(), hw=(h, w)),
         "shifted": Camera(K=shifted, cam_from_world=posed((1, -4, 5), (0.3, 0.05, 0.1)), hw=(w, h)),
         "turned": Camera(K=turned, cam_from_world=posed((-2, 1, 0), (0, -0.2, 0)), hw=(w, h)),
-        "bent": Camera(
+        "distorted": Camera(
             K=intrinsics(0.6 * w, (h, w)), cam_from_world=posed((0, 2, -1), (-0.25, 0, 0)), hw=(h, w), distortion=LENS
         ),
     }

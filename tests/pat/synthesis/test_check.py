@@ -6,7 +6,7 @@ import torch
 from arraygeom.camera import Camera, intrinsics
 from arraygeom.pixels import pixel_grid
 from arraygeom.rig import Rig
-from pat.synthesis.check import Limits, check_views
+from pat.synthesis.check import CheckLimits, check_views
 from pat.synthesis.rendered import RenderedFrame
 from tests.pat.synthesis.scenes import LENS, posed
 
@@ -107,4 +107,4 @@ def test_frames_of_different_times_are_not_compared(rig, frames):
 
 
 def test_limits_can_be_set(rig, frames):
-    assert not check_views(rig, frames, Limits(overlap=0.99)).accepted
+    assert not check_views(rig, frames, CheckLimits(overlap=0.99)).accepted

@@ -8,11 +8,11 @@ from pat.media.images import write_image
 from pat.synthesis.boards import PIXELS, draw_board, inner_corners, opencv_board
 from pat.synthesis.furnish import Setting
 from pat.synthesis.generators import GENERATORS, abstract, board, photographs, random_board_poses
-from pat.synthesis.scene import Board, Scene
+from pat.synthesis.scene import BoardObject, Scene
 from pat.synthesis.shapes import inside, mesh
 from tests.pat.synthesis.scenes import posed, unlike_cameras
 
-BOARD = Board(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
+BOARD = BoardObject(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
 
 
 def depths(scene: Scene, camera: Camera) -> torch.Tensor:
@@ -70,7 +70,7 @@ def test_what_cannot_be_generated_is_said(tmp_path):
     with pytest.raises(ValueError, match="at least one pose"):
         board([], BOARD)
     with pytest.raises(ValueError, match="unknown marker dictionary 'DICT_9'"):
-        draw_board(Board(dictionary="DICT_9"))
+        draw_board(BoardObject(dictionary="DICT_9"))
     assert set(GENERATORS) == {"abstract", "photographs", "board"}
 
 

@@ -161,9 +161,9 @@ def test_groups_must_be_shared_evenly():
         Process(0, 2).share(3)
 
 
-def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatch):
+def test_a_sample_that_is_not_finite_is_named_and_saved(folder, whole, monkeypatch):
     config = replace(whole, out=folder / "nan")
-    ordinary = loop.Source.sample
+    ordinary = loop.SampleSource.sample
 
     def poisoned(self, planned, step, group):
         given = ordinary(self, planned, step, group)
@@ -171,15 +171,15 @@ def test_a_sample_that_is_not_finite_is_named_and_kept(folder, whole, monkeypatc
             given.ground_truth[1, :, 5, 5] = torch.nan
         return given
 
-    monkeypatch.setattr(loop.Source, "sample", poisoned)
+    monkeypatch.setattr(loop.SampleSource, "sample", poisoned)
     with pytest.raises(FloatingPointError, match=r"step 5: .*, by sample 1 of group 1; "):
         train(config)
     (file,) = config.out.glob("offending-*")
     assert file.name == "offending-step-5-group-1.safetensors"
-    with safe_open(file, "pt") as kept:
-        assert kept.get_tensor("truth")[1].isnan().any()
-        assert kept.get_tensor("betas/0").isfinite().all()
-        assert kept.metadata()["samples"] == "[1]"
+    with safe_open(file, "pt") as saved:
+        assert saved.get_tensor("ground_truth")[1].isnan().any()
+        assert saved.get_tensor("betas/0").isfinite().all()
+        assert saved.metadata()["samples"] == "[1]"
     assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
 
 

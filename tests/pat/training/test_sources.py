@@ -17,29 +17,30 @@ from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pixels import pixel_grid
 from arraygeom.sampling import sample
 from arraygeom.undistortion import resampled
+from pat.data.windows import RenderedView, read_view, undistorted, window
 from pat.farm.backends import LayeredSettings
 from pat.media.colour import luminance
 from pat.media.images import write_image
 from pat.networks.paper import PATConfig
-from pat.synthesis.check import Limits
+from pat.synthesis.check import CheckLimits
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
 from pat.synthesis.rigs import RigDistribution
-from pat.training.config import Recording, TrainConfig, parse_config
+from pat.training.config import RecordingConfig, TrainConfig, parse_config
 from pat.training.lenses import lens_over, one_camera, through_lenses
 from pat.training.loop import new_network
 from pat.training.losses import explained, match_loss, validation
-from pat.training.samples import degraded, pair_of, plan, scenes, truth_in
-from pat.training.scenes import HELD, SKY, TURN, RenderedCrops, View, batched, in_hand, read_view, window
+from pat.training.samples import degraded, pair_of, plan, scenes, transfer
+from pat.training.scenes import ACTIVE, GROUPS_PER_EXCHANGE, SKY, RenderedCrops, active_items, batched, finite_window
 from pat.training.stereo import PairCrops
 from pat.training.train import save_config, train
 
 from .runs import losses, short_run
 from .test_loop import command, one_thread, stopped  # noqa: F401
 
-EXACT = Recording(gain=0, blur=0, noise=0, paper=0)
+EXACT = RecordingConfig(gain=0, blur=0, noise=0, paper=0)
 
 
 def generator(seed: int = 0) -> Generator:
@@ -62,7 +63,7 @@ def make_rig() -> Rig:
 def rendered(tmp_path_factory):
     """Four layered scenes of patterns; copy what you break."""
     root = tmp_path_factory.mktemp("rendered")
-    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), Limits())
+    renderer = LayeredSettings(layers=(4, 7), oversampling=1).renderer(make_rig(), CheckLimits())
     for seed in range(4):
         renderer.render(seed, root / "scenes" / f"{seed:06d}")
     return root
@@ -117,34 +118,34 @@ def test_what_is_wrong_with_shares(text, message):
 
 
 def test_all_items_have_their_turn_equally_often():
-    count = HELD + 5
-    drawn = [in_hand(number, count, 3) for number in range(20 * TURN * count)]
-    assert all(len(hand) == HELD for hand in drawn)
-    assert all(len(set(a) ^ set(b)) <= 2 or len(set(b)) < HELD for a, b in pairwise(drawn))
-    times = torch.bincount(torch.tensor(drawn[TURN * HELD :]).flatten())
+    count = ACTIVE + 5
+    drawn = [active_items(number, count, 3) for number in range(20 * GROUPS_PER_EXCHANGE * count)]
+    assert all(len(hand) == ACTIVE for hand in drawn)
+    assert all(len(set(a) ^ set(b)) <= 2 or len(set(b)) < ACTIVE for a, b in pairwise(drawn))
+    times = torch.bincount(torch.tensor(drawn[GROUPS_PER_EXCHANGE * ACTIVE :]).flatten())
     assert len(times) == count
     assert times.max() <= 1.2 * times.min()
-    assert in_hand(40, count, 3) == drawn[40] != in_hand(40, count, 4)
+    assert active_items(40, count, 3) == drawn[40] != active_items(40, count, 4)
 
 
 # Rendered scenes -------------------------------------------------------------------------------------------
 
 
 def through(root):
-    """Put lenses in front of two cameras of every scene: their images bent, nothing known beyond the old ones."""
+    """Put lenses in front of two cameras of every scene: their images distorted, nothing known beyond the old ones."""
     for folder in (root / "scenes").iterdir():
         source = Rendered(folder)
         rig = source.rig
         for name, k1 in (("mono", -0.4), ("wide", 0.3)):
             lens = Distortion(BROWN_CONRADY, torch.tensor([k1, 0.01, 0, 0]).double())
             camera, frame = rig[name], source.frame(name)
-            has_lens = camera.replace(distortion=lens)
-            depth = resampled(frame.depth[None], camera, has_lens, interpolation="nearest")
-            rgb = resampled(frame.rgb, camera, has_lens).values[0].clamp(min=0)
+            lossy = camera.replace(distortion=lens)
+            depth = resampled(frame.depth[None], camera, lossy, interpolation="nearest")
+            rgb = resampled(frame.rgb, camera, lossy).values[0].clamp(min=0)
             known = torch.where(depth.valid[0], depth.values[0, 0], torch.nan)
             plain = replace(frame, rgb=rgb, depth=known, normals=None, flow=None)
             save_frame(folder / source.about["frames"][name][0]["file"], plain)
-            rig = rig.with_camera(name, has_lens)
+            rig = rig.with_camera(name, lossy)
         rig.save(folder / "rig.yaml")
     return root
 
@@ -167,10 +168,10 @@ def test_true_depth_says_where_alphas_pixels_are_in_beta(lenses, broken):
     assert torch.stack(moved).mean() > 3 * torch.stack(seen).mean()
 
 
-def test_scenes_behind_lenses_are_straightened(rendered, broken):
+def test_scenes_behind_lenses_are_undistorted(rendered, broken):
     """Colours and depth are where the same ray was in the image without a lens."""
     folder = through(broken) / "scenes" / "000001"
-    before, view = Rendered(rendered / "scenes" / "000001"), read_view(folder, "mono")
+    before, view = Rendered(rendered / "scenes" / "000001"), undistorted(read_view(folder, "mono"))
     assert view.camera.distortion is None
     assert view.depth.isnan().any()
     x = pixel_grid((96, 128), dtype=torch.float64)[4:-4:3, 4:-4:3].flatten(0, 1)
@@ -184,7 +185,7 @@ def test_scenes_behind_lenses_are_straightened(rendered, broken):
 
 def test_windows_reach_beyond_images():
     camera = Camera(K=intrinsics(5.0, (4, 6)), cam_from_world=Pose.identity(), hw=(4, 6))
-    view = View(torch.rand(3, 4, 6), torch.rand(4, 6) + 1, camera)
+    view = RenderedView(torch.rand(3, 4, 6), torch.rand(4, 6) + 1, camera)
     beyond = window(view, -1, 3, (6, 6), (6, 6))
     assert torch.equal(beyond.rgb[:, 1:5, :3], view.rgb[:, :, 3:])
     assert torch.equal(beyond.rgb[:, 0, 3:], view.rgb[:, 0, 5:].expand(3, 3))
@@ -198,14 +199,14 @@ def test_any_camera_is_alpha_and_betas_are_others(rendered):
     crops = RenderedCrops([rendered], hw=(32, 48), resolutions=(0.5,))
     focal = {float(c.K[0, 0]) / times for c in make_rig().cameras.values() for times in (1, 2)}
     batches = [crops.sample(3, generator(number), number=number, betas=3) for number in range(12)]
-    drawn = torch.cat([b.K[0][:, 0, 0] for b in batches])
+    drawn = torch.cat([b.cameras[0].K[:, 0, 0] for b in batches])
     assert set(drawn.tolist()) == focal
     for batch in batches:
         assert [tuple(image.shape) for image in batch.images] == [(3, 3, 32, 48), *[(3, 3, 16, 24)] * 3]
-        assert (batch.K[1][:, 0, 0] / batch.K[0][:, 0, 0]).sub(0.5).abs().max() < 0.03
-        assert torch.equal(batch.t[1], batch.t[3])
-        assert not torch.equal(batch.t[1], batch.t[2])
-        assert (batch.t[1].norm(dim=1) > 0.05).all()
+        assert (batch.cameras[1].K[:, 0, 0] / batch.cameras[0].K[:, 0, 0]).sub(0.5).abs().max() < 0.03
+        assert torch.equal(batch.cameras[1].t, batch.cameras[3].t)
+        assert not torch.equal(batch.cameras[1].t, batch.cameras[2].t)
+        assert (batch.cameras[1].t.norm(dim=1) > 0.05).all()
 
 
 def test_samples_of_scenes_depend_on_their_number_alone(rendered):
@@ -213,7 +214,10 @@ def test_samples_of_scenes_depend_on_their_number_alone(rendered):
     for number in range(3):
         used.sample(2, generator(number), number=number)
     one, other = (crops.sample(2, generator(9), number=7) for crops in (used, fresh))
-    assert all(torch.equal(a, b) for a, b in zip(one.images + one.depth + one.K, other.images + other.depth + other.K))
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(one.images + one.depth + [one.cameras[0].K], other.images + other.depth + [other.cameras[0].K])
+    )
 
 
 def test_the_sky_is_seen_by_both_at_infinity():
@@ -223,10 +227,10 @@ def test_the_sky_is_seen_by_both_at_infinity():
     K = intrinsics(60.0, (32, 48))
     cameras = [Camera(K=K, cam_from_world=pose, hw=(32, 48)) for pose in (Pose.identity(), beta)]
     sky = torch.full((32, 48), torch.inf)
-    views = [window(View(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras]
+    views = [finite_window(RenderedView(torch.rand(3, 32, 48), sky, c), 0, 0, (32, 48), (32, 48)) for c in cameras]
     batch = batched([views], "cpu")
     assert batch.depth_range.max() <= SKY
-    position, visible = truth_in(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
+    position, visible = transfer(pair_of(batch, 1, generator()), batch.depth[0], batch.depth[1])
     x = K @ turn @ torch.linalg.inv(K) @ torch.tensor([20.0, 12.0, 1.0]).double()
     torch.testing.assert_close(position[0, 12, 20].double(), (x / x[2])[:2], atol=1e-3, rtol=0)
     assert visible[0, 12, 20]
@@ -273,16 +277,16 @@ def test_a_pairs_cameras_put_what_one_shows_where_the_other_shows_it(tmp_path):
         batch = crops.sample(3, generator(number), number=number)
         given = degraded(batch, generator(), recording=EXACT)
         assert (given.position, given.visible, batch.depth) == ([], [], [])
-        near, baseline = batch.depth_range[:, 0], batch.t[1][:, 0]
+        near, baseline = batch.depth_range[:, 0], batch.cameras[1].t[:, 0]
         sides |= set(baseline.sign().tolist())
         reductions |= set((120 / (48 / near)).round().int().tolist())
         depth = (near * 120 / 6)[:, None, None].expand(3, 32, 48)
-        where, _ = truth_in(pair_of(batch, 1, generator()), depth, depth)
+        where, _ = transfer(pair_of(batch, 1, generator()), depth, depth)
         found = sample(given.betas[0], where.to(given.ground_truth).flatten(1, 2)).values.unflatten(2, (32, 48))
         assert (found - given.ground_truth)[..., 8:-8].abs().max() < 0.03
         assert (given.betas[0] - given.ground_truth)[..., 8:-8].abs().max() > 0.1
         torch.testing.assert_close(given.alpha, luminance(given.ground_truth), atol=0.003, rtol=0)
-        held = given.looks[0].at(torch.tensor([[24.0, 16.0]]).double())
+        held = given.fields[0].at(torch.tensor([[24.0, 16.0]]).double())
         assert held.valid.all()
     assert (sides, reductions) == ({-1.0, 1.0}, {1, 2})
 
@@ -370,24 +374,24 @@ def test_a_lens_sees_all_that_the_pinhole_sees_but_for_what_is_lost(mode):
     assert max(map(abs, strengths)) <= 0.3
 
 
-def test_straightened_images_show_what_they_showed_and_say_what_they_lost(scene):
+def test_undistorted_images_show_what_they_showed_and_say_what_they_lost(scene):
     smooth = torch.nn.functional.avg_pool2d(scene.images[1], 5, 1, 2)
-    kept = through_lenses(smooth, scene.cameras[1], lambda has_lens: has_lens, generator(1))
-    assert kept.valid[:, 1:-1, 1:-1].all()
-    assert (kept.values - smooth)[..., 3:-3, 3:-3].abs().max() < 0.03
-    has_lens = []
-    cut = through_lenses(smooth, scene.cameras[1], lambda b: has_lens.append(b) or b, generator(1), lost=0.3)
-    assert (has_lens[0] - smooth).abs().max() > 0.1
+    undistorted_images = through_lenses(smooth, scene.cameras[1], lambda image: image, generator(1))
+    assert undistorted_images.valid[:, 1:-1, 1:-1].all()
+    assert (undistorted_images.values - smooth)[..., 3:-3, 3:-3].abs().max() < 0.03
+    distorted = []
+    cut = through_lenses(smooth, scene.cameras[1], lambda b: distorted.append(b) or b, generator(1), lost=0.3)
+    assert (distorted[0] - smooth).abs().max() > 0.1
     assert 0.3 < cut.valid.float().mean() < 0.95
     assert ((cut.values - smooth).abs().amax(1)[cut.valid] < 0.05).float().mean() > 0.97
 
 
 def test_what_a_lens_lost_is_not_visible(scene):
-    plain, has_lens = (degraded(scene, generator(2), recording=replace(EXACT, lens=p)) for p in (0.0, 1.0))
+    plain, lossy = (degraded(scene, generator(2), recording=replace(EXACT, lens=p)) for p in (0.0, 1.0))
     torch.testing.assert_close(plain.ground_truth, scene.images[0], atol=0.003, rtol=0)
-    assert not (has_lens.visible[0] & ~degraded(scene, generator(2), recording=EXACT).visible[0]).any()
-    assert has_lens.visible[0].float().mean() < plain.visible[0].float().mean()
-    assert (has_lens.ground_truth - plain.ground_truth)[..., 4:-4, 4:-4].abs().mean() < 0.01
+    assert not (lossy.visible[0] & ~degraded(scene, generator(2), recording=EXACT).visible[0]).any()
+    assert lossy.visible[0].float().mean() < plain.visible[0].float().mean()
+    assert (lossy.ground_truth - plain.ground_truth)[..., 4:-4, 4:-4].abs().mean() < 0.01
 
 
 # Runs ------------------------------------------------------------------------------------------------------
@@ -408,7 +412,7 @@ def mixed(rendered, tmp_path_factory):
         "photos": (),
         "cache": None,
     }
-    config = replace(short_run(folder), **sources, **cheap, recording=Recording(lens=0.5), out=folder / "whole")
+    config = replace(short_run(folder), **sources, **cheap, recording=RecordingConfig(lens=0.5), out=folder / "whole")
     train(config)
     return config
 

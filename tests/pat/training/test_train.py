@@ -44,10 +44,10 @@ def test_truth_is_where_the_geometry_says(config):
 def test_positions_lie_on_the_segments(config):
     learn, _ = scenes(config)
     for given in learn(3):
-        for look, position, visible in zip(given.looks, given.position, given.visible):
+        for field, position, visible in zip(given.fields, given.position, given.visible):
             h, w = visible.shape[1:]
             x = torch.stack(torch.meshgrid(torch.arange(w), torch.arange(h), indexing="xy"), -1).float().reshape(-1, 2)
-            segments = look.at(x)
+            segments = field.at(x)
             nearest = segments.at(segments.fraction(position.reshape(len(position), -1, 2)).clamp(0, 1))
             off = (nearest - position.reshape(len(position), -1, 2)).norm(dim=-1)
             assert off[segments.valid & visible.reshape(len(visible), -1)].max() < 0.1
@@ -63,7 +63,7 @@ def test_a_field_of_ones_own_trains(config):
     learn, _ = scenes(config, field=upper_half)
     whole, _ = scenes(config)
     x = torch.tensor([[20.0, 15.0]])
-    (mine, all_of_it) = (next(source(1)).looks[0].at(x) for source in (learn, whole))
+    (mine, all_of_it) = (next(source(1)).fields[0].at(x) for source in (learn, whole))
     assert torch.allclose(2 * mine.length, all_of_it.length, rtol=1e-4)
 
 
@@ -87,7 +87,7 @@ def test_a_short_run_learns_and_leaves_weights(config):
     assert all(line["psnr"] > 5 for line in lines)
 
 
-def test_degradation_keeps_the_truth_in_colour(config):
+def test_degradation_keeps_the_ground_truth_in_colour(config):
     from pat.synthesis.layered import LayeredScenes
     from pat.synthesis.rigs import RigDistribution
     from pat.training.train import photographs

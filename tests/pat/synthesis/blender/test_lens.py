@@ -33,9 +33,9 @@ def test_a_pinhole_is_rendered_as_it_is_turned_upright(name):
     assert lens.resampled(image) is image
 
 
-@pytest.mark.parametrize("model", ["bent", "fisheye"])
+@pytest.mark.parametrize("model", ["distorted", "fisheye"])
 def test_a_lens_is_resampled_from_a_pinhole_that_covers_it(model):
-    camera = RIG["bent"]
+    camera = RIG["distorted"]
     if model == "fisheye":
         coefficients = torch.tensor([-0.02, 0.004, -0.001, 0.0002], dtype=torch.float64)
         camera = camera.replace(distortion=Distortion(KANNALA_BRANDT, coefficients), K=intrinsics(35.0, camera.hw))
@@ -51,7 +51,7 @@ def test_a_lens_is_resampled_from_a_pinhole_that_covers_it(model):
 
 
 def test_depth_across_edges_is_of_one_side():
-    lens = lens_for(RIG["bent"], "bent")
+    lens = lens_for(RIG["distorted"], "distorted")
     h, w = lens.pinhole.hw
     left = torch.arange(w).expand(h, w) < w // 2
     depth = torch.where(left, 2.0, 5.0)
@@ -61,8 +61,8 @@ def test_depth_across_edges_is_of_one_side():
 
 
 def test_what_the_lens_cannot_see_is_marked():
-    folding = dataclasses.replace(RIG["bent"].distortion, coefficients=torch.tensor([-1.0, 0, 0, 0]).double())
-    lens = lens_for(RIG["bent"].replace(distortion=folding), "bent")
+    folding = dataclasses.replace(RIG["distorted"].distortion, coefficients=torch.tensor([-1.0, 0, 0, 0]).double())
+    lens = lens_for(RIG["distorted"].replace(distortion=folding), "distorted")
     assert not lens.valid.all()
     depth = lens.depth(torch.full(lens.pinhole.hw, 3.0), torch.ones(lens.pinhole.hw, dtype=torch.int32))
     assert (depth.isnan() == ~lens.valid).all()
@@ -75,9 +75,9 @@ def test_what_the_lens_cannot_see_is_marked():
         (RIG["oblong"].replace(K=RIG["oblong"].K + torch.tensor([[0, 0.5, 0], [0, 0, 0], [0, 0, 0]])), "has skew"),
         (RIG["oblong"].replace(K=RIG["oblong"].K * torch.tensor([[-1.0], [1], [1]])), "mirrors its image"),
         (View(hw=(48, 64)), "not calibrated"),
-        (RIG["bent"].replace(K=RIG["bent"].K[None]), "is batched"),
+        (RIG["distorted"].replace(K=RIG["distorted"].K[None]), "is batched"),
         (
-            RIG["bent"].replace(
+            RIG["distorted"].replace(
                 K=intrinsics(20.0, (48, 64)), distortion=Distortion(KANNALA_BRANDT, torch.zeros(4).double())
             ),
             "degrees off its axis",

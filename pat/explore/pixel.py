@@ -1,9 +1,9 @@
-"""What the explorer shows: one alpha pixel and a state of the controls in, everything that is drawn out.
+"""The explorer's computation: one alpha pixel and a state of the controls in, everything that is drawn out.
 
-Only the one pixel is worked out, so that an answer takes milliseconds whatever the images' size. No widget is
-known here. The weights are those of C3 attention with the plainest features there are: luminance in a window
-around each point, its mean taken away and brought to length one, so that scores are normalised correlations. Windows
-of beta are mapped by the rough homography, so that other focal lengths and rotated cameras compare the same patch.
+Only one pixel is computed, so that an answer takes milliseconds whatever the images' size; no widget is used here. The
+weights are those of C3 attention with the simplest features: luminance in a window around each point, of mean zero and
+length one, so that scores are normalised correlations. Windows of beta are warped by the rough homography, so that
+cameras of other focal lengths and orientations compare the same patch.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ from arraygeom import (
     Camera,
     Curved,
     Dense,
-    Epipolar,
-    EpipolarLine,
     HomographyDisplacement,
     Local,
     NearestVoxels,
@@ -40,18 +38,19 @@ from arraygeom import (
     sample,
 )
 from arraygeom.fields import covering_displacement
+from arraygeom.fields.default import FIELDS, LINE_SHARE, recorded_field
 from arraygeom.pixels import HW
 
 from ..media.colour import luminance
 
 
 @dataclass(frozen=True)
-class State:
-    """Where the controls stand.
+class ExplorerState:
+    """Values of the controls.
 
-    `x` is alpha's pixel. `near` and `far` (metres) stand in for the rig's, `displacement` (pixels of beta) for what
-    covers the depth range; None leaves them. `across` widens the field (pixels). `changes` are steps of the
-    rig's numbers, named and measured as in `Rig.parameters` (radians, metres, pixels). `sharpness` multiplies scores.
+    `x` is alpha's pixel. `near` and `far` (metres) replace the rig's, `displacement` (pixels of beta) the one that
+    covers the depth range; None keeps them. `across` widens the field (pixels). `changes` are steps of the rig's
+    parameters, with the names and units of `Rig.parameters` (radians, metres, pixels). `sharpness` multiplies scores.
     """
 
     alpha: str
@@ -64,43 +63,44 @@ class State:
     sharpness: float = 30.0
     changes: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
 
-    def replace(self, **changes: object) -> State:
-        """A copy with some controls moved."""
+    def replace(self, **changes: object) -> ExplorerState:
+        """A copy with some values changed."""
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
-class SeenInBeta(NamedTuple):
-    """Where one beta is looked at for the pixel, and what is found.
+class BetaReport(NamedTuple):
+    """Sampling locations in one beta for the pixel, and the match.
 
-    xy: samples in beta's pixels; `counts` says which count. ends: start and end where the field is a segment.
+    xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a segment.
     weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
-    value: beta's image there, weighted. position, spread, peak: as those of `pat.attention`.
+    value: beta's image, weighted. position, deviation, peak: mean position, its standard deviation (pixels) and the
+    largest weight, as in `pat.attention`.
     """
 
     xy: Float[Tensor, "l 2"]
-    counts: Bool[Tensor, "l"]
+    valid: Bool[Tensor, "l"]
     ends: Float[Tensor, "2 2"] | None
     weight: Float[Tensor, "l"]
     depth: Float[Tensor, "l"]
     value: Float[Tensor, "c"]
     position: Float[Tensor, "2"]
-    spread: float
+    deviation: float
     peak: float
 
 
-class Seen(NamedTuple):
-    """The rig with its changes, what each beta shows or why it shows nothing, and the colour put together."""
+class PixelReport(NamedTuple):
+    """The rig with its changes, a report or a problem for each beta, and the fused colour and depth of the pixel."""
 
     rig: Rig
-    betas: dict[str, SeenInBeta]
+    betas: dict[str, BetaReport]
     problems: dict[str, str]
     colour: Float[Tensor, "c"]
     depth: float
 
 
 @dataclass(frozen=True)
-class Scene:
-    """A rig and its images (C, H, W), with the luminance that is compared made once."""
+class ExplorerScene:
+    """A rig and its images (C, H, W), with the luminances that are compared, computed once."""
 
     rig: Rig
     images: Mapping[str, Tensor]
@@ -115,62 +115,46 @@ class Scene:
             self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None]
 
 
-def auto(pair: Pair, state: State) -> ReceptiveField:
-    """The field that knows most about the pair: between depths, around H x, or along the row."""
-    if pair.link is None and pair.calibrated and pair.depth is not None:
-        return between_depths(pair, state)
-    return around_homography(pair, state) if pair.link is not None or pair.calibrated else along_row(pair, state)
-
-
-def between_depths(pair: Pair, state: State) -> ReceptiveField:
-    """Epipolar, through the lenses where there are any."""
-    lenses = any(isinstance(c, Camera) and c.distortion is not None for c in (pair.alpha, pair.beta))
-    return Curved(256) if lenses else Epipolar()
-
-
-def around_homography(pair: Pair, state: State) -> ReceptiveField:
-    """The line within the displacement of H x."""
-    return HomographyDisplacement(displacement(pair, state))
-
-
-def nearest_voxels(pair: Pair, state: State) -> ReceptiveField:
-    """The paper's whole pixels beside the line."""
-    return NearestVoxels(window=max(1, round(displacement(pair, state))))
-
-
-def along_row(pair: Pair, state: State) -> ReceptiveField:
-    """The row of a rectified pair."""
-    return Rectified(displacement(pair, state), alpha_is="either")
-
-
-def everywhere(pair: Pair, state: State) -> ReceptiveField:
-    """All of beta, thinned out to some two thousand positions."""
+def dense_field(pair: Pair) -> ReceptiveField:
+    """All of beta, reduced to some two thousand positions."""
     h, w = pair.beta.hw
     return Dense(stride=max(1, math.ceil(math.sqrt(h * w / 2048))))
 
 
-FAMILIES: dict[str, Callable[[Pair, State], ReceptiveField]] = {
-    "auto": auto,
-    "epipolar": between_depths,
-    "line": lambda pair, state: EpipolarLine(),
-    "homography": around_homography,
-    "rectified": along_row,
-    "nearest": nearest_voxels,
+SIZED: dict[str, Callable[[Pair, ExplorerState], ReceptiveField]] = {
+    "homography": lambda pair, state: HomographyDisplacement(displacement(pair, state)),
+    "rectified": lambda pair, state: Rectified(displacement(pair, state), alpha_is="either"),
+    "nearest": lambda pair, state: NearestVoxels(window=max(1, round(displacement(pair, state)))),
     "local": lambda pair, state: Local(9),
-    "dense": everywhere,
+    "dense": lambda pair, state: dense_field(pair),
+    "curved": lambda pair, state: Curved(256),
 }
+"""Families whose extent is set by the controls or by the images' size."""
+FAMILIES = ("auto", *FIELDS)
+"""Names of the fields: `auto` is the default field, which `pat fuse` uses."""
 
 
-def displacement(pair: Pair, state: State) -> float:
-    """The displacement asked for, else what covers the depth range at this pixel, else 6 % of beta's longer side."""
+def chosen_field(pair: Pair, state: ExplorerState) -> ReceptiveField:
+    """The field of the state's family. For `auto` a displacement in the state replaces the default one."""
+    family = state.family
+    if family in SIZED:
+        return SIZED[family](pair, state)
+    found = recorded_field(pair) if family == "auto" else FIELDS[family]()
+    if state.displacement is not None and isinstance(found, HomographyDisplacement | Rectified):
+        return SIZED["homography" if isinstance(found, HomographyDisplacement) else "rectified"](pair, state)
+    return found
+
+
+def displacement(pair: Pair, state: ExplorerState) -> float:
+    """The state's displacement, else what covers the depth range at this pixel, else a share of beta's longer side."""
     if state.displacement is not None:
         return state.displacement
     if pair.link is None and pair.calibrated and pair.depth is not None:
         return max(1.0, float(covering_displacement(pair, pixel_of(state))))
-    return 0.06 * max(pair.beta.hw)
+    return LINE_SHARE * max(pair.beta.hw)
 
 
-def changed_rig(rig: Rig, state: State) -> Rig:
+def changed_rig(rig: Rig, state: ExplorerState) -> Rig:
     """The rig with the state's numbers. Raises ValueError if near is beyond far."""
     steps = {name: torch.tensor(step, dtype=torch.float64) for name, step in state.changes.items() if any(step)}
     rig = rig.perturbed(steps)
@@ -182,47 +166,47 @@ def changed_rig(rig: Rig, state: State) -> Rig:
     return rig.replace(depth=(near if state.near is None else state.near, far if state.far is None else state.far))
 
 
-def look_at(scene: Scene, state: State) -> Seen:
-    """What every beta that has an image shows for the state's pixel.
+def inspect_pixel(scene: ExplorerScene, state: ExplorerState) -> PixelReport:
+    """The report on the state's pixel in every beta that has an image.
 
-    Raises ValueError for a rig that the state makes impossible. What one beta cannot tell stands in `problems`.
+    Raises ValueError for a rig that the state makes impossible. Errors that concern one beta go to `problems`.
     """
     rig = changed_rig(scene.rig, state)
-    betas: dict[str, SeenInBeta] = {}
+    betas: dict[str, BetaReport] = {}
     problems: dict[str, str] = {}
     for name in rig.betas(state.alpha):
         if name not in scene.images:
             problems[name] = "no image given"
             continue
         try:
-            betas[name] = look_in_beta(scene, rig.pair(state.alpha, name), name, state)
+            betas[name] = beta_report(scene, rig.pair(state.alpha, name), name, state)
         except ValueError as error:
             problems[name] = str(error)
-    return Seen(rig, betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
+    return PixelReport(rig, betas, problems, fused_colour(scene, betas, state), joint_depth(betas))
 
 
-def pixel_of(state: State) -> Float[Tensor, "1 2"]:
+def pixel_of(state: ExplorerState) -> Float[Tensor, "1 2"]:
     """The state's pixel, in float64."""
     return torch.tensor([state.x], dtype=torch.float64)
 
 
-def look_in_beta(scene: Scene, pair: Pair, name: str, state: State) -> SeenInBeta:
+def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerState) -> BetaReport:
     """The pixel's samples in one beta, their weights and depths. Raises ValueError where the field does not fit."""
     x = pixel_of(state)
-    chosen = FAMILIES[state.family](pair, state)
+    chosen = chosen_field(pair, state)
     found = (Widened(chosen, across=state.across) if state.across else chosen)(pair, x)
     samples = found.positions(samples_along(found)) if isinstance(found, Segments) else found
-    xy, counts = samples.xy[0], samples.mask[0]
+    xy, valid = samples.xy[0], samples.mask[0]
     scores = correlations(scene.guides[state.alpha], scene.guides[name], pair, x, xy)
-    weight = softmax(state.sharpness * scores, counts)
+    weight = softmax(state.sharpness * scores, valid)
     position = weight @ xy
     value = sampled(scene.images[name][None], xy) @ weight
-    return SeenInBeta(
+    return BetaReport(
         xy,
-        counts,
+        valid,
         ends_of(found),
         weight,
-        depths(pair, x, xy, counts),
+        depths(pair, x, xy, valid),
         value,
         position,
         float((weight @ (xy - position).square().sum(-1)).sqrt()),
@@ -261,7 +245,7 @@ def correlations(
 
 
 def jacobian(pair: Pair, x: Float[Tensor, "1 2"]) -> Float[Tensor, "2 2"]:
-    """How steps in alpha map to steps in beta by H, at x; the identity where H maps x nowhere."""
+    """The Jacobian of H at x; the identity where H maps x to infinity."""
     ends = torch.cat([x, x + x.new_tensor([[0.5, 0.0], [0.0, 0.5]]), x - x.new_tensor([[0.5, 0.0], [0.0, 0.5]])])
     transformed, valid = apply_homography(pair.homography.to(x), ends)
     return (transformed[1:3] - transformed[3:5]).T if bool(valid.all()) else torch.eye(2, dtype=x.dtype)
@@ -272,51 +256,51 @@ def window_features(
 ) -> Float[Tensor, "l k"]:
     """The window's values around each point, mean 0 and length 1; 0 where it is flat."""
     h, w = guide.shape[-2:]
-    where = (x[:, None] + steps).clamp(min=0).minimum(x.new_tensor([w - 1, h - 1]))
-    values = sampled(guide, where)[0]
+    points = (x[:, None] + steps).clamp(min=0).minimum(x.new_tensor([w - 1, h - 1]))
+    values = sampled(guide, points)[0]
     values = values - values.mean(-1, keepdim=True)
     length = values.norm(dim=-1, keepdim=True)
     return torch.where(length > FLAT, values / torch.where(length > FLAT, length, 1.0), 0.0)
 
 
 FLAT = 1e-4
-"""A window with less contrast than this looks like nothing."""
+"""A window with less contrast than this has no features."""
 
 
-def softmax(scores: Float[Tensor, "l"], counts: Bool[Tensor, "l"]) -> Float[Tensor, "l"]:
-    """Over what counts; all zero where nothing does."""
-    if not bool(counts.any()):
+def softmax(scores: Float[Tensor, "l"], valid: Bool[Tensor, "l"]) -> Float[Tensor, "l"]:
+    """Over the valid samples; all zero without any."""
+    if not bool(valid.any()):
         return torch.zeros_like(scores)
-    return torch.where(counts, scores, -torch.inf).softmax(0)
+    return torch.where(valid, scores, -torch.inf).softmax(0)
 
 
 def depths(
-    pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], counts: Bool[Tensor, "l"]
+    pair: Pair, x: Float[Tensor, "1 2"], xy: Float[Tensor, "l 2"], valid: Bool[Tensor, "l"]
 ) -> Float[Tensor, "l"]:
     """The depth in alpha of each sample, NaN where it has none or the pair is not calibrated."""
     if pair.link is not None or not pair.calibrated:
         return torch.full_like(xy[:, 0], torch.nan)
     found = depth_of(pair, x.expand(len(xy), 2), xy)
-    return torch.where(found.valid & counts, found.depth, torch.nan)
+    return torch.where(found.valid & valid, found.depth, torch.nan)
 
 
-def joint_depth(betas: Mapping[str, SeenInBeta]) -> float:
+def joint_depth(betas: Mapping[str, BetaReport]) -> float:
     """The inverse of the mean inverse depth by all weights, metres; NaN if no sample has a depth."""
     inverse, total = 0.0, 0.0
-    for seen in betas.values():
-        known = seen.depth.isfinite()
-        inverse += seen.peak * float((seen.weight[known] / seen.depth[known]).sum())
-        total += seen.peak * float(seen.weight[known].sum())
+    for beta in betas.values():
+        known = beta.depth.isfinite()
+        inverse += beta.peak * float((beta.weight[known] / beta.depth[known]).sum())
+        total += beta.peak * float(beta.weight[known].sum())
     return total / inverse if inverse > 0 else math.nan
 
 
 def sampled(image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"]) -> Float[Tensor, "c *l"]:
-    """The image's values at positions, in their precision; the image itself is not copied."""
+    """The image's values at positions, in their precision; the image is not copied."""
     return sample(image, x[None].to(image)).values[0].to(x)
 
 
-def fused_colour(scene: Scene, betas: Mapping[str, SeenInBeta], state: State) -> Float[Tensor, "c"]:
-    """Alpha's luminance with the colour that the betas in colour show, each weighted by its peak."""
+def fused_colour(scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState) -> Float[Tensor, "c"]:
+    """Alpha's luminance with the colour differences of the betas in colour, each weighted by its peak."""
     own = sampled(scene.guides[state.alpha], pixel_of(state))[:, 0]
     coloured = [s for s in betas.values() if len(s.value) == 3 and s.peak > 0]
     if not coloured:
@@ -331,14 +315,14 @@ def grey_of(colour: Float[Tensor, "3"]) -> Float[Tensor, "1"]:
     return luminance(colour[:, None, None]).reshape(1)
 
 
-def numbers_of(rig: Rig) -> dict[str, int]:
-    """The rig's numbers that can be moved, by name, and how many values each has; not the depth range."""
+def parameter_lengths(rig: Rig) -> dict[str, int]:
+    """Lengths of the rig's parameters by name, without the depth range."""
     if not any(isinstance(camera, Camera) for camera in rig.cameras.values()):
         return {}
     return {name: step.numel() for name, step in rig.parameters(free=["*.*"]).items() if not name.startswith("depth.")}
 
 
 def image_pixel(x: float, y: float, hw: HW) -> tuple[float, float]:
-    """The centre of the pixel that a place on the image belongs to."""
+    """The centre of the pixel nearest to a point."""
     h, w = hw
     return float(min(max(round(x), 0), w - 1)), float(min(max(round(y), 0), h - 1))

@@ -1,7 +1,7 @@
-"""The usual mistakes in rigs, each with what undoes it.
+"""The usual mistakes in rigs, each with the remedy that undoes it.
 
-A `Remedy` turns the rig that was given into the rig that is right if that mistake was made, for the images as they
-are. What was done to images without telling the rig is done to the rig's camera.
+A `Remedy` turns the given rig into the rig that is right if that mistake was made. Operations on images that the rig
+does not state (rotation, resizing, cropping) are applied to the rig's camera.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix
 from arraygeom.pixels import HW, rot90_matrix, shift_matrix
 
 KINDS = (
-    *("nothing", "resized", "turned or mirrored", "cameras swapped", "pose inverted", "R transposed"),
+    *("nothing", "resized", "rotated or mirrored", "cameras swapped", "pose inverted", "R transposed"),
     *("x and y exchanged", "units", "distortion", "half-pixel shift", "one-pixel shift"),
 )
 RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
@@ -32,25 +32,23 @@ UNITS = {
 TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 """Exchanges x and y."""
 
-Repair = Callable[[Rig], Rig]
-
 
 @dataclass(frozen=True)
 class Remedy:
-    """One mistake that may have been made: its kind (one of `KINDS`), in words, and what undoes it."""
+    """A possible mistake: its kind (one of `KINDS`), its description in words, and the change that undoes it."""
 
     kind: str
     words: str
-    repair: Repair
+    repair: Callable[[Rig], Rig]
 
 
 NOTHING = Remedy("nothing", "as given", lambda rig: rig)
 
 
 def remedies(rig: Rig, sizes: Mapping[str, HW]) -> list[Remedy]:
-    """All single mistakes that can have been made with a rig whose images have these sizes, likely ones first.
+    """All single mistakes that are possible with a rig whose images have these sizes, likely ones first.
 
-    Where images do not have the sizes that the rig states, only what explains it.
+    Where images do not have the sizes that the rig states, only those that explain it.
     """
     names = [name for name in rig.names if name in sizes]
     wrong = tuple(name for name in names if rig[name].hw != sizes[name])
@@ -61,7 +59,7 @@ def remedies(rig: Rig, sizes: Mapping[str, HW]) -> list[Remedy]:
         *_poses(rig, names),
         *_units(rig),
         *_exchanged(rig, names),
-        *_turned(rig, names, sizes),
+        *_rotated(rig, names, sizes),
         *_scaled(names),
         *_lenses(rig, names),
         *_shifts(names),
@@ -77,7 +75,7 @@ def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
     """Distortion was ignored, and is about `k1` in all cameras that have none.
 
     With k2 = 1.5 k1^2, as lenses tend to have it (a fisheye's r = theta has 1.8, ordinary wide ones about 1.3): one
-    number, and one to one at any radius.
+    parameter, and one to one at any radius.
     """
     bare = bare_cameras(rig, names)
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
@@ -86,7 +84,7 @@ def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
 
 
 def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:
-    """Mirroring an image left to right (`across`), or top to bottom.
+    """The pixel map of mirroring an image left to right (`across`), or top to bottom.
 
     >>> (mirror_matrix((4, 6), across=True) @ torch.tensor([5.0, 1.0, 1.0], dtype=torch.float64)).tolist()
     [0.0, 1.0, 1.0]
@@ -97,21 +95,21 @@ def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:
     return A
 
 
-TURNS: dict[str, Callable[[HW], Tensor]] = {
-    "turned by 180 degrees": lambda hw: rot90_matrix(hw, 2),
-    "turned by 90 degrees counter-clockwise": lambda hw: rot90_matrix(hw, 1),
-    "turned by 90 degrees clockwise": lambda hw: rot90_matrix(hw, 3),
+ROTATIONS: dict[str, Callable[[HW], Tensor]] = {
+    "rotated by 180 degrees": lambda hw: rot90_matrix(hw, 2),
+    "rotated by 90 degrees counter-clockwise": lambda hw: rot90_matrix(hw, 1),
+    "rotated by 90 degrees clockwise": lambda hw: rot90_matrix(hw, 3),
     "mirrored left to right": lambda hw: mirror_matrix(hw, across=True),
     "mirrored top to bottom": lambda hw: mirror_matrix(hw, across=False),
     "mirrored about the diagonal (rows and columns exchanged)": lambda hw: TRANSPOSE,
     "mirrored about the other diagonal": lambda hw: rot90_matrix(hw[::-1], 2) @ TRANSPOSE,
 }
-"""What may be done to an image by turning and mirroring it: x' ~ A x, A being that of the image's size."""
+"""Rotations and mirrorings of an image of a size: x' ~ A x."""
 
 
-def turned_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
-    """A and the new size of one of `TURNS`."""
-    A = TURNS[words](view.hw)
+def rotated_view(view: View, words: str) -> tuple[Float[Tensor, "3 3"], HW]:
+    """A and the new size of one of `ROTATIONS`."""
+    A = ROTATIONS[words](view.hw)
     return A, view.hw[::-1] if bool(A[0, 0] == 0) else view.hw
 
 
@@ -129,15 +127,15 @@ def on_cameras(rig: Rig, names: Iterable[str], change: Callable[[Camera], Camera
     return rig.replace(cameras={**rig.cameras, **changed})
 
 
-def on_pixels(rig: Rig, names: Iterable[str], change: Callable[[View], tuple[Tensor, HW]]) -> Rig:
-    """The rig with the pixels of some cameras mapped: x' ~ A x, and the new size."""
+def on_pixels(rig: Rig, names: Iterable[str], change: Callable[[str, View], tuple[Tensor, HW]]) -> Rig:
+    """The rig with the pixels of some cameras transformed: x' ~ A x, and the new size."""
     for name in names:
-        rig = rig.transformed(name, *change(rig[name]))
+        rig = rig.transformed(name, *change(name, rig[name]))
     return rig
 
 
 def _groups(names: Iterable[str]) -> Iterator[tuple[tuple[str, ...], str]]:
-    """All cameras together, then one by one; and how to say so."""
+    """All cameras together, then one by one; with a label."""
     names = tuple(names)
     if names:
         yield names, "all cameras"
@@ -160,20 +158,19 @@ def _poses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
         ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.transpose(-1, -2), pose.t),
     }
     for (kind, words), change in changes.items():
-        for group, spoken in _groups(_calibrated(rig, names)):
-            posed = partial(_posed, change=change)
-            yield Remedy(kind, words.format(spoken), partial(on_cameras, names=group, change=posed))
+        for group, label in _groups(_calibrated(rig, names)):
+            yield Remedy(kind, words.format(label), partial(_with_poses, names=group, change=change))
 
 
-def _posed(camera: Camera, change: Callable[[Pose], Pose]) -> Camera:
-    return camera.replace(cam_from_world=change(camera.cam_from_world))
+def _with_poses(rig: Rig, names: Iterable[str], change: Callable[[Pose], Pose]) -> Rig:
+    return on_cameras(rig, names, lambda c: c.replace(cam_from_world=change(c.cam_from_world)))
 
 
 def _units(rig: Rig) -> Iterator[Remedy]:
     for factor, words in UNITS.items() if rig.depth is not None else ():
-        scaled = partial(_posed, change=partial(_scaled_pose, factor=factor))
+        scaled = partial(_scaled_pose, factor=factor)
         words = f"translations against the depth range: {words}"
-        yield Remedy("units", words, partial(on_cameras, names=rig.names, change=scaled))
+        yield Remedy("units", words, partial(_with_poses, names=rig.names, change=scaled))
 
 
 def _scaled_pose(pose: Pose, factor: float) -> Pose:
@@ -181,12 +178,13 @@ def _scaled_pose(pose: Pose, factor: float) -> Pose:
 
 
 def _exchanged(rig: Rig, names: list[str]) -> Iterator[Remedy]:
-    for group, spoken in _groups(_calibrated(rig, names)):
-        words = f"x and y exchanged in focal lengths and principal point of {spoken}"
+    for group, label in _groups(_calibrated(rig, names)):
+        words = f"x and y exchanged in focal lengths and principal point of {label}"
         yield Remedy("x and y exchanged", words, partial(on_cameras, names=group, change=_transposed))
     if rig.links:
         words = "x and y exchanged in F (it is for row, column)"
-        yield Remedy("x and y exchanged", words, partial(on_pixels, names=names, change=lambda v: (TRANSPOSE, v.hw)))
+        repair = partial(on_pixels, names=names, change=lambda _, view: (TRANSPOSE, view.hw))
+        yield Remedy("x and y exchanged", words, repair)
 
 
 def _transposed(camera: Camera) -> Camera:
@@ -194,72 +192,84 @@ def _transposed(camera: Camera) -> Camera:
     return camera.replace(K=P @ camera.K @ P)
 
 
-def _turned(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
-    """Images turned or mirrored after calibration, where the sizes allow it."""
-    for words in TURNS:
-        for group, spoken in _groups(names):
-            if all(turned_view(rig[n], words)[1] == sizes[n] for n in group):
-                repair = partial(on_pixels, names=group, change=partial(turned_view, words=words))
-                yield Remedy("turned or mirrored", f"image of {spoken} {words}", repair)
+def _rotated(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
+    """Images rotated or mirrored after calibration, where the sizes allow it."""
+    for words in ROTATIONS:
+        for group, label in _groups(names):
+            yield from _rotated_group(rig, group, label, words, sizes)
+
+
+def _rotated_group(
+    rig: Rig, group: tuple[str, ...], label: str, words: str, sizes: Mapping[str, HW]
+) -> Iterator[Remedy]:
+    if all(rotated_view(rig[n], words)[1] == sizes[n] for n in group):
+        repair = partial(on_pixels, names=group, change=lambda _, view: rotated_view(view, words))
+        yield Remedy("rotated or mirrored", f"image of {label} {words}", repair)
 
 
 def _scaled(names: list[str]) -> Iterator[Remedy]:
-    """K is for images of another size than the rig says."""
+    """K is for images of another size than the rig states."""
     for factor in RESIZED:
-        for group, spoken in _groups(names):
-            words = f"K of {spoken} is for images {1 / factor:.3g} times as large"
-            yield Remedy("resized", words, partial(on_pixels, names=group, change=partial(_magnified, factor=factor)))
+        A = torch.diag(torch.tensor([factor, factor, 1.0], dtype=torch.float64))
+        A[:2, 2] = 0.5 * factor - 0.5
+        for group, label in _groups(names):
+            words = f"K of {label} is for images {1 / factor:.3g} times as large"
+            yield Remedy("resized", words, _same_size(group, A))
 
 
-def _magnified(view: View, factor: float) -> tuple[Tensor, HW]:
-    A = torch.diag(torch.tensor([factor, factor, 1.0], dtype=torch.float64))
-    A[:2, 2] = 0.5 * factor - 0.5
-    return A, view.hw
+def _shifts(names: list[str]) -> Iterator[Remedy]:
+    for pixels, kind in ((0.5, "half-pixel shift"), (1.0, "one-pixel shift")):
+        for group, label in _groups(names):
+            for shift in (-pixels, pixels):
+                words = f"pixels of {label} are {shift:+g} from where the rig counts them"
+                yield Remedy(kind, words, _same_size(group, shift_matrix(-shift, -shift)))
+
+
+def _same_size(names: tuple[str, ...], A: Tensor) -> Callable[[Rig], Rig]:
+    """The repair x' ~ A x of the pixels of some cameras, whose image sizes stay."""
+    return partial(on_pixels, names=names, change=lambda _, view: (A, view.hw))
 
 
 def _of_sizes(rig: Rig, wrong: tuple[str, ...], sizes: Mapping[str, HW]) -> Iterator[Remedy]:
-    """What makes the sizes that the rig states those of the images."""
-    spoken = ", ".join(map(repr, wrong))
+    """Explanations of image sizes other than those that the rig states."""
+    label = ", ".join(map(repr, wrong))
     if all(rig[n].hw == sizes[n][::-1] for n in wrong):
-        for words in TURNS:
-            if all(turned_view(rig[n], words)[1] == sizes[n] for n in wrong):
-                repair = partial(on_pixels, names=wrong, change=partial(turned_view, words=words))
-                yield Remedy("turned or mirrored", f"image of {spoken} {words}", repair)
-        words = f"size of {spoken} written as height, width"
-        yield Remedy("x and y exchanged", words, partial(_to_sizes, names=wrong, sizes=sizes, matrix=_cut_at_corner))
+        for words in ROTATIONS:
+            yield from _rotated_group(rig, wrong, label, words, sizes)
+        words = f"size of {label} written as height, width"
+        yield Remedy("x and y exchanged", words, _to_sizes(wrong, sizes, _cropped_at_corner))
     for words, matrix in FITS.items():
-        repair = partial(_to_sizes, names=wrong, sizes=sizes, matrix=matrix)
-        yield Remedy("resized", f"image of {spoken} {words}", repair)
+        yield Remedy("resized", f"image of {label} {words}", _to_sizes(wrong, sizes, matrix))
 
 
-def _cut_at_corner(old: HW, new: HW) -> Tensor:
+def _cropped_at_corner(old: HW, new: HW) -> Tensor:
     return shift_matrix(0, 0)
 
 
-def _cut_from_middle(old: HW, new: HW) -> Tensor:
+def _cropped_centrally(old: HW, new: HW) -> Tensor:
     return shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2)
 
 
 FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "resized": resize_matrix,
-    "cut out of the middle": _cut_from_middle,
-    "cut off at the right and the bottom": _cut_at_corner,
+    "cropped about its middle": _cropped_centrally,
+    "cropped at the right and the bottom": _cropped_at_corner,
 }
 """How an image may have come to another size."""
 
 
-def _to_sizes(rig: Rig, names: Iterable[str], sizes: Mapping[str, HW], matrix: Callable[[HW, HW], Tensor]) -> Rig:
-    for name in names:
-        rig = rig.transformed(name, matrix(rig[name].hw, sizes[name]), sizes[name])
-    return rig
+def _to_sizes(
+    names: Iterable[str], sizes: Mapping[str, HW], matrix: Callable[[HW, HW], Tensor]
+) -> Callable[[Rig], Rig]:
+    return partial(on_pixels, names=names, change=lambda name, view: (matrix(view.hw, sizes[name]), sizes[name]))
 
 
 def _lenses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
     curved = [n for n in _calibrated(rig, names) if n not in bare_cameras(rig, names)]
-    for group, spoken in _groups(curved):
-        drop, turn = (partial(on_cameras, names=group, change=change) for change in (_without_lens, _opposite_lens))
-        yield Remedy("distortion", f"images of {spoken} are undistorted already: distortion applied twice", drop)
-        yield Remedy("distortion", f"distortion of {spoken} with the wrong sign (the inverse map)", turn)
+    for group, label in _groups(curved):
+        drop, negate = (partial(on_cameras, names=group, change=change) for change in (_without_lens, _opposite_lens))
+        yield Remedy("distortion", f"images of {label} are undistorted already: distortion applied twice", drop)
+        yield Remedy("distortion", f"distortion of {label} with the wrong sign (the inverse map)", negate)
 
 
 def _without_lens(camera: Camera) -> Camera:
@@ -269,16 +279,3 @@ def _without_lens(camera: Camera) -> Camera:
 def _opposite_lens(camera: Camera) -> Camera:
     lens = camera.distortion
     return camera if lens is None else camera.replace(distortion=Distortion(lens.model, -lens.coefficients))
-
-
-def _shifts(names: list[str]) -> Iterator[Remedy]:
-    for pixels, kind in ((0.5, "half-pixel shift"), (1.0, "one-pixel shift")):
-        for group, spoken in _groups(names):
-            for shift in (-pixels, pixels):
-                words = f"pixels of {spoken} are {shift:+g} from where the rig counts them"
-                repair = partial(on_pixels, names=group, change=partial(_shifted, shift=shift))
-                yield Remedy(kind, words, repair)
-
-
-def _shifted(view: View, shift: float) -> tuple[Tensor, HW]:
-    return shift_matrix(-shift, -shift), view.hw

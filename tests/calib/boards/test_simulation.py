@@ -1,15 +1,15 @@
-"""Photographs of boards that were never printed: corners where the cameras put them, and a rig back from them."""
+"""Photographs of boards that were never printed: corners at their projections, and the rig recovered from them."""
 
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.calibrate import calibrate
 from calib.boards.collect import collect_folder
-from calib.boards.rehearsal import board_poses, photograph, rehearse
+from calib.boards.rig import calibrate
+from calib.boards.simulation import board_poses, photograph, simulate_photos
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import camera
+from tests.calib.board_scenes import camera
 
 BOARD = parse_board("charuco:7x5:60mm")
 
@@ -27,7 +27,7 @@ def rig():
 @pytest.fixture(scope="module")
 def rehearsed(rig, tmp_path_factory):
     folder = tmp_path_factory.mktemp("photos")
-    return rehearse(rig, BOARD, folder, count=7, seed=3), collect_folder(folder, BOARD).views
+    return simulate_photos(rig, BOARD, folder, count=7, seed=3), collect_folder(folder, BOARD).views
 
 
 def test_corners_are_where_the_cameras_put_them(rig, rehearsed):

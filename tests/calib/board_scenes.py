@@ -1,12 +1,12 @@
-"""Arrays of cameras with known truth, and what they see of a board: corners by projection."""
+"""Arrays of cameras with known ground truth, and their views of a board: corners by projection."""
 
 import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards.bundle import BoardPoses, Observations, Scene, parameter_names
+from calib.boards.bundle import BoardPoses, BundleProblem, Observations, parameter_names
 from calib.boards.detect import Detection
-from calib.boards.intrinsics import Views
+from calib.boards.intrinsics import BoardViews
 from calib.boards.target import Board, parse_board
 
 BOARD = parse_board("charuco:9x7:60mm")
@@ -17,7 +17,7 @@ def tensor(*values):
 
 
 def camera(focal, hw, centre=(0.0, 0.0, 0.0), turn=(0.0, 0.0, 0.0), lens=(), model="brown-conrady", offset=(3.0, -2.0)):
-    """A camera at `centre` in the world, turned by a rotation vector in degrees."""
+    """A camera at `centre` in the world, rotated by a rotation vector in degrees."""
     middle = (hw[1] - 1) / 2 + offset[0], (hw[0] - 1) / 2 + offset[1]
     pose = Pose.from_centre(rotation_from_vector(torch.deg2rad(tensor(*turn))), tensor(*centre))
     distortion = Distortion(model, tensor(*lens)) if lens else None
@@ -39,7 +39,7 @@ def four_cameras() -> Rig:
 
 
 def board_poses(count, *, seed=0, depth=(0.9, 2.4), tilt=35.0, spread=0.4) -> Pose:
-    """`world_from_board` in front of a camera at the origin: random places, depths and tilts."""
+    """`world_from_board` in front of a camera at the origin: random positions, depths and tilts."""
     random = np.random.default_rng(seed)
     middle = BOARD.points.mean(0)
     rotations, translations = [], []
@@ -53,7 +53,7 @@ def board_poses(count, *, seed=0, depth=(0.9, 2.4), tilt=35.0, spread=0.4) -> Po
     return Pose(torch.stack(rotations), torch.stack(translations))
 
 
-def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, Views]:
+def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, BoardViews]:
     """What every camera of a rig sees of the boards, with noise in pixels along x and y."""
     random = np.random.default_rng(seed)
     views = {}
@@ -66,23 +66,23 @@ def see(rig, boards, board: Board = BOARD, *, noise=0.0, seed=1) -> dict[str, Vi
             if inside.sum() >= 12:
                 measured = x.numpy()[inside] + random.normal(0, noise, (inside.sum(), 2))
                 seen[frame] = Detection(np.flatnonzero(inside), measured)
-        views[name] = Views(camera.hw, seen)
+        views[name] = BoardViews(camera.hw, seen)
     return views
 
 
-def scene_of(rig, boards, views, board: Board = BOARD) -> Scene:
-    """The truth as a scene to adjust."""
+def scene_of(rig, boards, views, board: Board = BOARD) -> BundleProblem:
+    """The ground truth as a problem to adjust."""
     seen = {}
     for name, v in views.items():
         parts = [(np.full(len(d.ids), frame), board.points[d.ids], d.x) for frame, d in v.seen.items()]
         seen[name] = Observations(*(np.concatenate(part) for part in zip(*parts)))
-    return Scene(dict(rig.cameras), BoardPoses(boards), seen)
+    return BundleProblem(dict(rig.cameras), BoardPoses(boards), seen)
 
 
 def errors_of(fit, rig):
-    """Estimate minus truth of every free number, in the order of `fit.names`."""
+    """Estimate minus ground truth of every free parameter, in the order of `fit.names`."""
     found = []
-    for name, camera_found in fit.scene.cameras.items():
+    for name, camera_found in fit.problem.cameras.items():
         ground_truth = rig[name]
         R = (camera_found.R @ ground_truth.R.T).numpy()
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
@@ -100,7 +100,7 @@ def pose_errors(fit, rig):
     """The largest error of orientations (degrees) and of optical centres (metres)."""
     degrees = [
         np.degrees(np.linalg.norm(errors_of(fit, rig)[[fit.names.index(f"{n}.rotation.{i}") for i in range(3)]]))
-        for n in list(fit.scene.cameras)[1:]
+        for n in list(fit.problem.cameras)[1:]
     ]
-    metres = [float((c.centre - rig[n].centre).norm()) for n, c in fit.scene.cameras.items()]
+    metres = [float((c.centre - rig[n].centre).norm()) for n, c in fit.problem.cameras.items()]
     return max(degrees), max(metres)

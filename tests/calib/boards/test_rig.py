@@ -1,4 +1,4 @@
-"""From what cameras saw to a rig: the truth with its uncertainty, and a word for every set that cannot be used."""
+"""From detections to a rig: ground truth within its uncertainty, and a message for every unusable set."""
 
 import re
 
@@ -7,15 +7,15 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.calibrate import calibrate, fit_alone
 from calib.boards.covariance import RigCovariance, beta_covariance
 from calib.boards.coverage import coverage
 from calib.boards.detect import Detection
-from calib.boards.intrinsics import Views
+from calib.boards.intrinsics import BoardViews
 from calib.boards.poses import symmetry_poses
 from calib.boards.report import report_html, rig_covariance
+from calib.boards.rig import calibrate, calibrate_single
 from calib.boards.target import parse_board
-from tests.calib.boards_seen import BOARD, board_poses, camera, four_cameras, see, tensor
+from tests.calib.board_scenes import BOARD, board_poses, camera, four_cameras, see, tensor
 
 CHESS = parse_board("chessboard:8x6:60mm")
 """The corners of `BOARD`, without their names."""
@@ -39,7 +39,8 @@ def found(pair):
 
 def kept(views, **keys):
     return {
-        name: Views(v.hw, {k: d for k, d in v.seen.items() if k in keys.get(name, v.seen)}) for name, v in views.items()
+        name: BoardViews(v.hw, {k: d for k, d in v.seen.items() if k in keys.get(name, v.seen)})
+        for name, v in views.items()
     }
 
 
@@ -57,7 +58,7 @@ def test_a_pair_is_found_within_its_uncertainty(pair, found):
 
 
 def test_the_covariance_says_how_far_predictions_are_off(pair, found):
-    """A point of alpha at 2 m, predicted in beta, by truth and by the calibration."""
+    """A point of alpha at 2 m, predicted in beta, by the true rig and by the calibration."""
     rig, covariance = pair[0], rig_covariance(found)
     x = np.stack(np.meshgrid(np.linspace(200, 760, 5), np.linspace(150, 570, 4)), -1).reshape(-1, 2)
     both = []
@@ -103,10 +104,11 @@ def test_chessboards_that_are_numbered_from_either_end(pair):
     turn = CHESS.symmetries[1]
     views = see(rig, boards, CHESS, noise=0.1)
     whole = {
-        n: Views(v.hw, {k: d for k, d in v.seen.items() if len(d.ids) == len(CHESS.points)}) for n, v in views.items()
+        n: BoardViews(v.hw, {k: d for k, d in v.seen.items() if len(d.ids) == len(CHESS.points)})
+        for n, v in views.items()
     }
     views = {
-        n: Views(
+        n: BoardViews(
             v.hw, {k: Detection(turn[d.ids], d.x) if n == "colour" and k % 3 == 1 else d for k, d in v.seen.items()}
         )
         for n, v in whole.items()
@@ -137,10 +139,10 @@ def test_cameras_that_share_no_frame_are_refused(pair):
 
 
 def test_sets_a_frame_late_are_refused(pair):
-    late = {name: Views(v.hw, {k + (name == "colour"): d for k, d in v.seen.items()}) for name, v in pair[2].items()}
-    with pytest.raises(
-        ValueError, match=r"mono and colour contradict each other: .*once colour is taken to be 1 frame late"
-    ):
+    late = {
+        name: BoardViews(v.hw, {k + (name == "colour"): d for k, d in v.seen.items()}) for name, v in pair[2].items()
+    }
+    with pytest.raises(ValueError, match=r"mono and colour contradict each other: .*if colour is 1 frame late"):
         calibrate(late, BOARD)
 
 
@@ -153,21 +155,21 @@ def test_mirrored_sets_are_refused(pair):
         ids = (d.ids // 8) * 8 + 7 - d.ids % 8
         mirrored[key] = Detection(ids, np.stack([width - 1 - d.x[:, 0], d.x[:, 1]], -1))
     with pytest.raises(ValueError, match=r"contradict each other: .*they agree once (colour|mono) is mirrored"):
-        calibrate({**views, "colour": Views(views["colour"].hw, mirrored)}, CHESS)
+        calibrate({**views, "colour": BoardViews(views["colour"].hw, mirrored)}, CHESS)
 
 
 def test_boards_that_move_between_the_exposures_do_not_bend_the_lenses(pair):
-    """Frames a moment apart: intrinsics stay what each camera's own images tell, and the note says so."""
+    """Frames a moment apart: intrinsics stay those of each camera's own images, and the note states so."""
     rig, boards, views = pair
     moved = Pose(boards.R, boards.t + torch.from_numpy(np.random.default_rng(0).normal(0, 0.004, (10, 3))))
     views = {"mono": views["mono"], "colour": see(rig, moved, noise=0.1)["colour"]}
     result = calibrate(views, BOARD)
     assert any("taken at the same moments" in note for note in result.notes)
-    alone = fit_alone("colour", views["colour"], BOARD)
-    told = dict(zip(alone.fit.names, np.sqrt(alone.fit.covariance.diagonal())))
+    alone = calibrate_single("colour", views["colour"], BOARD)
+    deviations = dict(zip(alone.fit.names, np.sqrt(alone.fit.covariance.diagonal())))
     for i in range(2):
         change = abs(float(result.rig["colour"].K[i, i] - alone.camera.K[i, i]))
-        assert change < told[f"colour.focal.{i}"]
+        assert change < deviations[f"colour.focal.{i}"]
     assert len(set(result.fit.sigma.values())) == 1
 
 
@@ -183,8 +185,8 @@ def test_parallel_boards_are_refused():
         calibrate(see(Rig({"cam": c}), boards), BOARD)
 
 
-def test_what_images_do_not_tell_is_left_alone():
-    """A long lens hardly bends: k2 and k3 stay 0, and the sentence says so; the coverage names what is missing."""
+def test_unobservable_parameters_are_fixed():
+    """A long lens hardly distorts: k2 and k3 stay 0, with a note; the coverage names what is missing."""
     c = camera(4000.0, (480, 640), lens=(0.0, 0.0, 0.0, 0.0, 0.0))
     board = parse_board("charuco:9x7:20mm")
     boards = board_poses(8, depth=(2.5, 2.8), spread=0.02)
@@ -192,7 +194,7 @@ def test_what_images_do_not_tell_is_left_alone():
     views = see(Rig({"tele": c}), Pose(boards.R, boards.t + shift), board, noise=0.1)
     result = calibrate(views, board)
     assert result.rig["tele"].distortion.coefficients[[1, 4]].tolist() == [0, 0]
-    assert any("tele: the lens's k3 is kept at 0: the images do not tell it" in note for note in result.notes)
+    assert any("tele: the lens's k3 is fixed at 0: the images do not determine it" in note for note in result.notes)
     assert "tele.distortion.4" not in result.deviations()
 
 
@@ -200,7 +202,7 @@ def test_a_camera_of_which_little_is_told_stays_plausible():
     """Four boards in the middle, hardly tilted, corners to half a pixel: square pixels, a middle in the middle."""
     true = camera(900.0, (480, 640), lens=(-0.1, 0.0, 0.0, 0.0, 0.0))
     views = see(Rig({"cam": true}), board_poses(4, tilt=18.0, depth=(1.3, 1.6), spread=0.02), noise=0.5)
-    found = fit_alone("cam", views["cam"], BOARD, final=False).camera
+    found = calibrate_single("cam", views["cam"], BOARD, final=False).camera
     assert float(found.K[0, 0] / found.K[1, 1]) == pytest.approx(1, abs=0.01)
     assert np.abs(found.K[:2, 2].numpy() - (319.5, 239.5)).max() < 0.06 * 640
 
@@ -223,7 +225,7 @@ def test_coverage_names_what_is_missing():
     pose = Pose(torch.eye(3, dtype=torch.float64), tensor(-0.24, -0.18, 2.0))
     c = camera(600.0, (480, 640))
     x = c.project(pose.apply(torch.from_numpy(BOARD.points))).x.numpy()
-    found = coverage(Views(c.hw, {0: Detection(np.arange(len(x)), x)}), {0: pose}, BOARD)
+    found = coverage(BoardViews(c.hw, {0: Detection(np.arange(len(x)), x)}), {0: pose}, BOARD)
     assert found.depths == pytest.approx((2.0, 2.0))
     assert found.tilts[1] == pytest.approx(0, abs=1e-6)
     assert [m.split(" (")[0].split(":")[0] for m in found.missing] == [

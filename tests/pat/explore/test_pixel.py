@@ -1,4 +1,4 @@
-"""What the explorer works out agrees with the fields, with attention and with the true image."""
+"""The explorer's computation agrees with the fields, with attention and with the true image."""
 
 import math
 import time
@@ -10,8 +10,8 @@ from torch.nn.functional import interpolate
 from arraygeom import Curved, Distortion, Epipolar, HomographyDisplacement, Link, Rig, View, depth_of
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
-from pat.explore import FAMILIES, Scene, State, look_at
-from pat.explore import seen as core
+from pat.explore import FAMILIES, ExplorerScene, ExplorerState, inspect_pixel
+from pat.explore import pixel as core
 
 
 @pytest.fixture(scope="module")
@@ -21,31 +21,31 @@ def sample():
 
 @pytest.fixture(scope="module")
 def scene(sample):
-    return Scene(sample.rig, sample.images)
+    return ExplorerScene(sample.rig, sample.images)
 
 
 def state(**changes):
-    return State("mono", (320.0, 200.0), **changes)
+    return ExplorerState("mono", (320.0, 200.0), **changes)
 
 
 def test_the_segment_is_the_fields_own(scene, sample):
-    seen = look_at(scene, state()).betas["colour"]
+    report = inspect_pixel(scene, state()).betas["colour"]
     field = Epipolar()(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
-    torch.testing.assert_close(seen.ends, torch.cat([field.start, field.end]))
-    torch.testing.assert_close(seen.xy[[0, -1]], seen.ends)
+    torch.testing.assert_close(report.ends, torch.cat([field.start, field.end]))
+    torch.testing.assert_close(report.xy[[0, -1]], report.ends)
 
 
 def test_weights_are_those_of_attention(scene, sample):
     """The same windows as keys of `pat.attention`, one at each sample, give the same answer."""
-    seen = look_at(scene, state(sharpness=7.0)).betas["colour"]
+    report = inspect_pixel(scene, state(sharpness=7.0)).betas["colour"]
     pair, x = sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64)
-    scores = core.correlations(scene.guides["mono"], scene.guides["colour"], pair, x, seen.xy)
+    scores = core.correlations(scene.guides["mono"], scene.guides["colour"], pair, x, report.xy)
     key, query = 7.0 * scores[None, None, None], torch.ones(1, 1, 1, 1, dtype=torch.float64)
     row = torch.stack([torch.arange(len(scores), dtype=torch.float64), torch.zeros(len(scores))], -1)
-    look = core.Positions(row[None, None], seen.counts[None, None])
-    found = attend_with_statistics(query, key, seen.xy.T[None, :, None], look, backend="reference")
-    torch.testing.assert_close(found.value[0, :, 0, 0], seen.position)
-    assert float(found.peak) == pytest.approx(seen.peak)
+    look = core.Positions(row[None, None], report.valid[None, None])
+    found = attend_with_statistics(query, key, report.xy.T[None, :, None], look, backend="reference")
+    torch.testing.assert_close(found.value[0, :, 0, 0], report.position)
+    assert float(found.peak) == pytest.approx(report.peak)
 
 
 def test_windows_of_beta_are_of_its_scale(sample):
@@ -61,29 +61,32 @@ def test_the_windows_find_the_colour_and_the_depth(scene, sample):
     errors = []
     for x in range(60, 600, 90):
         for y in range(50, 380, 90):
-            seen = look_at(scene, state().replace(x=(float(x), float(y)), sharpness=60.0))
+            report = inspect_pixel(scene, state().replace(x=(float(x), float(y)), sharpness=60.0))
             ground_truth = sample.ground_truth[:, y, x].double()
             errors.append(
-                [float((colour - ground_truth).abs().max()) for colour in (seen.colour, ground_truth.mean().expand(3))]
+                [
+                    float((colour - ground_truth).abs().max())
+                    for colour in (report.colour, ground_truth.mean().expand(3))
+                ]
             )
     found, grey = torch.tensor(errors).median(0).values
     assert found < 0.5 * grey
 
 
 def test_depths_are_those_of_the_samples(scene, sample):
-    seen = look_at(scene, state()).betas["colour"]
+    report = inspect_pixel(scene, state()).betas["colour"]
     near, far = (float(d) for d in sample.rig.depth)
-    assert float(seen.depth[0]) == pytest.approx(near, rel=1e-6)
-    assert float(seen.depth[-1]) == pytest.approx(far, rel=1e-6)
-    again = depth_of(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]]).double(), seen.xy[5:6])
-    assert float(seen.depth[5]) == pytest.approx(float(again.depth))
+    assert float(report.depth[0]) == pytest.approx(near, rel=1e-6)
+    assert float(report.depth[-1]) == pytest.approx(far, rel=1e-6)
+    again = depth_of(sample.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]]).double(), report.xy[5:6])
+    assert float(report.depth[5]) == pytest.approx(float(again.depth))
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_every_family_answers(scene, family):
-    seen = look_at(scene, state(family=family))
-    assert not seen.problems
-    assert float(seen.betas["colour"].weight.sum()) == pytest.approx(1)
+    report = inspect_pixel(scene, state(family=family))
+    assert not report.problems
+    assert float(report.betas["colour"].weight.sum()) == pytest.approx(1)
 
 
 def test_near_far_and_displacement_are_the_fields(scene, sample):
@@ -94,29 +97,29 @@ def test_near_far_and_displacement_are_the_fields(scene, sample):
         ({"family": "homography", "displacement": 12.0}, HomographyDisplacement(12.0)),
     ):
         found = field(pair, x)
-        ends = look_at(scene, state(**changes)).betas["colour"].ends
+        ends = inspect_pixel(scene, state(**changes)).betas["colour"].ends
         torch.testing.assert_close(ends, torch.cat([found.start, found.end]))
 
 
 def test_a_turned_camera_moves_the_segment_as_the_rig_says(scene, sample):
     step = (0.0, math.radians(0.3), 0.0)
-    seen = look_at(scene, state(changes={"colour.rotation": step}))
+    report = inspect_pixel(scene, state(changes={"colour.rotation": step}))
     turned = sample.rig.perturbed({"colour.rotation": torch.tensor(step, dtype=torch.float64)})
     found = Epipolar()(turned.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
-    torch.testing.assert_close(seen.betas["colour"].ends[0], found.start[0])
-    moved = seen.betas["colour"].ends - look_at(scene, state()).betas["colour"].ends
+    torch.testing.assert_close(report.betas["colour"].ends[0], found.start[0])
+    moved = report.betas["colour"].ends - inspect_pixel(scene, state()).betas["colour"].ends
     assert moved.norm(dim=-1).tolist() == pytest.approx([460 * math.radians(0.3)] * 2, rel=0.15)
 
 
 def test_lenses_are_followed(scene, sample):
     lens = Distortion("brown-conrady", torch.tensor([-0.2, 0.05, 0.0, 0.0, 0.0], dtype=torch.float64))
     camera = sample.rig["colour"].replace(distortion=lens)
-    has_lens = Scene(sample.rig.with_camera("colour", camera), sample.images)
-    seen = look_at(has_lens, state()).betas["colour"]
-    assert seen.ends is None
+    has_lens = ExplorerScene(sample.rig.with_camera("colour", camera), sample.images)
+    report = inspect_pixel(has_lens, state()).betas["colour"]
+    assert report.ends is None
     found = Curved(256)(has_lens.rig.pair("mono", "colour"), torch.tensor([[320.0, 200.0]], dtype=torch.float64))
-    torch.testing.assert_close(seen.xy, found.xy[0])
-    assert "colour.distortion" in core.numbers_of(has_lens.rig)
+    torch.testing.assert_close(report.xy, found.xy[0])
+    assert "colour.distortion" in core.parameter_lengths(has_lens.rig)
 
 
 def test_cameras_known_by_F_or_by_size_alone(sample):
@@ -124,20 +127,20 @@ def test_cameras_known_by_F_or_by_size_alone(sample):
     views = {name: View(hw=sample.rig[name].hw) for name in sample.rig.names}
     linked = Rig(views, links={("mono", "colour"): Link(pair.fundamental, pair.homography)})
     for rig in (linked, Rig(views)):
-        seen = look_at(Scene(rig, sample.images), state())
-        assert not seen.problems
-        assert seen.betas["colour"].depth.isnan().all()
-        assert math.isnan(seen.depth)
-        assert core.numbers_of(rig) == {}
-    problem = look_at(Scene(Rig(views), sample.images), state(family="epipolar")).problems["colour"]
+        report = inspect_pixel(ExplorerScene(rig, sample.images), state())
+        assert not report.problems
+        assert report.betas["colour"].depth.isnan().all()
+        assert math.isnan(report.depth)
+        assert core.parameter_lengths(rig) == {}
+    problem = inspect_pixel(ExplorerScene(Rig(views), sample.images), state(family="epipolar")).problems["colour"]
     assert "calibrat" in problem
 
 
 def test_what_cannot_be_is_told(scene, sample):
     with pytest.raises(ValueError, match="near"):
-        look_at(scene, state(near=30.0))
+        inspect_pixel(scene, state(near=30.0))
     with pytest.raises(ValueError, match="64x40, the rig says 640x400"):
-        Scene(sample.rig, {"mono": torch.zeros(1, 40, 64)})
+        ExplorerScene(sample.rig, {"mono": torch.zeros(1, 40, 64)})
 
 
 def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
@@ -147,11 +150,11 @@ def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
         rig = rig.resize(name, (1024, 1280))
         images[name] = interpolate(images[name][None], size=(1024, 1280), mode="bilinear")[0]
     rig, images = rig.with_camera("second", rig["colour"]), images | {"second": images["colour"]}
-    scene = Scene(rig, images)
-    look_at(scene, state())
+    scene = ExplorerScene(rig, images)
+    inspect_pixel(scene, state())
     times = []
     for i in range(9):
         start = time.process_time()
-        look_at(scene, state().replace(x=(400.0 + 50 * i, 500.0)))
+        inspect_pixel(scene, state().replace(x=(400.0 + 50 * i, 500.0)))
         times.append(time.process_time() - start)
     assert sorted(times)[4] < 0.1

@@ -1,4 +1,4 @@
-"""Rigs made worse and made better again, against their truth."""
+"""Perturbed rigs and their refinement, against ground truth."""
 
 import math
 
@@ -8,18 +8,36 @@ import torch
 
 from arraygeom import Camera, Link, Rig, View
 from calib.images.matches import Matches, match_cameras
-from calib.images.parameters import changed, unknowns
-from calib.images.photometric import Views, photometric_errors
-from calib.images.refine import Fit, jacobian, line_distances, polish, refine, refine_matches, sampson, solve
+from calib.images.parameters import apply_change, free_parameters
+from calib.images.photometric import PhotometricFrame, photometric_errors
+from calib.images.refinement import (
+    RefinementProblem,
+    jacobian,
+    line_distances,
+    polish,
+    refine,
+    refine_matches,
+    sampson,
+    solve,
+)
 from calib.images.residuals import epipolar_residuals
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import write_image
-from tests.calib.scenes import HW, rectified_images, rectified_pair, seen_points, texture, unlike_pair, vector
+from tests.calib.scenes import (
+    HW,
+    rectified_images,
+    rectified_pair,
+    seen_points,
+    texture,
+    uninformed,
+    unlike_pair,
+    vector,
+)
 
 
 def worse(rig: Rig, *, seed=0) -> Rig:
-    """Each camera turned by 0.3 degrees, each principal point moved by 5 pixels, some way or other."""
+    """Each camera rotated by 0.3 degrees, each principal point moved by 5 pixels, in random directions."""
     g = torch.Generator().manual_seed(seed)
     changes = rig.parameters(free=["*.rotation", "*.centre"])
     drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
@@ -63,12 +81,12 @@ def test_several_frames_hold_a_whole_one_out():
     assert found.accepted
 
 
-def test_what_images_cannot_tell_is_left_alone_and_named():
+def test_what_images_cannot_tell_is_unobservable_and_named():
     """Side by side and alike, a shift of both principal points along the rows moves no line."""
     rig = rectified_pair()
     bad = rig.perturbed({"right.rotation": vector(0.003, 0, 0.004)})
     found = refine_matches(bad, [seen_points(rig)], free=["rotation", "centre", "translation"])
-    assert {"left.centre x", "right.centre x", "right.translation x"} <= set(found.left_alone)
+    assert {"left.centre x", "right.centre x", "right.translation x"} <= set(found.unobservable)
     for name in ("left", "right"):
         assert found.rig[name].K[0, 2] == bad[name].K[0, 2]
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
@@ -82,8 +100,8 @@ def test_translations_are_freed_where_points_demand_it():
     found = refine_matches(moved, [seen_points(rig, count=400)])
     assert any(change.name == "second.translation" for change in found.changes)
     assert median_off(found.rig, exact) < 0.1
-    turned = refine_matches(worse(rig), [seen_points(rig)])
-    assert not any("translation" in change.name for change in turned.changes)
+    rotated = refine_matches(worse(rig), [seen_points(rig)])
+    assert not any("translation" in change.name for change in rotated.changes)
     only = refine_matches(moved, [seen_points(rig, count=400)], free=["rotation"])
     assert not any("translation" in change.name for change in only.changes)
 
@@ -91,7 +109,7 @@ def test_translations_are_freed_where_points_demand_it():
 def test_a_tight_prior_holds():
     rig = unlike_pair()
     found = refine_matches(worse(rig), [seen_points(rig)], sigma={"centre": 1e-4, "rotation": math.radians(1)})
-    assert any("centre" in name for name in found.left_alone)
+    assert any("centre" in name for name in found.unobservable)
     assert not any("centre" in change.name for change in found.changes)
 
 
@@ -101,7 +119,7 @@ def test_a_good_rig_stays_as_it_is():
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.1
 
 
-def test_points_held_out_refuse_what_wrong_points_say():
+def test_held_out_points_reject_a_fit_to_wrong_points():
     rig = unlike_pair()
     drifted = rig.perturbed({"second.rotation": vector(0.01, 0.005, 0)})
     found = refine_matches(rig, [seen_points(drifted), seen_points(rig, seed=2)])
@@ -112,7 +130,7 @@ def test_points_held_out_refuse_what_wrong_points_say():
 
 
 def test_deviations_are_those_of_repeated_measurement():
-    """The spread of the answers over draws of noise is what the answer says of itself."""
+    """The standard deviation over draws of noise is the stated one."""
     rig = rectified_pair().perturbed({"right.rotation": vector(0.02, 0.01, -0.03)})
     draws = [refine_matches(worse(rig), [seen_points(rig, noise=0.2, seed=s)], free=["rotation"]) for s in range(12)]
     amounts = torch.tensor([d.changes[0].amount for d in draws])
@@ -127,19 +145,21 @@ def test_derivatives_are_those_of_finite_differences(lens):
     rig = unlike_pair(lens=lens)
     pairs = seen_points(rig, count=20)
     free = ["rotation", "translation", "focal", "centre"] + (["distortion"] if lens else [])
-    given = unknowns(rig, rig.names, free=free)
+    given = free_parameters(rig, rig.names, free=free)
     z = 0.1 * torch.ones(sum(len(u.sigma) for u in given), dtype=torch.float64)
 
     def algebraic_over_fixed_gradient(z):
-        return sampson(changed(rig, given, z), pairs)
+        return sampson(apply_change(rig, given, z), pairs)
 
     _, J = jacobian(algebraic_over_fixed_gradient, z)
     (names, points), *_ = pairs.items()
-    fixed = epipolar_residuals(changed(rig, given, z).pair(*names), points)
+    fixed = epipolar_residuals(apply_change(rig, given, z).pair(*names), points)
     for k in (0, 4, len(z) - 1):
         step = torch.zeros_like(z)
         step[k] = 1e-4
-        ends = [epipolar_residuals(changed(rig, given, z + s * step).pair(*names), points).sampson for s in (1, -1)]
+        ends = [
+            epipolar_residuals(apply_change(rig, given, z + s * step).pair(*names), points).sampson for s in (1, -1)
+        ]
         difference = (ends[0] - ends[1]) / 2e-4
         near_zero = fixed.sampson.abs() < 3
         assert torch.allclose(J[near_zero, k], difference[near_zero], atol=0.05, rtol=0.05)
@@ -166,7 +186,7 @@ def test_a_fundamental_matrix_is_refined():
 def test_photometric_error_is_least_for_the_true_rig():
     rig, images = rectified_pair(), rectified_images()
     rig = rig.replace(depth=(2.5, 6.5))
-    views = Views.of(images)
+    views = PhotometricFrame.of(images)
 
     def error(pixels):
         moved = rig.perturbed({"right.centre": vector(0, pixels)})
@@ -183,28 +203,24 @@ def test_photometric_error_is_least_for_the_true_rig():
     assert slope[1] > 0
 
 
-def test_the_fusions_error_brings_a_rig_nearer_its_truth():
+def test_photometric_error_refines_a_rig():
     rig, images = rectified_pair(), rectified_images()
     bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
     found = refine(bad, [images], free=["rotation"], attend=attend_with_statistics)
     assert found.accepted
     assert found.photometric is not None
-    assert "fusion's own error" in found.as_text()
+    assert "photometric error on held-out pixels" in found.as_text()
     assert median_off(found.rig, seen_points(rig, noise=0.0)) < 0.1
 
 
-def test_the_fusions_error_alone_does_too():
+def test_photometric_error_alone_refines_a_rig():
     """No point is used: the gradient through attention's segments moves the rig."""
     rig, images = rectified_pair().replace(depth=(2.5, 6.5)), rectified_images()
-    fit = Fit.of(
-        rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)}),
-        [match_cameras(images)],
-        free=["right.rotation"],
-        sigma=None,
-    )
+    bad = rig.perturbed({"right.rotation": vector(0.004, 0, 0.002)})
+    fit = RefinementProblem.of(bad, ["right.rotation"], frames=[match_cameras(images)])
     ground_truth = seen_points(rig, near=3.0, far=5.5, noise=0.0)
     before = median_off(fit.rig, ground_truth)
-    found, errors = polish(fit, fit.prior(), [images], attend_with_statistics)
+    found, errors = polish(fit, uninformed(fit), [images], attend_with_statistics)
     assert before > 1
     assert median_off(fit.after(found.z), ground_truth) < 0.3 * before
     assert errors.accepted
@@ -219,14 +235,14 @@ def test_bad_input_is_one_clear_line():
         refine(rig, [{"left": images["left"], "right": images["left"]}])
     with pytest.raises(ValueError, match="do the cameras see the same things"):
         refine(rig, [images | {"right": texture(seed=5)}])
-    with pytest.raises(ValueError, match=r"is 100x80, the rig says 320x240.*doctor"):
+    with pytest.raises(ValueError, match=r"is 100x80, the rig states 320x240.*doctor"):
         refine(rig, [images | {"right": texture((80, 100))}])
     with pytest.raises(ValueError, match="the rig has no 'rotatoin'"):
         refine(rig, [images], free=["rotatoin"])
     with pytest.raises(ValueError, match="nothing is free"):
         refine(rig, [images], free=["left.rotation"])
     unknown = Rig({name: View(hw=HW) for name in images})
-    with pytest.raises(ValueError, match="says nothing of how these cameras are related"):
+    with pytest.raises(ValueError, match="does not relate these cameras"):
         refine(unknown, [images])
     with pytest.raises(ValueError, match="--sigma"):
         refine(rig, [images], sigma={"center": 3})

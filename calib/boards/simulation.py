@@ -1,7 +1,7 @@
-"""A calibration rehearsed: what the cameras of a rig would photograph of a board, before one is printed.
+"""Simulated calibration: images of a board by the cameras of a planned rig, before a board is printed.
 
-`rehearse` writes a folder such as `pat calibrate` reads. So one sees which board, how many images and which depths a
-planned array needs, and how well it would be known then.
+`simulate_photos` writes a folder that `pat calibrate` reads. It shows which board, how many images and which depths a
+planned array needs, and how accurately it would be calibrated.
 """
 
 from __future__ import annotations
@@ -24,14 +24,18 @@ from arraygeom.viz import calibrated
 from .target import Board, Circles, draw_board
 
 FILLS = (0.35, 0.9)
-"""How much of the narrowest view a board is wide."""
+"""Least and largest width of the board, as a share of the narrowest view."""
+TILT = 35.0
+"""Largest rotation of the board about x and about y, degrees."""
 TRIES = 2000
 WALL = 90
-"""Grey value of what is behind the board."""
+"""Grey value of the background."""
 
 
-def rehearse(rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: float = 1.5, seed: int = 0) -> Pose:
-    """Photograph a board at `count` random places: `folder`/CAMERA/000.png and so on.
+def simulate_photos(
+    rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: float = 1.5, seed: int = 0
+) -> Pose:
+    """Render a board in `count` random poses: `folder`/CAMERA/000.png and so on.
 
     `noise` is in grey values of 255. Returns the true `world_from_board`, a batch (count).
     Raises ValueError for a rig without calibrated cameras, or whose cameras nowhere see a board together.
@@ -44,17 +48,16 @@ def rehearse(rig: Rig, board: Board, folder: Path, *, count: int = 12, noise: fl
         for i in range(count):
             pose = camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
             image = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
+            png = cv2.imencode(".png", np.clip(image.round(), 0, 255).astype(np.uint8))[1]
             with write_atomically(folder / name / f"{i:03d}.png") as temporary:
-                temporary.write_bytes(
-                    cv2.imencode(".png", np.clip(image.round(), 0, 255).astype(np.uint8))[1].tobytes()
-                )
+                temporary.write_bytes(png.tobytes())
     return boards
 
 
-def board_poses(rig: Rig, board: Board, count: int, *, tilt: float = 35.0, seed: int = 0) -> Pose:
-    """`world_from_board` (a batch) where every camera sees the board's middle: near and far, to all sides, tilted.
+def board_poses(rig: Rig, board: Board, count: int, *, seed: int = 0) -> Pose:
+    """Random `world_from_board` (a batch) with the board's centre visible in every camera, at several depths and tilts.
 
-    `tilt` is the most about x and about y, degrees. Raises ValueError if there is no such place.
+    Raises ValueError if there are too few such poses.
     """
     cameras, random = list(calibrated(rig).values()), np.random.default_rng(seed)
     narrow = max(float(c.K[0, 0]) / c.hw[1] for c in cameras)
@@ -64,11 +67,11 @@ def board_poses(rig: Rig, board: Board, count: int, *, tilt: float = 35.0, seed:
         camera = cameras[random.integers(len(cameras))]
         depth = max(board.extent) * narrow / random.uniform(*FILLS)
         x = torch.from_numpy(random.uniform(0.15, 0.85, 2) * (np.array(camera.hw[::-1]) - 1))
-        there = camera.unproject(x, torch.tensor(depth))
-        if all(bool(p.valid) and bool(c.contains(p.x)) for c in cameras for p in [c.project(there)]):
-            turn = np.radians([*random.uniform(-tilt, tilt, 2), random.uniform(-20, 20)])
-            R = camera.R.T.double() @ rotation_from_vector(torch.from_numpy(turn))
-            found.append(Pose(R, there - R @ middle))
+        centre = camera.unproject(x, torch.tensor(depth))
+        if all(bool(p.valid) and bool(c.contains(p.x)) for c in cameras for p in [c.project(centre)]):
+            rotation = np.radians([*random.uniform(-TILT, TILT, 2), random.uniform(-20, 20)])
+            R = camera.R.T.double() @ rotation_from_vector(torch.from_numpy(rotation))
+            found.append(Pose(R, centre - R @ middle))
         if len(found) == count:
             return Pose(torch.stack([p.R for p in found]), torch.stack([p.t for p in found]))
     raise ValueError(f"the cameras see the board {board} together almost nowhere: take a larger or a smaller one")
@@ -80,10 +83,10 @@ Rays = tuple[Float[Tensor, "n 3"], Bool[Tensor, " n"]]
 def photograph(
     camera: Camera, cam_from_board: Pose, board: Board, *, dpi: float | None = None, rays: Rays | None = None
 ) -> UInt8[np.ndarray, "h w"]:
-    """The image that a camera takes of a printed board, through its lens: the mean of four points a pixel.
+    """The image of a printed board by a camera, through its lens: the mean of four samples per pixel.
 
-    The print is drawn at `dpi`; by default so that its pixels are about as large as the distance of those points, for
-    then none is skipped. `rays` are `fine_rays(camera)`, if they are there already.
+    The print is drawn at `dpi`, by default such that its pixels match the distance of the samples. `rays` are
+    `fine_rays(camera)`, if precomputed.
     """
     directions, valid = rays or fine_rays(camera)
     R, t = cam_from_board.R, cam_from_board.t
@@ -100,13 +103,13 @@ def photograph(
 
 
 def fine_rays(camera: Camera) -> Rays:
-    """The rays of a camera's pixels at twice its size, row by row, and which are valid."""
+    """The rays of a camera's pixels at twice its resolution, row by row, and which are valid."""
     fine = camera.to(torch.float64).resize((2 * camera.hw[0], 2 * camera.hw[1]))
     return fine.rays(pixel_grid(fine.hw, dtype=torch.float64).reshape(-1, 2))
 
 
 def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
-    """Dots per inch of which one is half a pixel at the board's middle, in steps of a tenth."""
+    """Dots per inch at which a dot is half a pixel at the board's centre, in steps of a tenth."""
     middle = torch.from_numpy((board.points.max(0) + board.points.min(0)) / 2)
     depth = max(float(cam_from_board.apply(middle[None])[0, 2]), 1e-3)
     exact = 2 * float(camera.K[0, 0]) / depth * 0.0254
@@ -115,7 +118,7 @@ def _resolution(camera: Camera, cam_from_board: Pose, board: Board) -> float:
 
 @lru_cache(maxsize=32)
 def printed(board: Board, dpi: float) -> tuple[UInt8[np.ndarray, "h w"], float, Float[np.ndarray, "2"]]:
-    """The board as it comes out of a printer: grey values, pixels a metre, and the pixel of its first point."""
+    """The printed board: grey values, pixels per metre, and the pixel of its first point."""
     margin = 0.012
     figure = draw_board(board, margin=margin)
     canvas = FigureCanvasAgg(figure)

@@ -1,0 +1,300 @@
+"""A calibrated rig from detected board points, with its accuracy."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from arraygeom import Camera, Pose, Rig, epipolar_distance
+
+from .bundle import (
+    BoardPoses,
+    BundleProblem,
+    BundleResult,
+    IntrinsicsPrior,
+    Observations,
+    adjust,
+    intrinsic_values,
+    noise,
+    parameter_names,
+)
+from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts
+from .observability import gate, typical_prior
+from .photos import FrameKey
+from .poses import CalibratedViews, initial_rig
+from .target import Board
+
+SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
+FEWEST_TO_HOLD_OUT = 8
+"""Frames are held out from this many on that two cameras share."""
+INCONSISTENT, REJECTED = 3.0, 20.0
+"""Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
+HOLD_OUT_EVERY = 5
+"""One frame in this many is held out."""
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """A rig with its accuracy.
+
+    fit: result of the bundle adjustment; its blocks are `frames` in order.
+    single: each camera's reprojection error (RMS, px) when it is calibrated by itself.
+    views: the detections used, numbered consistently in all cameras. held_out: epipolar errors of held-out frames, px.
+    """
+
+    rig: Rig
+    board: Board
+    fit: BundleResult
+    frames: tuple[FrameKey, ...]
+    views: Mapping[str, BoardViews]
+    single: Mapping[str, float]
+    epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
+    held_out: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
+    notes: tuple[str, ...] = field(default=())
+
+    @property
+    def rms(self) -> float:
+        """The reprojection error of all points of all images, pixels, outliers included."""
+        return self.fit.problem.rms()
+
+    def deviations(self) -> dict[str, float]:
+        """The standard deviation of each free parameter by name ("left.focal.0"), in its own unit."""
+        assert self.fit.covariance is not None
+        return dict(zip(self.fit.names, np.sqrt(self.fit.covariance.diagonal()).tolist()))
+
+
+def calibrate(
+    views: Mapping[str, BoardViews], board: Board, *, lens: Lens | Mapping[str, Lens] = "brown-conrady"
+) -> Calibration:
+    """Calibrate a rig from detected board points. Its world is the first camera.
+
+    `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, if a camera has too few
+    images or only parallel boards, if cameras are not connected, or if their frames contradict each other.
+    """
+    models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
+    single = {
+        name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()
+    }
+    initial = initial_rig(
+        [CalibratedViews(name, a.camera, a.views, a.cam_from_board) for name, a in single.items()], board
+    )
+    cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
+    together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), single)
+    rig = Rig(together.fit.problem.cameras)
+    return Calibration(
+        rig=rig,
+        board=board,
+        fit=together.fit,
+        frames=tuple(initial.world_from_board),
+        views=initial.views,
+        single={name: a.fit.problem.rms() for name, a in single.items()},
+        epipolar=epipolar_errors(rig, initial.views),
+        held_out=_held_out(cameras, initial.world_from_board, initial.views, board, together),
+        notes=(*_images_left_out(views, single, initial.left_out), *together.notes),
+    )
+
+
+class SingleCalibration(NamedTuple):
+    """One camera calibrated by itself, in its own frame; `views` are the images used."""
+
+    fit: BundleResult
+    views: BoardViews
+    frames: tuple[FrameKey, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def camera(self) -> Camera:
+        """The camera, at the origin."""
+        return next(iter(self.fit.problem.cameras.values()))
+
+    @property
+    def cam_from_board(self) -> dict[FrameKey, Pose]:
+        """The board's pose in the camera by moment."""
+        return self.fit.problem.board_poses(self.frames)
+
+
+def calibrate_single(
+    name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady", final: bool = True
+) -> SingleCalibration:
+    """One camera's intrinsics and lens from its own images. Raises ValueError as `calibrate` does.
+
+    Unless `final`, a poorly constrained focal length is accepted, as other cameras will add constraints.
+    """
+    start = calibrate_camera(name, views, board, lens=lens)
+    kept = _without_outliers(views, start)
+    if len(kept.seen) < len(views.seen):
+        start = calibrate_camera(name, kept, board, lens=lens)
+    problem = _problem({name: start.camera}, start.cam_from_board, {name: kept}, board)
+    fit, _, notes = _fitted(problem, final=final)
+    found = SingleCalibration(fit, kept, tuple(start.cam_from_board), tuple(notes))
+    check_tilts(name, found.cam_from_board)
+    return found
+
+
+class _JointFit(NamedTuple):
+    """The fit of all cameras, its free parameters, notes, and whether all cameras shared one noise."""
+
+    fit: BundleResult
+    free: dict[str, np.ndarray]
+    notes: list[str]
+    equal_noise: bool = False
+
+    def refit(self, problem: BundleProblem) -> BundleResult:
+        """The same adjustment of other frames."""
+        return adjust(replace(problem, priors=self.fit.problem.priors), self.free, equal_noise=self.equal_noise)
+
+
+def _joint_fit(problem: BundleProblem, single: Mapping[str, SingleCalibration]) -> _JointFit:
+    """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
+
+    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
+    """
+    if len(problem.cameras) == 1:
+        (only,) = single.values()
+        fixed = {name: _free(c, False, lens=0) for name, c in problem.cameras.items()}
+        return _JointFit(only.fit, fixed, list(only.notes))
+    fit, free, notes = _fitted(problem)
+    if not (doubts := _inconsistent_cameras(fit, single)):
+        return _JointFit(fit, free, notes)
+    priors = {name: _as_prior(name, a) for name, a in single.items()}
+    free = {name: priors[name].information.diagonal() > 0 for name in problem.cameras}
+    for index, mask in enumerate(free.values()):
+        mask[:6] = index > 0
+    fit = adjust(replace(problem, priors=priors), free, equal_noise=True)
+    kept = "so each camera's intrinsics keep close to its own calibration"
+    notes = [note for a in single.values() for note in a.notes]
+    return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"], equal_noise=True)
+
+
+def _as_prior(name: str, single: SingleCalibration) -> IntrinsicsPrior:
+    """The single calibration of a camera as a prior of its intrinsics; none for parameters that were fixed."""
+    fit, entries = single.fit, parameter_names(single.camera)
+    free = [entries.index(entry.removeprefix(f"{name}.")) for entry in fit.names]
+    information = np.zeros((len(entries), len(entries)))
+    if fit.covariance is not None:
+        information[np.ix_(free, free)] = np.linalg.inv(fit.covariance)
+    return IntrinsicsPrior(intrinsic_values(single.camera), information)
+
+
+def epipolar_errors(rig: Rig, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the reverse."""
+    found = {}
+    for a, b in combinations(views, 2):
+        xa, xb = _common(views[a], views[b])
+        if len(xa):
+            found[a, b] = _symmetric_distance(rig, a, b, xa, xb)
+    return found
+
+
+def _symmetric_distance(rig: Rig, a: str, b: str, xa: np.ndarray, xb: np.ndarray) -> np.ndarray:
+    pair, reverse = rig.pair(a, b), rig.pair(b, a)
+    (pa, va), (pb, vb) = pair.alpha.undistort(torch.from_numpy(xa)), pair.beta.undistort(torch.from_numpy(xb))
+    forward = epipolar_distance(pair.fundamental, pa, pb).abs()
+    backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
+    return ((forward + backward) / 2)[va & vb].numpy()
+
+
+def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (n, 2) of the points both cameras observed in the same frames."""
+    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 2)), np.zeros((0, 2)))]
+    for key in a.seen:
+        if key in b.seen:
+            _, i, j = np.intersect1d(a.seen[key].ids, b.seen[key].ids, return_indices=True)
+            parts.append((a.seen[key].x[i], b.seen[key].x[j]))
+    xa, xb = (np.concatenate(part) for part in zip(*parts))
+    return xa, xb
+
+
+def _without_outliers(views: BoardViews, start: InitialCamera) -> BoardViews:
+    """The views without images whose reprojection error is far above the others'."""
+    limit = max(2.0, 10 * float(np.median(list(start.rms.values()))))
+    return BoardViews(views.hw, {key: d for key, d in views.seen.items() if start.rms[key] < limit})
+
+
+def _problem(
+    cameras: Mapping[str, Camera], boards: Mapping[FrameKey, Pose], views: Mapping[str, BoardViews], board: Board
+) -> BundleProblem:
+    index = {key: i for i, key in enumerate(boards)}
+    poses = Pose(torch.stack([p.R for p in boards.values()]), torch.stack([p.t for p in boards.values()]))
+    seen = {name: _observations(v, index, board) for name, v in views.items()}
+    return BundleProblem(
+        cameras, BoardPoses(poses), seen, {name: typical_prior(camera) for name, camera in cameras.items()}
+    )
+
+
+def _observations(views: BoardViews, index: Mapping[FrameKey, int], board: Board) -> Observations:
+    parts = [(np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in views.seen.items()]
+    return Observations(*(np.concatenate(part) for part in zip(*parts)))
+
+
+def _fitted(problem: BundleProblem, *, final: bool = True) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
+    """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is."""
+    sigma = noise(problem, 0)
+    full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(problem.cameras.items())}
+    problem, free, notes = gate(problem, full, sigma, final=False)
+    fit = adjust(problem, free)
+    while True:
+        problem, free, more = gate(fit.problem, free, fit.sigma, final=final)
+        if not more:
+            return fit, free, notes
+        notes, fit = notes + more, adjust(problem, free)
+
+
+def _free(camera: Camera, posed: bool, *, lens: int) -> np.ndarray:
+    """A mask of the camera's parameters: its pose if `posed`, K, and the first `lens` distortion terms."""
+    names = parameter_names(camera)
+    mask = np.ones(len(names), dtype=bool)
+    mask[:6] = posed
+    mask[10 + lens :] = False
+    return mask
+
+
+def _held_out(
+    cameras: Mapping[str, Camera],
+    boards: Mapping[FrameKey, Pose],
+    views: Mapping[str, BoardViews],
+    board: Board,
+    together: _JointFit,
+) -> dict[tuple[str, str], np.ndarray]:
+    """Epipolar errors on one frame in five of a rig calibrated with the others; empty if there are too few."""
+    shared = [key for key in boards if sum(key in v.seen for v in views.values()) > 1]
+    if len(shared) < FEWEST_TO_HOLD_OUT:
+        return {}
+    out = set(shared[HOLD_OUT_EVERY // 2 :: HOLD_OUT_EVERY])
+    used = {name: BoardViews(v.hw, {k: d for k, d in v.seen.items() if k not in out}) for name, v in views.items()}
+    kept = {name: BoardViews(v.hw, {k: d for k, d in v.seen.items() if k in out}) for name, v in views.items()}
+    if any(len(v.seen) < 3 for v in used.values()):
+        return {}
+    problem = _problem(cameras, {k: p for k, p in boards.items() if k not in out}, used, board)
+    return epipolar_errors(Rig(together.refit(problem).problem.cameras), kept)
+
+
+def _images_left_out(
+    views: Mapping[str, BoardViews], single: Mapping[str, SingleCalibration], left_out: list[tuple[str, FrameKey]]
+) -> list[str]:
+    notes = []
+    for name, v in views.items():
+        if rejected := [str(key) for key in v.seen if key not in single[name].views.seen]:
+            notes.append(f"{name}: left out {', '.join(rejected)}: the detected board does not fit the camera")
+        if inconsistent := [str(key) for other, key in left_out if other == name]:
+            notes.append(f"{name}: left out {', '.join(inconsistent)}: they contradict the other cameras' images")
+    return notes
+
+
+def _inconsistent_cameras(fit: BundleResult, single: Mapping[str, SingleCalibration]) -> str:
+    """Text on cameras that fit much worse together than alone, or "". Raises ValueError if far worse."""
+    doubts = []
+    for name, r in fit.problem.residuals().items():
+        together, by_itself = float(np.sqrt((r**2).sum(-1).mean())), single[name].fit.problem.rms()
+        fits = f"{name} fits to {by_itself:.2f} px alone but to {together:.2f} px with the others"
+        if together > REJECTED * max(by_itself, 0.3):
+            raise ValueError(f"{fits}: were the images {SYNCHRONISED}?")
+        if together > 0.5 and together > INCONSISTENT * by_itself:
+            doubts.append(fits)
+    return f"{', '.join(doubts)} (were the images {SYNCHRONISED}?)" if doubts else ""

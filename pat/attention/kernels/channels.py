@@ -1,0 +1,265 @@
+"""Work along the channels: inner products with taps, weighted sums of taps, and additions to them."""
+
+from __future__ import annotations
+
+import math
+from inspect import unwrap
+
+import numpy as np
+from numba import types
+from numba.extending import overload
+
+from .emit import LANES, compiled
+from .layout import BLOCK, from_pixel, of, pointers
+from .vectors import (
+    TAP_BLOCK,
+    add_totals,
+    dot_row,
+    extend_row,
+    fma_row,
+    fma_taps,
+    fold_row,
+    from_index,
+    gather_row,
+    half_bits,
+    load,
+    load_one,
+    load_row,
+    splat,
+    store,
+    store_row,
+    zero,
+)
+
+ROW = 8
+"""Vectors of channels that are processed at once."""
+CHUNK = 48
+"""Taps that the pixels of a block have in turn, while these lie in the first cache: 16 KiB."""
+
+
+# ---- one pixel -----------------------------------------------------------------------------------
+
+
+@compiled
+def fill(numbers, first, last, filler):
+    """numbers[j] = filler for first <= j < last."""
+    for j in range(first, last):
+        numbers[j] = filler
+
+
+@compiled
+def unpack(array, at, n, out):
+    """out[c] = array[at + c], widened."""
+    whole = n // LANES * LANES
+    for c in range(0, whole, LANES):
+        store(out, c, load(array, at + c))
+    for c in range(whole, n):
+        out[c] = load_one(array, at + c)
+
+
+def pack(numbers, n, array, at):
+    """array[at + c] = numbers[c], narrowed."""
+
+
+@overload(pack)
+def _pack(numbers, n, array, at):
+    return _pack_same if array.dtype == numbers.dtype else _pack_narrower
+
+
+@unwrap
+def _pack_same(numbers, n, array, at):
+    unpack(numbers, 0, n, from_index(array, at))
+
+
+@unwrap
+def _pack_narrower(numbers, n, array, at):
+    for c in range(n):
+        array[at + c] = narrow(array, numbers[c])
+
+
+def narrow(array, number):
+    """A number as the array stores it."""
+
+
+@overload(narrow)
+def _narrow(array, number):
+    if array.dtype == types.uint16:
+        return _bfloat16_bits
+    if array.dtype == types.int16:
+        return lambda array, number: half_bits(number)
+    return lambda array, number: number
+
+
+@unwrap
+def _bfloat16_bits(array, number):
+    bits = np.float32(number).view(np.uint32)
+    if math.isnan(number):
+        return np.uint16(0x7FC0)
+    return np.uint16((bits + np.uint32(0x7FFF) + ((bits >> np.uint32(16)) & np.uint32(1))) >> np.uint32(16))
+
+
+@compiled
+def inner_products(x, rows, first, last, image, channels, out):
+    """out[t] = x . image[rows[t]], for first <= t < last; rows is padded to a multiple of TAP_BLOCK."""
+    c = 0
+    for t in range(first, last, LANES):
+        store(out, t, splat(zero(x)))
+    while c + ROW * LANES <= channels:
+        _inner_products_of_row(x, rows, first, last, image, channels, c, out)
+        c += ROW * LANES
+    if c < channels:
+        _inner_products_of_rest(x, rows, first, last, image, channels, c, out)
+
+
+@compiled
+def _inner_products_of_row(x, rows, first, last, image, channels, c, out):
+    row = load_row(x, c, ROW)
+    for t in range(first, last, TAP_BLOCK):
+        add_totals(
+            out,
+            t,
+            dot_row(row, image, rows[t] * channels + c),
+            dot_row(row, image, rows[t + 1] * channels + c),
+            dot_row(row, image, rows[t + 2] * channels + c),
+            dot_row(row, image, rows[t + 3] * channels + c),
+        )
+
+
+@compiled
+def _inner_products_of_rest(x, rows, first, last, image, channels, first_channel, out):
+    whole = first_channel + (channels - first_channel) // LANES * LANES
+    for t in range(first, last, TAP_BLOCK):
+        starts = rows[t] * channels, rows[t + 1] * channels, rows[t + 2] * channels, rows[t + 3] * channels
+        totals = extend_row((splat(zero(x)),), TAP_BLOCK)
+        for c in range(first_channel, whole, LANES):
+            totals = fma_row(load(x, c), gather_row(image, starts, c), totals)
+        add_totals(out, t, *totals)
+        for c in range(whole, channels):
+            for k in range(TAP_BLOCK):
+                out[t + k] += x[c] * load_one(image, starts[k] + c)
+
+
+@compiled
+def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
+    """out[c] += weights[t] image[rows[t], c] for first <= t < last and the channels begin <= c < end.
+
+    Weights and rows are padded to a multiple of TAP_BLOCK.
+    """
+    c = begin
+    while c + ROW * LANES <= end:
+        _weighted_sum_8(weights, rows, first, last, image, channels, c, out)
+        c += ROW * LANES
+    while c + 4 * LANES <= end:
+        _weighted_sum_4(weights, rows, first, last, image, channels, c, out)
+        c += 4 * LANES
+    while c + LANES <= end:
+        _weighted_sum_1(weights, rows, first, last, image, channels, c, out)
+        c += LANES
+    for tail in range(c, end):
+        for t in range(first, last):
+            out[tail] += weights[t] * load_one(image, rows[t] * channels + tail)
+
+
+def _weighted_sum(n, taps):
+    """`weighted_sum` for n vectors of channels, with accumulators for some taps at a time."""
+    accumulators = n * taps
+
+    @compiled
+    def sum_row(weights, rows, first, last, image, channels, c, out):
+        totals = extend_row(load_row(out, c, n), accumulators)
+        for t in range(first, last, taps):
+            totals = fma_taps(weights, rows, t, image, channels, c, totals, n)
+        store_row(out, c, fold_row(totals, n))
+
+    return sum_row
+
+
+_weighted_sum_8, _weighted_sum_4, _weighted_sum_1 = _weighted_sum(ROW, 1), _weighted_sum(4, 2), _weighted_sum(1, 4)
+
+
+# ---- a block of pixels ---------------------------------------------------------------------------
+
+
+@compiled
+def block_products(pixels, counts, x, rows, image, channels, out):
+    """`inner_products` for the pixels of a block. Neighbours touch much the same pixels of beta: at a few of those in
+    turn, which then lie in the first cache."""
+    for t in range(0, _most(counts, pixels), CHUNK):
+        for i in range(pixels):
+            last = min(t + CHUNK, of(counts, i)[0])
+            inner_products(of(x, i), of(rows, i), t, last, image, channels, of(out, i))
+
+
+@compiled
+def block_sums(pixels, counts, weights, rows, image, channels, out):
+    """`weighted_sum` likewise, from 0."""
+    for i in range(pixels):
+        fill(of(out, i), 0, channels, zero(out.first))
+    for c in range(0, channels, ROW * LANES):
+        end = min(c + ROW * LANES, channels)
+        for t in range(0, _most(counts, pixels), CHUNK):
+            for i in range(pixels):
+                last = min(t + CHUNK, of(counts, i)[0])
+                weighted_sum(of(weights, i), of(rows, i), t, last, image, channels, c, end, of(out, i))
+
+
+@compiled
+def _most(counts, n):
+    most = 0
+    for i in range(n):
+        most = max(most, of(counts, i)[0])
+    return most
+
+
+# ---- additions to beta's pixels ------------------------------------------------------------------
+
+
+@compiled(nogil=True, cache=True)
+def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
+    """out[row, c] += weight x[pixel, c] for all taps of the alpha pixels taps.first .. last: those of a block
+    in turn, as in `block_products`.
+
+    `weights` is a column of `taps`. One caller owns the channels first_channel .. last_channel, so the order of
+    additions, and with it every bit, is the same however many callers share the work.
+    """
+    taps, (weights, x, out) = pointers(taps), pointers((weights, x, out))
+    for first in range(0, last - taps.first, BLOCK):
+        pixels = min(BLOCK, last - taps.first - first)
+        counts = from_pixel(taps.tap_count, first)
+        for t in range(0, _most(counts, pixels), CHUNK):
+            for i in range(pixels):
+                end = min(t + CHUNK, of(counts, i)[0])
+                at = from_index(x, (taps.first + first + i) * channels)
+                rows, weight = of(taps.rows, first + i), of(weights, first + i)
+                _scatter(rows, weight, t, end, at, channels, first_channel, last_channel, out)
+
+
+@compiled
+def _scatter(rows, weights, first, last, x, channels, first_channel, last_channel, out):
+    c = first_channel
+    while c + 4 * LANES <= last_channel:
+        _scatter_4(rows, weights, first, last, x, channels, c, out)
+        c += 4 * LANES
+    while c + LANES <= last_channel:
+        _scatter_1(rows, weights, first, last, x, channels, c, out)
+        c += LANES
+    for tail in range(c, last_channel):
+        one = load_one(x, tail)
+        for t in range(first, last):
+            out[rows[t] * channels + tail] += weights[t] * one
+
+
+def _scatter_rows(n):
+    """`_scatter` for n vectors of channels."""
+
+    @compiled
+    def scatter_row(rows, weights, first, last, x, channels, c, out):
+        row = load_row(x, c, n)
+        for t in range(first, last):
+            at = rows[t] * channels + c
+            store_row(out, at, fma_row(splat(weights[t]), row, load_row(out, at, n)))
+
+    return scatter_row
+
+
+_scatter_4, _scatter_1 = _scatter_rows(4), _scatter_rows(1)

@@ -1,0 +1,157 @@
+"""Makes numba intrinsics of functions that emit LLVM's instructions.
+
+The body of such a function is Python that runs at compile time: a loop in it is unrolled code.
+"""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+from llvmlite import ir
+from numba import njit, types
+from numba.core import cgutils
+from numba.extending import intrinsic, models, register_model
+
+LANES = 8
+
+
+def compiled(function=None, **options):
+    """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled."""
+    return njit(inspect.unwrap(function), **options) if function else lambda function: compiled(function, **options)
+
+
+class Vector(types.Type):
+    """`LANES` numbers of the accumulation type, or of int32, in one register (or two)."""
+
+    def __init__(self, scalar):
+        self.scalar = scalar
+        super().__init__(name=f"Vector({scalar})")
+
+
+@register_model(Vector)
+class _VectorModel(models.PrimitiveModel):
+    def __init__(self, manager, kind):
+        super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), LANES))
+
+
+def accumulated(array):
+    """The type in which the numbers at a pointer are accumulated."""
+    return types.float64 if array.dtype == types.float64 else types.float32
+
+
+def vector_of(array, *_):
+    """The type of a vector of the numbers at a pointer."""
+    return Vector(accumulated(array))
+
+
+def row_of(vector, n):
+    """The type of a row: a tuple of n vectors."""
+    return types.UniTuple(vector, getattr(n, "literal_value", n))
+
+
+class Code:
+    """Emits instructions. `kinds` are numba's types of the intrinsic's arguments, `result` that of its value."""
+
+    def __init__(self, context, builder, kinds, result):
+        self.context, self.builder, self.kinds, self.result = context, builder, kinds, result
+
+    def __getattr__(self, name: str) -> Any:
+        """An instruction of LLVM, by its name."""
+        return getattr(self.builder, name)
+
+    def offset(self, index, k: int):
+        """index + k."""
+        return self.builder.add(index, ir.Constant(index.type, k))
+
+    def at(self, address, index):
+        """The number stored at an index."""
+        return self.builder.load(self.builder.gep(address, [index]))
+
+    def get(self, array, address, index, lanes=LANES):
+        """The vector stored at an index; `array` is the type of the pointer."""
+        lane = ir.VectorType(self.context.get_data_type(array.dtype), lanes)
+        place = self.builder.bitcast(self.builder.gep(address, [index]), lane.as_pointer())
+        return self.builder.load(place, align=array.dtype.bitwidth // 8)
+
+    def get_wide(self, array, address, index):
+        """The same in the accumulation type."""
+        return self.widen(self.get(array, address, index), array.dtype, LANES)
+
+    def put(self, array, address, index, vector):
+        """Stores a vector at an index."""
+        place = self.builder.bitcast(self.builder.gep(address, [index]), vector.type.as_pointer())
+        self.builder.store(vector, place, align=array.dtype.bitwidth // 8)
+
+    def widen(self, stored, dtype, lanes: int):
+        """A stored number, or a vector of them, in the accumulation type."""
+
+        def shape(lane):
+            return ir.VectorType(lane, lanes) if lanes > 1 else lane
+
+        if dtype == types.uint16:
+            whole = shape(ir.IntType(32))
+            sixteen = whole([16] * lanes if lanes > 1 else 16)
+            return self.bitcast(self.shl(self.zext(stored, whole), sixteen), shape(ir.FloatType()))
+        if dtype == types.int16:
+            return self.fpext(self.bitcast(stored, shape(ir.HalfType())), shape(ir.FloatType()))
+        return stored
+
+    def repeat(self, number):
+        """A vector of one number repeated."""
+        undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
+        return self.shuffle(self.insert_element(undefined, number, ir.IntType(32)(0)), None, [0] * LANES)
+
+    def shuffle(self, a, b, lanes):
+        """Some lanes of two vectors, or of one."""
+        return self.shuffle_vector(a, a if b is None else b, _constants(lanes))
+
+    def intrinsic(self, name: str, result, args, **options):
+        """Calls an intrinsic of LLVM by its name; `%` stands for the kind of vector."""
+        element = args[-1].type.element
+        full = name.replace("%", f"v{LANES}{'f64' if element == ir.DoubleType() else 'f32'}")
+        function = ir.FunctionType(result, [value.type for value in args])
+        return self.call(cgutils.get_or_insert_function(self.module, function, full), args, **options)
+
+    def fused(self, a, b, c):
+        """a b + c, rounded once."""
+        return self.intrinsic("llvm.fma.%", a.type, [a, b, c])
+
+    def parts(self, value):
+        """The values in a tuple."""
+        return cgutils.unpack_tuple(self.builder, value)
+
+    def pack(self, parts):
+        """A tuple, of the type of the result."""
+        return self.context.make_tuple(self.builder, self.result, parts)
+
+
+def _constants(lanes):
+    return ir.Constant(ir.VectorType(ir.IntType(32), len(lanes)), lanes)
+
+
+def instruction(result):
+    """Decorates a function (code, *values) that emits the code of an intrinsic; `result` makes its type from those of
+    the arguments. Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at compile time."""
+
+    def decorate(emit):
+        _, *parameters = inspect.signature(inspect.unwrap(emit)).parameters.values()
+        notes = [str(parameter.annotation) for parameter in parameters]
+
+        def typed(typing, *kinds):
+            given = result(*kinds)
+            taken = [types.intp if note == "index" else kind for note, kind in zip(notes, kinds)]
+
+            def code(context, builder, signature, args):
+                values = [kind.literal_value if note == "literal" else a for note, kind, a in zip(notes, kinds, args)]
+                out = inspect.unwrap(emit)(Code(context, builder, kinds, given), *values)
+                return context.get_dummy_value() if out is None else out
+
+            return given(*taken), code
+
+        first = inspect.Parameter("typing", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        typed.__signature__ = inspect.Signature([first, *parameters])  # type: ignore[attr-defined]
+        typed.__name__, typed.__doc__ = emit.__name__, emit.__doc__
+        return intrinsic(prefer_literal="literal" in notes)(typed)
+
+    return decorate

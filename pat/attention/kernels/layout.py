@@ -1,0 +1,218 @@
+"""What the kernels work on: the inputs of a call and scratch. Tuples of arrays outside, of pointers inside.
+
+What works on pointers counts no references (a fifth of the time otherwise); the caller keeps the arrays.
+"""
+
+from __future__ import annotations
+
+from collections import namedtuple
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import types
+
+from .emit import LANES, compiled, instruction
+from .vectors import from_index
+
+BLOCK = 16
+"""Alpha pixels that are processed together, step by step."""
+
+LAYOUT = (
+    ("sample_count", "integer", "pixel"),
+    ("index", "integer", "sample"),  # which of the samples this is, of those that count
+    ("cell", "integer", "sample"),  # the upper left pixel of the four around it
+    ("tap", "integer", "sample"),  # its first tap
+    ("x", "number", "sample"),
+    ("y", "number", "sample"),
+    ("ahead", "number", "sample"),  # where it lies in the cell, along the way that the samples run
+    ("aside", "number", "sample"),  # and across
+    ("score", "number", "sample"),
+    ("weight", "number", "sample"),
+    ("slope", "number", "sample"),  # gradient by the weight
+    ("score_slope", "number", "sample"),
+    ("tap_count", "integer", "pixel"),
+    ("rows", "integer", "tap"),  # the taps' pixels in beta
+    ("by_key", "number", "tap"),  # inner products with the query; in forward then the weights
+    ("by_value", "number", "tap"),  # inner products with the gradient by the output
+    ("query", "number", "channel"),
+    ("upstream", "number", "channel"),
+)
+"""The scratch of a block: name, kind, and one for each what of an alpha pixel."""
+
+Block = namedtuple("Block", [name for name, _, _ in LAYOUT])  # type: ignore[misc]
+
+
+def block_scratch(samples: int, channels: int, number: np.dtype) -> Block:
+    """Room for a block: an array (BLOCK, length) for each line of `LAYOUT`, what belongs to a pixel side by side."""
+    lengths = {"pixel": 1, "sample": samples + LANES, "tap": 4 * samples + 2 * LANES, "channel": channels}
+    ends = {"integer": 0, "number": 0}
+    slices = []
+    for _, kind, each in LAYOUT:
+        slices.append(slice(ends[kind], ends[kind] + lengths[each]))
+        ends[kind] = slices[-1].stop
+    rooms = {kind: np.empty((BLOCK, ends[kind]), dtype) for kind, dtype in (("integer", np.int32), ("number", number))}
+    return Block(*(rooms[kind][:, part] for (_, kind, _), part in zip(LAYOUT, slices)))
+
+
+class Geometry(NamedTuple):
+    """Where the samples of a call lie."""
+
+    points: Any
+    mask: Any
+    fractions: Any
+    samples: int
+    straight: bool
+    nearest: bool
+    alpha_pixels: int
+    shared: bool
+    height: int
+    width: int
+    last_x: Any
+    last_y: Any
+    slack: Any
+
+
+class Call(NamedTuple):
+    """The inputs of a call: images, geometry, bias (if `biased`), and the channels of the query and the value."""
+
+    query: Any
+    key: Any
+    value: Any
+    geometry: Geometry
+    bias: Any
+    biased: bool
+    channels: int
+    value_channels: int
+
+
+class Share(NamedTuple):
+    """Work of one of several callers: pieces of `size` of the alpha pixels first .. last, drawn from a common counter,
+    with scratch of its own."""
+
+    first: int
+    last: int
+    size: int
+    counter: Any
+    block: Any
+
+
+class Outputs(NamedTuple):
+    """Values, statistics (pixel, 4; if `measured`), and logarithms of the sums of exponentials."""
+
+    value: Any
+    statistics: Any
+    logsum: Any
+    measured: bool
+
+
+class Saved(NamedTuple):
+    """What forward found, and the gradients by its outputs. Statistics of pixel p start at `step` p."""
+
+    statistics: Any
+    logsum: Any
+    value_upstream: Any
+    statistics_upstream: Any
+    step: int
+
+
+class Gradients(NamedTuple):
+    """Those that belong to alpha's pixels, and which of them are wanted. points and bias come zeroed."""
+
+    query: Any
+    points: Any
+    bias: Any
+    wants_query: bool
+    wants_points: bool
+    wants_bias: bool
+
+
+class TapList(NamedTuple):
+    """What backward leaves for `scatter`, for each of the alpha pixels from `first` on: the number of its taps, their
+    rows, and their weights in the gradients of key and value."""
+
+    first: int
+    tap_count: Any
+    rows: Any
+    key_weight: Any
+    value_weight: Any
+
+
+class Taps(NamedTuple):
+    """The fields of a block that backward keeps in a `TapList`."""
+
+    tap_count: Any
+    rows: Any
+
+
+class Column(NamedTuple):
+    """A list for each pixel: where the first one's begins, and how far it is to the next."""
+
+    first: Any
+    step: Any
+
+
+# ---- from arrays to pointers ---------------------------------------------------------------------
+
+
+def _pointed(kind):
+    """The type of what `pointers` makes of a type."""
+    if isinstance(kind, types.Array):
+        first = types.CPointer(kind.dtype)
+        return first if kind.ndim == 1 else types.NamedTuple([first, types.intp], Column)
+    if isinstance(kind, types.BaseTuple):
+        parts = [_pointed(part) for part in kind.types]
+        return types.BaseTuple.from_types(parts, getattr(kind, "instance_class", None))
+    return kind
+
+
+def _point(code, kind, value):
+    if isinstance(kind, types.Array):
+        array = code.context.make_array(kind)(code.context, code.builder, value)
+        if kind.ndim == 1:
+            return array.data
+        size = code.context.get_constant(types.intp, kind.dtype.bitwidth // 8)
+        return _tuple(code, kind, [array.data, code.sdiv(code.parts(array.strides)[0], size)])
+    if isinstance(kind, types.BaseTuple):
+        return _tuple(code, kind, [_point(code, *part) for part in zip(kind.types, code.parts(value))])
+    return value
+
+
+def _tuple(code, kind, parts):
+    return code.context.make_tuple(code.builder, _pointed(kind), parts)
+
+
+@instruction(_pointed)
+def pointers(code, arrays):
+    """A tuple with pointers for flat arrays and a `Column` for arrays of two axes, in tuples within it, too."""
+    return _point(code, code.kinds[0], arrays)
+
+
+def _first_of_each(block, *_):
+    return types.BaseTuple.from_types([column.types[0] for column in block.types], block.instance_class)
+
+
+@instruction(_first_of_each)
+def pixel_of(code, block, slot: index):
+    """The pointers of one pixel of a block: those of its columns."""
+    columns = [code.parts(column) for column in code.parts(block)]
+    return code.pack([code.gep(first, [code.mul(slot, step)]) for first, step in columns])
+
+
+@instruction(lambda block, other: block)
+def replaced(code, block, other):
+    """A block with the columns that another tuple has by the same name."""
+    names, others = (kind.instance_class._fields for kind in code.kinds)
+    changed = dict(zip(others, code.parts(other)))
+    return code.pack([changed.get(name, column) for name, column in zip(names, code.parts(block))])
+
+
+@compiled
+def of(column, slot):
+    """The list of one pixel."""
+    return from_index(column.first, slot * column.step)
+
+
+@compiled
+def from_pixel(column, slot):
+    """The column from one pixel on."""
+    return Column(of(column, slot), column.step)

@@ -1,0 +1,263 @@
+"""Instructions on eight numbers at a time, and on rows of them.
+
+A *row* is a tuple of n vectors that lie side by side, n being known at compile time; it stays in registers.
+"""
+
+from __future__ import annotations
+
+from llvmlite import ir
+from numba import types
+
+from .emit import LANES, Vector, accumulated, instruction, row_of, vector_of
+
+TAP_BLOCK = 4
+
+
+def _nothing(*_):
+    return types.void
+
+
+def _first(kind, *_):
+    return kind
+
+
+# ---- memory --------------------------------------------------------------------------------------
+
+
+@instruction(lambda counter: counter.dtype)
+def take(code, counter):
+    """Increments the number at a pointer atomically; gives what it was."""
+    return code.atomic_rmw("add", counter, ir.Constant(counter.type.pointee, 1), "monotonic")
+
+
+@instruction(_first)
+def from_index(code, array, i: index):
+    """The pointer to an index."""
+    return code.gep(array, [i])
+
+
+@instruction(accumulated)
+def zero(code, array):
+    """0 in the accumulation type of the numbers at a pointer."""
+    return code.context.get_constant(code.result, 0)
+
+
+@instruction(vector_of)
+def load(code, array, i: index):
+    """The vector at an index, in the accumulation type."""
+    return code.get_wide(code.kinds[0], array, i)
+
+
+@instruction(_nothing)
+def store(code, array, i: index, vector):
+    """Stores a vector at an index."""
+    code.put(code.kinds[0], array, i, vector)
+
+
+@instruction(lambda array, i: accumulated(array))
+def load_one(code, array, i: index):
+    """The number at an index, in the accumulation type."""
+    return code.widen(code.at(array, i), code.kinds[0].dtype, 1)
+
+
+# ---- rows ----------------------------------------------------------------------------------------
+
+
+@instruction(lambda array, i, n: row_of(vector_of(array), n))
+def load_row(code, array, i: index, n: literal):
+    """n vectors from an index on."""
+    return code.pack([code.get_wide(code.kinds[0], array, code.offset(i, k * LANES)) for k in range(n)])
+
+
+@instruction(lambda array, starts, i: row_of(vector_of(array), starts.count))
+def gather_row(code, array, starts, i: index):
+    """The vector at an index from each of some starts on."""
+    return code.pack([code.get_wide(code.kinds[0], array, code.add(start, i)) for start in code.parts(starts)])
+
+
+@instruction(_nothing)
+def store_row(code, array, i: index, row):
+    """Stores a row from an index on."""
+    for k, vector in enumerate(code.parts(row)):
+        code.put(code.kinds[0], array, code.offset(i, k * LANES), vector)
+
+
+@instruction(lambda row, n: row_of(row.dtype, n))
+def extend_row(code, row, n: literal):
+    """A row with zeros added: n vectors."""
+    vectors = code.parts(row)
+    return code.pack(vectors + [ir.Constant(vectors[0].type, None)] * (n - len(vectors)))
+
+
+@instruction(lambda vector, row, totals: totals)
+def fma_row(code, vector, row, totals):
+    """totals + vector row, each rounded once."""
+    return code.pack([code.fused(vector, a, b) for a, b in zip(code.parts(row), code.parts(totals))])
+
+
+@instruction(lambda row, array, i: row.dtype)
+def dot_row(code, row, array, i: index):
+    """The products of a row with the one at an index, summed lane by lane."""
+    total = None
+    for k, a in enumerate(code.parts(row)):
+        b = code.get_wide(code.kinds[1], array, code.offset(i, k * LANES))
+        total = code.fmul(a, b) if total is None else code.fused(a, b, total)
+    return total
+
+
+@instruction(lambda weights, rows, t, image, channels, c, totals, n: totals)
+def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
+    """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row at image[rows[t + k], c]."""
+    vectors = code.parts(totals)
+    for k in range(0, len(vectors), n):
+        tap = code.offset(t, k // n)
+        weight = code.repeat(code.at(weights, tap))
+        start = code.add(code.mul(code.sext(code.at(rows, tap), channels.type), channels), c)
+        for i in range(n):
+            vector = code.get_wide(code.kinds[3], image, code.offset(start, i * LANES))
+            vectors[k + i] = code.fused(weight, vector, vectors[k + i])
+    return code.pack(vectors)
+
+
+@instruction(lambda row, n: row_of(row.dtype, n))
+def fold_row(code, row, n: literal):
+    """The sum, pair by pair, of the groups of n vectors of a row."""
+    vectors = code.parts(row)
+    groups = [vectors[k : k + n] for k in range(0, len(vectors), n)]
+    while len(groups) > 1:
+        groups = [[code.fadd(a, b) for a, b in zip(*pair)] for pair in zip(groups[::2], groups[1::2])]
+    return code.pack(groups[0])
+
+
+# ---- arithmetic ----------------------------------------------------------------------------------
+
+
+def _elementwise(emit):
+    """The intrinsic of vectors of one kind that gives another one of it."""
+    return instruction(_first)(emit)
+
+
+add = _elementwise(lambda code, a, b: code.fadd(a, b))
+sub = _elementwise(lambda code, a, b: code.fsub(a, b))
+mul = _elementwise(lambda code, a, b: code.fmul(a, b))
+add_int = _elementwise(lambda code, a, b: code.add(a, b))
+mul_int = _elementwise(lambda code, a, b: code.mul(a, b))
+minimum_int = _elementwise(lambda code, a, b: code.select(code.icmp_signed("<", a, b), a, b))
+minimum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered("<", a, b), a, b))
+maximum = _elementwise(lambda code, a, b: code.select(code.fcmp_ordered(">", a, b), a, b))
+"""Where either number is NaN, minimum and maximum are that of b."""
+fma = _elementwise(lambda code, a, b, c: code.fused(a, b, c))
+"""a b + c, rounded once."""
+exponentials64 = _elementwise(lambda code, a: code.intrinsic("llvm.exp.%", a.type, [a]))
+
+
+@_elementwise
+def keep_above(code, a, limit, b):
+    """The numbers of b; 0 where those of a are below the limit."""
+    return code.select(code.fcmp_ordered("<", a, limit), ir.Constant(b.type, None), b)
+
+
+@_elementwise
+def two_to(code, a):
+    """2 to the power of whole numbers in float32."""
+    whole = ir.VectorType(ir.IntType(32), LANES)
+    exponent = code.add(code.fptosi(a, whole), ir.Constant(whole, [127] * LANES))
+    return code.bitcast(code.shl(exponent, ir.Constant(whole, [23] * LANES)), a.type)
+
+
+@instruction(Vector)
+def splat(code, number):
+    """A vector of one number repeated."""
+    return code.repeat(number)
+
+
+@instruction(lambda a: Vector(types.int32))
+def truncated(code, a):
+    """A vector's numbers towards 0, as int32."""
+    return code.fptosi(a, ir.VectorType(ir.IntType(32), LANES))
+
+
+@instruction(lambda whole, like: like)
+def converted(code, whole, like):
+    """A vector of int32 in the type of another."""
+    return code.sitofp(whole, like.type)
+
+
+@instruction(lambda a: a.scalar)
+def total(code, a):
+    """The sum of a vector's numbers."""
+    nothing = ir.Constant(a.type.element, 0.0)
+    return code.intrinsic("llvm.vector.reduce.fadd.%", a.type.element, [nothing, a], fastmath=["reassoc"])
+
+
+@instruction(lambda a: a.scalar)
+def largest(code, a):
+    """The largest of a vector's numbers."""
+    return code.intrinsic("llvm.vector.reduce.fmax.%", a.type.element, [a], fastmath=["reassoc"])
+
+
+@instruction(_nothing)
+def add_totals(code, array, i: index, a, b, c, d):
+    """Adds the sums of four vectors to four numbers side by side."""
+
+    def pairs(p, q):
+        even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
+        return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, odd))
+
+    v = pairs(pairs(a, b), pairs(c, d))
+    sums = code.fadd(code.shuffle(v, None, [0, 1, 2, 3]), code.shuffle(v, None, [4, 5, 6, 7]))
+    code.put(code.kinds[0], array, i, code.fadd(code.get(code.kinds[0], array, i, TAP_BLOCK), sums))
+
+
+# ---- four numbers of each of eight places --------------------------------------------------------
+
+FOURS = [[0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]]
+PAIRS = [[0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]]
+"""Shuffles that transpose a 4 by 4 block in each half of four vectors."""
+
+
+def _transpose(code, a, b, c, d):
+    (ab_low, ab_high), (cd_low, cd_high) = ([code.shuffle(p, q, how) for how in FOURS] for p, q in ((a, b), (c, d)))
+    return [code.shuffle(p, q, how) for p, q in ((ab_low, cd_low), (ab_high, cd_high)) for how in PAIRS]
+
+
+@instruction(lambda array, starts, i: row_of(Vector(array.dtype), 4))
+def load_fours(code, array, starts, i: index):
+    """Four vectors, the k-th of array[start + k] for the `LANES` starts at an index."""
+
+    def four(k):
+        return code.get(code.kinds[0], array, code.at(starts, code.offset(i, k)), 4)
+
+    halves = [code.shuffle(four(k), four(k + 4), [*range(LANES)]) for k in range(4)]
+    return code.pack(_transpose(code, *halves))
+
+
+@instruction(_nothing)
+def add_fours(code, array, starts, i: index, a, b, c, d):
+    """Adds the numbers of four vectors to array[start + k], k from 0 to 3, for the `LANES` starts at an index,
+    in their order. By twos: what the next start touches is the second two of this one."""
+    fours = _transpose(code, a, b, c, d)
+    for k in range(LANES):
+        start = code.at(starts, code.offset(i, k))
+        for half in range(2):
+            lane = 2 * half + k // 4 * 4
+            number = code.shuffle(fours[k % 4], None, [lane, lane + 1])
+            place = code.offset(start, 2 * half)
+            code.put(code.kinds[0], array, place, code.fadd(code.get(code.kinds[0], array, place, 2), number))
+
+
+@instruction(_nothing)
+def store_four(code, array, i: index, number, offsets):
+    """array[i + k] = number + offsets[k], k from 0 to 3."""
+    numbers = shifts = ir.Constant(ir.VectorType(number.type, 4), ir.Undefined)
+    for k, shift in enumerate(code.parts(offsets)):
+        shift = code.context.cast(code.builder, shift, code.kinds[3].dtype, code.kinds[0].dtype)
+        numbers = code.insert_element(numbers, number, ir.IntType(32)(k))
+        shifts = code.insert_element(shifts, shift, ir.IntType(32)(k))
+    code.put(code.kinds[0], array, i, code.builder.add(numbers, shifts))
+
+
+@instruction(lambda number: types.int16)
+def half_bits(code, number):
+    """float32 to the bits of float16, to nearest even."""
+    return code.bitcast(code.fptrunc(number, ir.HalfType()), ir.IntType(16))

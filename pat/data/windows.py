@@ -1,0 +1,169 @@
+"""Rendered scenes on disk, their views, and windows cut from them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+from zipfile import BadZipFile
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom.camera import Camera
+from arraygeom.pixels import HW, map_homogeneous, pixel_grid, resize_matrix
+from arraygeom.pose import Pose
+from arraygeom.rig import Rig
+from arraygeom.sampling import sample
+from arraygeom.undistortion import pinhole_view, resampled
+from pat.synthesis.rendered import RENDER_FILE, Rendered, is_rendered
+
+
+def scene_folders(root: str | Path) -> list[Path]:
+    """The complete scenes in a folder of a job, of scenes, or a scene itself, in order of their names.
+
+    Raises FileNotFoundError for no such folder, ValueError where there is no scene, or an incomplete one.
+    """
+    root = Path(root)
+    if not root.is_dir():
+        raise FileNotFoundError(f"{root}: no such folder: check the path")
+    if is_rendered(root):
+        return [root]
+    inside = root / "scenes" if (root / "scenes").is_dir() else root
+    folders = sorted(f for f in inside.iterdir() if f.is_dir() and not f.name.startswith("."))
+    if not any(is_rendered(f) for f in folders):
+        raise ValueError(f"{root}: holds no rendered scene: make some with 'pat render CONFIG --scenes N --out {root}'")
+    for folder in folders:
+        if not is_rendered(folder):
+            raise ValueError(f"{folder}: is not a whole scene (no {RENDER_FILE}): remove it and run 'pat render' again")
+    return folders
+
+
+@contextmanager
+def reading(folder: Path) -> Iterator[None]:
+    """Errors of what is read name the folder and what to do."""
+    try:
+        yield
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, TypeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise ValueError(f"{folder}: cannot be read ({reason}): remove it and run 'pat render' again") from None
+
+
+def scene_rig(folder: Path) -> Rig:
+    """The cameras of a scene. Raises ValueError if they cannot be read, or are not calibrated."""
+    with reading(folder):
+        return Rendered(folder).rig
+
+
+class RenderedView(NamedTuple):
+    """An image in linear light, the depth of its pixels (metres; NaN where the camera sees nothing), its camera."""
+
+    rgb: Float[Tensor, "3 h w"]
+    depth: Float[Tensor, "h w"]
+    camera: Camera
+
+
+def read_view(folder: Path, name: str) -> RenderedView:
+    """The first frame of a camera, as rendered. Raises ValueError, naming the folder, for one that cannot be used."""
+    with reading(folder):
+        frame, camera = Rendered(folder).frame(name), Rendered(folder).rig[name]
+    if not isinstance(camera, Camera):
+        raise ValueError(f"{folder}: camera '{name}' is not calibrated")
+    hw = (frame.depth.shape[-2], frame.depth.shape[-1])
+    if hw != camera.hw or frame.rgb.shape[1:] != frame.depth.shape:
+        raise ValueError(
+            f"{folder}: the image of '{name}' is {hw[1]}x{hw[0]}, its rig says {camera.hw[1]}x{camera.hw[0]}: "
+            "remove it and run 'pat render' again"
+        )
+    return RenderedView(frame.rgb, frame.depth, camera.to(torch.float64))
+
+
+def pinhole_of(camera: Camera) -> Camera:
+    """The camera itself, or its pinhole view if it has a lens model."""
+    return camera if camera.distortion is None else pinhole_view(camera)
+
+
+def undistorted(view: RenderedView) -> RenderedView:
+    """The view resampled to its pinhole camera, if it has a lens model."""
+    if view.camera.distortion is None:
+        return view
+    pinhole = pinhole_of(view.camera)
+    rgb = resampled(view.rgb, view.camera, pinhole, extended=True).values[0].clamp(min=0)
+    depth = resampled(view.depth[None], view.camera, pinhole, interpolation="nearest")
+    return RenderedView(rgb, torch.where(depth.valid[0], depth.values[0, 0], torch.nan), pinhole)
+
+
+def window(view: RenderedView, top: int, left: int, size: HW, hw: HW) -> RenderedView:
+    """A window of a view, reduced (or enlarged) to `hw`. Beyond the image its edge is repeated, without depth."""
+    rows, columns = (torch.arange(n) + start for n, start in zip(size, (top, left)))
+    h, w = view.camera.hw
+    inside = ((rows >= 0) & (rows < h))[:, None] & (columns >= 0) & (columns < w)
+    rows, columns = rows.clamp(0, h - 1)[:, None], columns.clamp(0, w - 1)
+    rgb = reduced(view.rgb[:, rows, columns][None], hw)[0]
+    depth = reduced_depth(torch.where(inside, view.depth[rows, columns], torch.nan)[None], hw)[0]
+    return RenderedView(rgb, depth, view.camera.crop(top, left, size).resize(hw))
+
+
+def reduced(rgb: Float[Tensor, "n c h w"], hw: HW) -> Float[Tensor, "n c h2 w2"]:
+    """Cubic (a = -0.5, antialiased) reduction of linear light, which stays above zero."""
+    if rgb.shape[-2:] == hw:
+        return rgb
+    return interpolate(rgb, hw, mode="bicubic", align_corners=False, antialias=True).clamp(min=0)
+
+
+def reduced_depth(depth: Float[Tensor, "n h w"], hw: HW) -> Float[Tensor, "n h2 w2"]:
+    """Depth at the new pixels' centres: inverse depth interpolated on even surfaces, the nearest pixel's at edges."""
+    old = (depth.shape[-2], depth.shape[-1])
+    if old == hw:
+        return depth
+    back = resize_matrix(hw, old)
+    x = map_homogeneous(back[:2], pixel_grid(hw, dtype=torch.float64)).to(depth)[None]
+    between = 1 / sample(1 / depth[:, None], x).values[:, 0]
+    nearest = sample(depth[:, None], x, interpolation="nearest").values[:, 0]
+    even = (between / nearest - 1).abs() < 0.01
+    return torch.where(even, between, nearest)
+
+
+def select(rig: Rig, index: int) -> Rig:
+    """One rig of a batch."""
+
+    def chosen(camera: Camera) -> Camera:
+        lens = camera.distortion
+        lens = None if lens is None else replace(lens, coefficients=lens.coefficients[index])
+        pose = Pose(camera.R[index], camera.t[index])
+        return camera.replace(K=camera.K[index], cam_from_world=pose, distortion=lens)
+
+    cameras = {name: chosen(c) for name, c in rig.cameras.items() if isinstance(c, Camera)}
+    return rig.replace(cameras=cameras, depth=tuple(d[index] for d in rig.depth))
+
+
+def stacked(rigs: list[Rig]) -> Rig:
+    """A batch of rigs of the same cameras. Raises ValueError where sizes or names differ."""
+    first = rigs[0]
+    for rig in rigs[1:]:
+        same_cameras(first, rig)
+    depth = tuple(torch.stack([rig.depth[i] for rig in rigs]) for i in (0, 1))
+    return first.replace(cameras={name: stack_cameras([r[name] for r in rigs]) for name in first.names}, depth=depth)
+
+
+def stack_cameras(cameras: list[Camera]) -> Camera:
+    """One camera with a batch axis."""
+    first = cameras[0]
+    lens = first.distortion
+    if lens is not None:
+        lenses = [c.distortion for c in cameras if c.distortion is not None]
+        lens = replace(lens, coefficients=torch.stack([d.coefficients for d in lenses]))
+    pose = Pose(torch.stack([c.R for c in cameras]), torch.stack([c.t for c in cameras]))
+    return first.replace(K=torch.stack([c.K for c in cameras]), cam_from_world=pose, distortion=lens)
+
+
+def same_cameras(one: Rig, other: Rig) -> None:
+    """Raises ValueError unless two rigs have the same cameras with images of the same sizes."""
+    sizes = [{name: f"{c.hw[1]}x{c.hw[0]}" for name, c in rig.cameras.items()} for rig in (one, other)]
+    if sizes[0] != sizes[1]:
+        shown = [", ".join(f"{name} {wh}" for name, wh in s.items()) for s in sizes]
+        raise ValueError(f"has images of other sizes than the first ({shown[1]}; first: {shown[0]}): one rig a folder")

@@ -1,0 +1,122 @@
+"""Each file is read and developed once, and each field evaluated once for every pixel: whole frames, tiles, sequences."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+
+import pat.fusion.tiles
+import pat.fusion.views
+from arraygeom import Camera, Distortion, Epipolar, Pose, Rig, Sensor, intrinsics
+from pat.fusion.fuse import fuse
+from pat.fusion.sequence import ImageFiles, fuse_sequence
+from pat.fusion.tiles import REACH
+from pat.fusion.views import ViewFiles, Views
+from pat.media.images import write_image
+from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
+from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.pieces import tiles_of
+
+HW = (64, 96)
+SMALL = {"widths": (8, 8, 8, 8)}
+
+
+def rig_of(names, *, lens=False, places=None, **sensor):
+    """Alpha first, the others 10 cm times their place to the right of it."""
+    distortion = Distortion("brown-conrady", torch.tensor([-0.05, 0, 0, 0], dtype=torch.float64)) if lens else None
+    alpha = Camera(K=intrinsics(100.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=distortion)
+    steps = places or range(len(names))
+    moved = {n: Pose(alpha.R, alpha.t.new_tensor([-0.1 * i, 0, 0])) for n, i in zip(names, steps)}
+    return Rig({n: alpha.replace(cam_from_world=p, sensor=Sensor(**sensor)) for n, p in moved.items()}, depth=(1, 8))
+
+
+def smooth(channels, seed):
+    rough = torch.rand(1, channels, 12, 18, generator=torch.Generator().manual_seed(seed))
+    return torch.nn.functional.interpolate(rough, HW, mode="bicubic").clamp(0, 1)[0]
+
+
+@pytest.fixture
+def reads(monkeypatch):
+    """How often each file was read, and how often anything was developed."""
+    count = Counter()
+
+    def counted(name):
+        real = getattr(pat.fusion.views, name)
+
+        def call(first, *args, **kwargs):
+            count[str(first) if name == "read_image" else name] += 1
+            return real(first, *args, **kwargs)
+
+        return call
+
+    for name in ("read_image", "develop"):
+        monkeypatch.setattr(pat.fusion.views, name, counted(name))
+    return count
+
+
+@pytest.mark.parametrize(
+    ("bands", "lens", "places"), [((1, 3), False, None), ((1, 3), True, None), ((1, 1, 1, 1), True, [0, 1, 1, 2])]
+)
+def test_each_file_is_read_and_developed_once(bands, lens, places, reads, tmp_path):
+    torch.manual_seed(0)
+    names = "abcd"[: len(bands)]
+    rig, files = rig_of(names, lens=lens, places=places), {n: tmp_path / f"{n}.png" for n in names}
+    for i, (name, channels) in enumerate(zip(names, bands)):
+        write_image(files[name], smooth(channels, i))
+    network = BandwisePAT(BandwisePATConfig(**SMALL)) if len(bands) > 2 else GuidedPAT(GuidedPATConfig(**SMALL))
+    images = ViewFiles(rig, files, alpha="a")
+    frame = fuse(network.eval(), images.developed, images, alpha="a", match_levels=True)
+    assert frame.image.shape == (3, *HW)
+    assert reads == {**dict.fromkeys(map(str, files.values()), 1), "develop": len(names)}
+
+
+def test_each_file_of_a_sequence_is_read_once(reads, tmp_path):
+    torch.manual_seed(0)
+    rig = rig_of("ab", frame_rate=30.0)
+    rig = rig.with_camera("b", rig["b"].replace(sensor=Sensor(frame_rate=10.0)))
+    files = {"a": [tmp_path / f"a{i}.png" for i in range(9)], "b": [tmp_path / f"b{i}.png" for i in range(3)]}
+    for i, file in enumerate(files["a"] + files["b"]):
+        write_image(file, smooth(1 if file.name.startswith("a") else 3, i))
+    frames = {name: ImageFiles(paths, rig, name, alpha="a") for name, paths in files.items()}
+    network = GuidedPAT(GuidedPATConfig(**SMALL)).eval()
+    assert len(list(fuse_sequence(network, rig, frames, alpha="a", match_levels=True))) == 9
+    assert set(reads.values()) == {1, 12}
+    assert reads["develop"] == 12
+
+
+class Counted:
+    """A field that counts the pixels at which it is asked, by position."""
+
+    def __init__(self):
+        self.asked = Counter()
+
+    def __call__(self, pair, x):
+        self.asked.update(map(tuple, np.asarray(x.reshape(-1, 2))))
+        return Epipolar()(pair, x)
+
+
+@pytest.mark.parametrize("tiled", [False, True])
+def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
+    torch.manual_seed(0)
+    if tiled:
+        monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(HW, 32, REACH)))
+    network, field = GuidedPAT(GuidedPATConfig(**SMALL)).eval(), Counted()
+    fuse(network, rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}, alpha="a", field=field)
+    pixels = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0}
+    blocks = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0.5}
+    assert set(pixels.values()) == set(blocks.values()) == {1}
+    assert (len(pixels), len(blocks)) == (HW[0] * HW[1], HW[0] * HW[1] // 4)
+
+
+def test_views_name_what_is_wrong():
+    rig, images = rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}
+    for wrong, message in (
+        ({"b": images["b"]}, "no image of alpha, 'a'"),
+        ({"a": images["a"]}, "no image of any other camera than alpha"),
+        (images | {"c": images["b"]}, "no camera 'c'"),
+        (images | {"b": images["b"][:, :-1]}, "the image of 'b' is 96x63, the rig says 96x64"),
+        (images | {"b": images["b"] * torch.nan}, "NaN or infinite"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Views.of(rig, wrong, alpha="a")
