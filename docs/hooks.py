@@ -8,7 +8,7 @@ import json
 import os
 import re
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 ROOT = Path(__file__).parents[1]
 MISSING = "*(not made yet)*"
@@ -59,28 +59,9 @@ def shown(output: dict[str, Any]) -> str:
 
 def commands() -> str:
     """Every command with what its --help says."""
-    from pat.cli.main import Command
+    from pat.cli.main import command_paths
 
-    return "\n".join(f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in paths(Command))
-
-
-def paths(union: Any, before: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
-    """The words of every command that does something, those of groups like `pat rig` in full."""
-    found: list[tuple[str, ...]] = []
-    for part in get_args(union):
-        command, *marks = get_args(part)
-        name = next(m.name for m in marks if hasattr(m, "name"))
-        inner = command.__annotations__.get("command")
-        found += paths(subcommands(command), (*before, name)) if inner else [(*before, name)]
-    return found
-
-
-def subcommands(group: type) -> Any:
-    """The union of a group's commands, whatever marks tyro was given about it."""
-    hint = get_type_hints(group, include_extras=True)["command"]
-    while get_origin(hint) is Annotated:
-        hint = get_args(hint)[0]
-    return hint
+    return "\n".join(f"## pat {' '.join(path)}\n\n```text\n{help_of(path)}\n```\n" for path in command_paths())
 
 
 def help_of(path: tuple[str, ...]) -> str:

@@ -1,4 +1,4 @@
-"""What renders one scene from one seed: layered photographs, or Blender."""
+"""Renderers of one scene from one seed: layered photographs, or Blender."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ class BlenderSettings:
         self.render_settings()
 
     def render_settings(self) -> RenderSettings:
-        """All settings; one thread unless they say otherwise, because a farm has a worker a core."""
+        """All settings; one thread by default, because a farm has a worker a core."""
         given = from_document(RenderSettings, dict(self.settings), "settings")
         changes = {name: getattr(given, name) for name in self.settings}
         return RenderSettings.preset(self.preset, **{"threads": 1, **changes})
@@ -98,7 +98,7 @@ class BlenderSettings:
             lens_for(camera, name)
 
     def images(self, rig: Rig) -> list[HW]:
-        """The sizes of the images of a scene, as often as they are taken."""
+        """The sizes of the images of a scene, one for each exposure."""
         settings = self.render_settings()
         rig = fitted(rig, settings)
         return [rig[shot.camera].hw for shot in shots(rig, settings)]
@@ -142,7 +142,7 @@ class LayeredRenderer:
 
 
 def rig_from_alpha(rig: Rig) -> RigBatch:
-    """A rig as layered scenes want it: batched, the first camera being the world's frame.
+    """The rig as a batch of one, the first camera being the world's frame.
 
     Raises ValueError for cameras that are not calibrated or have a lens, and for a rig without a depth range.
     """
@@ -150,9 +150,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
         if not isinstance(camera, Camera):
             raise ValueError(f"camera '{name}' is not calibrated: rendering needs its K, R and t")
         if camera.distortion is not None:
-            raise ValueError(
-                f"camera '{name}' has a lens model, layered scenes have none: use Blender, or leave it out"
-            )
+            raise ValueError(f"camera '{name}' has a lens model, layered scenes have none: use Blender, or omit it")
     if rig.depth is None:
         raise ValueError("the rig has no depth range: add `depth: [near, far]` in metres to its file")
     near, far = (float(d) for d in rig.depth)
@@ -196,5 +194,5 @@ class BlenderRenderer:
         moving = self.render_settings.duration
         scene = GENERATORS[self.settings.generator](seed, self.rig, moving=moving, **further)
         rendered = render_here(scene, self.rig, out, settings=self.render_settings)
-        said = dict(rendered.about["check"])
-        return SceneCheck(views=said["views"], pairs=said["pairs"], reasons=tuple(said["reasons"]))
+        check = dict(rendered.about["check"])
+        return SceneCheck(views=check["views"], pairs=check["pairs"], reasons=tuple(check["reasons"]))

@@ -1,4 +1,4 @@
-"""The folder of a job: what is done, what is under way, what was given up. Only the standard library."""
+"""The folder of a job: scenes that are done, unfinished, or abandoned. Only the standard library."""
 
 from __future__ import annotations
 
@@ -51,18 +51,18 @@ class Shard:
 
 @dataclass(frozen=True)
 class JobFolder:
-    """Names in a job's folder, and what there is."""
+    """Names in a job's folder, and the scenes in it."""
 
     root: Path
 
     @property
     def scenes(self) -> Path:
-        """Where whole scenes are."""
+        """The folder of complete scenes."""
         return self.root / "scenes"
 
     @property
     def work(self) -> Path:
-        """What is under way."""
+        """The folder of unfinished scenes."""
         return self.root / ".work"
 
     def scene(self, index: int) -> Path:
@@ -70,7 +70,7 @@ class JobFolder:
         return self.scenes / f"{index:06d}"
 
     def quarantined(self, index: int) -> Path:
-        """The folder that says why a scene was given up, whether it is there or not."""
+        """The folder of an abandoned scene, whether it is there or not."""
         return self.root / "quarantine" / f"{index:06d}"
 
     def is_done(self, index: int) -> bool:
@@ -86,12 +86,12 @@ class JobFolder:
         return _numbers(self.root / "quarantine")
 
     def partial(self, index: int, tag: str) -> Path:
-        """A new name for a scene under way."""
+        """A new name for an unfinished scene."""
         self.work.mkdir(parents=True, exist_ok=True)
         return self.work / f"{tag}-{index:06d}-{uuid4().hex[:12]}"
 
     def clean(self, tag: str) -> None:
-        """Remove what a former run of the same shard left half done."""
+        """Remove unfinished scenes of a former run of the same shard."""
         names = (f"{tag}-*", f".{tag}-*", f"log-{tag}-*")
         for left in (path for name in names for path in self.work.glob(name)):
             shutil.rmtree(left) if left.is_dir() else left.unlink()
@@ -138,7 +138,7 @@ class JobFolder:
 
 
 def publish(partial: Path, final: Path) -> bool:
-    """Give a whole folder its name, after all of it is on disk. False if the name was taken; then it is removed."""
+    """Publish a complete folder under its name, after all of it is on disk; False if that is taken: it is removed."""
     for path in [*partial.iterdir(), partial]:
         _sync(path)
     final.parent.mkdir(parents=True, exist_ok=True)
@@ -151,17 +151,6 @@ def publish(partial: Path, final: Path) -> bool:
         return False
     _sync(final.parent)
     return True
-
-
-def write_atomic(path: Path, text: str) -> None:
-    """A file that appears whole or not at all."""
-    temporary = path.with_name(f".{path.name}-{uuid4().hex[:12]}")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        _sync(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _sync(path: Path) -> None:

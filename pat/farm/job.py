@@ -1,4 +1,4 @@
-"""What is rendered: the file that people write, and the manifest that the job's folder keeps of it."""
+"""The configuration of a job: the file that people write, and the manifest in the job's folder."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from typing import Any, Literal
 
 import yaml
 
+from arraygeom.atomic import write_text
 from arraygeom.rig import Rig
 from pat.sensors import seed_for
 from pat.support.schema import from_document, read_yaml, to_document
 from pat.synthesis.check import CheckLimits
 
 from .backends import BlenderSettings, LayeredSettings, Renderer
-from .folders import JobFolder, write_atomic
-from .workshop import Limits
+from .folders import JobFolder
+from .workshop import RetryLimits
 
 MANIFEST = "manifest.yaml"
 FORMAT = "pat-render 1"
@@ -32,7 +33,7 @@ class RenderConfig:
         seed: 1
         backend: blender         # or layered
         blender: {generator: abstract, preset: fast}
-        check: {overlap: 0.3}    # what the self-check asks for
+        check: {overlap: 0.3}    # requirements of the self-check
         limits: {timeout: 300}   # seconds a scene, and how often to try
 
     Settings of the backend that is not used are ignored.
@@ -44,7 +45,7 @@ class RenderConfig:
     layered: LayeredSettings = field(default_factory=LayeredSettings)
     blender: BlenderSettings = field(default_factory=BlenderSettings)
     check: CheckLimits = field(default_factory=CheckLimits)
-    limits: Limits = field(default_factory=Limits)
+    limits: RetryLimits = field(default_factory=RetryLimits)
 
     @classmethod
     def load(cls, path: str | Path) -> RenderConfig:
@@ -59,7 +60,7 @@ class RenderConfig:
             raise ValueError(f"{prefix}{error}") from None
 
     def beside(self, folder: Path) -> RenderConfig:
-        """The same with paths made absolute, as seen from a folder. Raises ValueError for what is not there."""
+        """The same with paths made absolute, as seen from a folder. Raises ValueError for missing ones."""
         photos = tuple(folder / p for p in self.layered.photos)
         blender = (
             self.blender if self.blender.photos is None else replace(self.blender, photos=folder / self.blender.photos)
@@ -84,11 +85,11 @@ class RenderConfig:
         return rig
 
     def renderer(self) -> Renderer:
-        """A renderer that is ready. Raises ValueError for a rig that it cannot serve, or if a library is missing."""
+        """A renderer that is ready. Raises ValueError for a rig that it cannot render, or if a library is missing."""
         return self.settings.renderer(self.load_rig(), self.check)
 
     def scene_bytes(self) -> float:
-        """About how much disk a scene takes: 2 bytes a colour, 4 for depth, and what compression leaves of it."""
+        """Approximate bytes of a scene on disk: 2 a colour and 4 for depth, before compression."""
         return sum(10.0 * h * w for h, w in self.settings.images(self.load_rig())) + 20_000
 
     def identity(self) -> dict[str, Any]:
@@ -106,7 +107,7 @@ class RenderConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """A configuration and the folder it is rendered into, one shard of it; known to its workers from a file."""
+    """A configuration and the folder it is rendered into, one shard of it; workers read it from a file."""
 
     config: RenderConfig
     root: Path
@@ -128,10 +129,8 @@ class Job:
 
     def save(self) -> None:
         """Write the file for workers."""
-        self.folder.work.mkdir(parents=True, exist_ok=True)
-        write_atomic(
-            self.file, json.dumps({"root": str(self.root), "tag": self.tag, "config": to_document(self.config)})
-        )
+        document = {"root": str(self.root), "tag": self.tag, "config": to_document(self.config)}
+        write_text(self.file, json.dumps(document))
 
     @classmethod
     def load(cls, path: Path) -> Job:
@@ -141,7 +140,7 @@ class Job:
         return cls(config=config, root=Path(document["root"]), tag=document["tag"])
 
     def write_manifest(self) -> None:
-        """Write the manifest, or check that the one that is there says the same.
+        """Write the manifest, or check that the existing one is the same.
 
         Raises ValueError if the folder holds scenes of another configuration.
         """
@@ -156,18 +155,18 @@ class Job:
                 )
             return
         manifest = {"format": FORMAT, "made from": json.loads(json.dumps(identity)), "versions": versions()}
-        write_atomic(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
+        write_text(path, yaml.safe_dump(manifest, sort_keys=False, width=120, default_flow_style=None))
 
     def write_table(self, fact_file: str) -> int:
-        """Write `scenes.jsonl` from what the scenes' folders say; how many there are."""
+        """Write `scenes.jsonl` from the files in the scenes' folders; the number of scenes."""
         facts = [(self.folder.scene(i) / fact_file) for i in self.folder.done()]
         lines = [json.dumps(json.loads(path.read_text(encoding="utf-8"))) for path in facts]
-        write_atomic(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
+        write_text(self.root / "scenes.jsonl", "".join(line + "\n" for line in lines))
         return len(lines)
 
 
 def versions() -> dict[str, str]:
-    """Of what takes part in rendering."""
+    """Versions of the packages that rendering uses."""
     found = {"python": platform.python_version()}
     for package in ("arraygeom-pat", "torch", "numpy", "bpy", "OpenEXR"):
         try:

@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from ..support.jobs import Workers, followed
 from .folders import RESERVE, JobFolder, Shard
 from .job import Job, RenderConfig
 from .pools import dask_pool, local_pool
 from .worker import FACTS
-from .workshop import Order, Outcome, worker_command
-
-LINE_EVERY = 30.0
-"""Seconds between lines of progress where there is no terminal."""
+from .workshop import Order, SceneOutcome, worker_command
 
 
 @dataclass
-class Summary:
-    """What a run has done."""
+class RenderSummary:
+    """Scenes made by a run, and what went wrong."""
 
     made: int = 0
     there: int = 0
@@ -31,10 +28,12 @@ class Summary:
     stopped: int = 0
     refusals: int = 0
     crashes: int = 0
+    started: float = field(default_factory=time.monotonic)
     seconds: float = 0.0
 
-    def add(self, outcome: Outcome) -> None:
-        """Count one scene."""
+    def add(self, outcome: SceneOutcome) -> str:
+        """Count a scene; the figures so far."""
+        self.seconds = time.monotonic() - self.started
         self.made += outcome.state == "done"
         self.there += outcome.state == "there"
         self.stopped += outcome.state == "stopped"
@@ -42,6 +41,7 @@ class Summary:
         self.crashes += outcome.crashes
         if outcome.state == "given up":
             self.given_up.append(outcome.index)
+        return f"{self.rate:.0f} an hour, {self.refusals} refused, {self.crashes} crashed"
 
     @property
     def complete(self) -> bool:
@@ -71,12 +71,12 @@ def render(
     shard: Shard = Shard(),  # noqa: B008
     scheduler: str | None = None,
     console: Console | None = None,
-) -> Summary:
+) -> RenderSummary:
     """Render what is missing of `scenes` scenes into the folder `out`.
 
     With `scheduler`, on a Dask cluster (see `pat.farm.pools`), else by `workers` processes. Scenes that are there
     or in quarantine are left alone. Raises ValueError for what cannot be rendered, more scenes than the disk
-    holds, or a folder in use or of another configuration; Stopped if the job cannot go on.
+    holds, or a folder in use or of another configuration; JobError if the job cannot go on.
     """
     if scenes < 1 or workers < 1:
         raise ValueError(f"give at least one scene and one worker, got --scenes {scenes} --workers {workers}")
@@ -86,11 +86,17 @@ def render(
     with job.folder.locked(shard.tag):
         wanted = shard.of(scenes)
         summary, missing, order = _prepared(job, wanted)
-        pool = (
-            local_pool(order, missing, workers) if scheduler is None else dask_pool(order, missing, scheduler, workers)
-        )
+        if scheduler is None:
+            outcomes = local_pool(order, missing, workers)
+        else:
+            outcomes = dask_pool(order, missing, Workers(workers, scheduler))
+        shown: dict[str, Any] = {
+            "title": "scenes",
+            "done": len(wanted) - len(missing),
+            "console": console or Console(stderr=True),
+        }
         try:
-            for _ in _shown(pool, summary, len(wanted), console or Console(stderr=True)):
+            for _ in followed(outcomes, total=len(wanted), status=summary.add, **shown):
                 pass
         finally:
             with suppress(OSError):
@@ -98,8 +104,8 @@ def render(
     return summary
 
 
-def _prepared(job: Job, wanted: list[int]) -> tuple[Summary, list[int], Order]:
-    """What there is, the scenes that are missing, and what workers are told. Raises ValueError."""
+def _prepared(job: Job, wanted: list[int]) -> tuple[RenderSummary, list[int], Order]:
+    """What there is, the scenes that are missing, and the order for the workers. Raises ValueError."""
     folder, config = job.folder, job.config
     folder.clean(job.tag)
     job.write_manifest()
@@ -110,7 +116,7 @@ def _prepared(job: Job, wanted: list[int]) -> tuple[Summary, list[int], Order]:
     check_space(folder, len(missing), size)
     command = worker_command(job.file)
     order = Order(root=job.root, tag=job.tag, command=command, limits=config.limits, scene_bytes=size)
-    return Summary(there=len(done & set(wanted)), given_up=sorted(given_up & set(wanted))), missing, order
+    return RenderSummary(there=len(done & set(wanted)), given_up=sorted(given_up & set(wanted))), missing, order
 
 
 def check_space(folder: JobFolder, scenes: int, scene_bytes: float) -> None:
@@ -122,27 +128,3 @@ def check_space(folder: JobFolder, scenes: int, scene_bytes: float) -> None:
             f"{scenes} more scenes of about {scene_bytes / 1e6:.1f} MB need {need / 1e9:.1f} GB and {folder.root} has "
             f"{free / 1e9:.1f} GB free: {fits} would fit; free space, ask for fewer --scenes, or another --out"
         )
-
-
-def _shown(outcomes: Iterator[Outcome], summary: Summary, total: int, console: Console) -> Iterator[Outcome]:
-    """The outcomes, counted in `summary` and shown as they come."""
-    started = told = time.monotonic()
-    columns = (BarColumn(), MofNCompleteColumn(), TimeElapsedColumn(), TextColumn("{task.description}"))
-    done = summary.there + len(summary.given_up)
-    with Progress(*columns, console=console, disable=not console.is_terminal, transient=True) as bar:
-        task = bar.add_task("", total=total, completed=done)
-        for outcome in outcomes:
-            summary.add(outcome)
-            summary.seconds = time.monotonic() - started
-            done += 1
-            bar.update(task, completed=done, description=_status(summary, total - done))
-            if not console.is_terminal and time.monotonic() - told > LINE_EVERY:
-                told = time.monotonic()
-                console.print(f"{done} of {total}: {_status(summary, total - done)}", soft_wrap=True, highlight=False)
-            yield outcome
-
-
-def _status(summary: Summary, left: int) -> str:
-    hours = left / summary.rate if summary.rate else float("nan")
-    eta = f"{hours:.1f} h left" if hours > 1 else f"{60 * hours:.0f} min left"
-    return f"{summary.rate:.0f} scenes/h, {eta}, {summary.refusals} refused, {summary.crashes} crashed"

@@ -1,4 +1,4 @@
-"""What the folder of a job holds, in a few lines."""
+"""Summary of the folder of a job, in a few lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .worker import FACTS
 
 
 def summarise(root: Path) -> str:
-    """Scenes, images, disk, time and memory, refusals, and what was given up. Raises ValueError if there is none."""
+    """Scenes, images, disk, time and memory, refusals, and abandoned scenes. Raises ValueError if there is none."""
     folders = scene_folders(root)
     rig = scene_rig(folders[0])
     size = sum(file.stat().st_size for folder in folders for file in folder.iterdir())
@@ -38,4 +38,4 @@ def _of_the_making(facts: Sequence[dict[str, Any]]) -> list[str]:
 
 def _given_up(folder: JobFolder) -> list[str]:
     reasons = {i: json.loads((folder.quarantined(i) / "reason.json").read_text()) for i in folder.given_up()}
-    return [f"given up: scene {i}: {said['reason']}" for i, said in reasons.items()]
+    return [f"given up: scene {i}: {why['reason']}" for i, why in reasons.items()]

@@ -23,7 +23,7 @@ from typing import Any
 from .folders import publish
 
 FACTS = "farm.json"
-"""In every scene's folder: its number, attempt, seed, figures of the self-check, and what it took to make."""
+"""In every scene's folder: its number, attempt, seed, figures of the self-check, and its cost."""
 
 
 def main(job: str) -> None:
@@ -44,7 +44,7 @@ def main(job: str) -> None:
 
 
 class _Server:
-    """What stays from scene to scene: the job, and a renderer that is ready."""
+    """The job, and a renderer that is ready for its scenes."""
 
     def __init__(self, job: Path):
         from .job import Job
@@ -53,7 +53,7 @@ class _Server:
         self.renderer = self.job.config.renderer()
 
     def answer(self, index: int, attempt: int) -> dict[str, Any]:
-        """Render, check and publish a scene; what to say of it."""
+        """Render, check and publish a scene; the answer about it."""
         folder = self.job.folder
         partial = folder.partial(index, self.job.tag)
         folder.journal("start", index, attempt=attempt)

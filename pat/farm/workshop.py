@@ -1,4 +1,4 @@
-"""One worker process and what to do when it fails. Only the standard library: nothing here imports a renderer."""
+"""One worker process and what to do when it fails. Nothing here imports a renderer."""
 
 from __future__ import annotations
 
@@ -10,19 +10,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal
 
+from ..support.jobs import JobError
 from .folders import RESERVE, JobFolder
 
 State = Literal["done", "there", "given up", "stopped"]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Limits:
-    """How long to try.
+class RetryLimits:
+    """When to give up.
 
     A worker ends after `recycle` scenes, so that nothing it leaks adds up. It has `timeout` seconds for a scene, and
     `start` for its own start. A scene whose self-check refuses it is made from the next seed, `refusals` times; one
@@ -45,7 +47,7 @@ class Limits:
 
 @dataclass(frozen=True, kw_only=True)
 class Order:
-    """What workers of a job are told: where to render, how to start them, how long to try.
+    """What workers of a job need: where to render, how they are started, when to give up.
 
     `command` starts a worker that reads scenes as lines of JSON and answers each with a line (see `worker`).
     """
@@ -53,7 +55,7 @@ class Order:
     root: Path
     tag: str
     command: tuple[str, ...]
-    limits: Limits = field(default_factory=Limits)
+    limits: RetryLimits = field(default_factory=RetryLimits)
     scene_bytes: float = 0.0
 
     @property
@@ -63,8 +65,8 @@ class Order:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Outcome:
-    """What became of a scene. "there": it was done before; "stopped": not tried to the end."""
+class SceneOutcome:
+    """The result of a scene. "there": it was done before; "stopped": not tried to the end."""
 
     index: int
     state: State
@@ -72,10 +74,6 @@ class Outcome:
     crashes: int = 0
     seconds: float = 0.0
     reason: str = ""
-
-
-class Stopped(Exception):
-    """The whole job cannot go on; one line says why."""
 
 
 class Workshop:
@@ -98,13 +96,12 @@ class Workshop:
 
     def close(self) -> None:
         """End the process."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.communicate()
-        self._forget()
+        self._end()
+        if self._log is not None:
+            self._log.unlink(missing_ok=True)
 
-    def make(self, index: int) -> Outcome:
-        """Make a scene unless it is there. Raises Stopped for what would befall every scene."""
+    def make(self, index: int) -> SceneOutcome:
+        """Make a scene unless it is there. Raises JobError for what would happen to every scene."""
         folder, limits = self.order.folder, self.order.limits
         started, crashes, kills, refusals, reason = time.monotonic(), 0, 0, 0, ""
         state: State = "there"
@@ -119,18 +116,18 @@ class Workshop:
             kills += answer["answer"] == "killed"
             state = "done"
             if refusals >= limits.refusals or crashes >= limits.crashes or kills >= limits.kills:
-                folder.give_up(index, reason, self._said(), refusals=refusals, crashes=crashes, kills=kills)
+                folder.give_up(index, reason, self._log_end(), refusals=refusals, crashes=crashes, kills=kills)
                 state = "given up"
                 break
         seconds = time.monotonic() - started
-        return Outcome(
+        return SceneOutcome(
             index=index, state=state, refusals=refusals, crashes=crashes + kills, seconds=seconds, reason=reason
         )
 
     def _ask(self, index: int, attempt: int) -> dict[str, Any]:
-        """One try. Raises Stopped."""
+        """One attempt. Raises JobError."""
         if self.order.folder.free() < RESERVE + 4 * self.order.scene_bytes:
-            raise Stopped(f"the disk of {self.order.root} is full: free space and run the same command again")
+            raise JobError(f"the disk of {self.order.root} is full: free space and run the same command again")
         process = self._started()
         order = {"scene": index, "attempt": attempt}
         try:
@@ -141,7 +138,7 @@ class Workshop:
             return self._dead()
         answer = self._answer(self.order.limits.timeout)
         if answer["answer"] == "stop":
-            raise Stopped(answer["reason"])
+            raise JobError(answer["reason"])
         self._made += 1
         if self._made >= self.order.limits.recycle and self._process is not None:
             self._retire()
@@ -152,9 +149,9 @@ class Workshop:
             self._start()
             answer = self._answer(self.order.limits.start)
             if answer["answer"] == "stop":
-                raise Stopped(answer["reason"])
+                raise JobError(answer["reason"])
             if answer["answer"] in ("crashed", "killed") and not self._may_start_again(answer):
-                raise Stopped(f"workers die when they start: {answer['reason']}")
+                raise JobError(f"workers die when they start: {answer['reason']}")
         return self._process
 
     def _may_start_again(self, answer: dict[str, Any]) -> bool:
@@ -195,24 +192,22 @@ class Workshop:
         return dict(json.loads(line))
 
     def _dead(self) -> dict[str, Any]:
-        """What to say of a process that has ended by itself, or was ended by someone else."""
+        """The answer for a process that has ended by itself, or was ended from outside."""
         assert self._process is not None
         code = self._process.wait()
         self._end()
         if code == -signal.SIGKILL:
             return {"answer": "killed", "reason": "the worker was killed (SIGKILL; out of memory?)"}
         cause = signal.Signals(-code).name if code < 0 else f"exit status {code}"
-        last = [line for line in self._said().splitlines() if line.strip()][-1:]
+        last = [line for line in self._log_end().splitlines() if line.strip()][-1:]
         return {"answer": "crashed", "reason": ": ".join([f"the worker died ({cause})", *last])}
 
     def _retire(self) -> None:
-        """Let the process end in peace."""
+        """Let the process end by itself."""
         assert self._process is not None
-        try:
+        with suppress(subprocess.TimeoutExpired):
             self._process.communicate(timeout=30)
-        except subprocess.TimeoutExpired:
-            self._end()
-        self._process = None
+        self._end()
 
     def _end(self) -> None:
         if self._process is not None:
@@ -220,16 +215,11 @@ class Workshop:
             self._process.communicate()
             self._process = None
 
-    def _said(self) -> str:
-        """The end of what the last process wrote."""
+    def _log_end(self) -> str:
+        """The end of the last process's log."""
         if self._log is None or not self._log.is_file():
             return ""
         return self._log.read_text(encoding="utf-8", errors="replace")[-20_000:]
-
-    def _forget(self) -> None:
-        self._process = None
-        if self._log is not None:
-            self._log.unlink(missing_ok=True)
 
 
 def worker_command(job: Path) -> tuple[str, ...]:

@@ -31,7 +31,7 @@ from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.video import write_video
 from ..networks.weights import Network, find_weights, load_weights
-from ..support.jobs import HERE, OnError, Report, Task, Workers, run_tasks
+from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from .fuse import fuse
 from .results import ImageFormat, save_frame, view_of
 from .sequence import ImageFiles, KeyColour, KeyFrame, SequenceFusion
@@ -111,7 +111,7 @@ class Batch:
         on_error: OnError = "stop",
         video: float | None = None,
         console: Console | None = None,
-    ) -> Report:
+    ) -> JobReport:
         """Fuse all frames. With `video`, its frames a second, fused.mp4 is written when all are there.
 
         Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings.

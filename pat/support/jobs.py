@@ -1,45 +1,47 @@
-"""Many tasks on many machines: each leaves a file that appears whole, and is not repeated if that file is there.
+"""Many tasks on many machines: each writes a file atomically, and is not repeated if that file is there.
 
-In this process, in local processes, or on the workers of a Dask scheduler. A worker that is killed costs the tasks it
-was at, which others repeat; a job that is killed as a whole is begun again and does only what is not there.
+In this process, in local processes, or on the workers of a Dask scheduler. If a worker is killed, others repeat the
+tasks it was running; a job that is killed as a whole and started again does only what is missing. Torch is imported
+only where tasks run.
 """
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 
-import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 if TYPE_CHECKING:
-    from distributed import Client
+    from distributed import Client, Future
 
+T = TypeVar("T")
 OnError = Literal["stop", "skip"]
 
 
 class Task(NamedTuple):
-    """Work that makes the file `makes` (and others before it); `run(*given)` must be fit to be pickled."""
+    """Work that writes the file `makes` (and others before it); `run(*given)` must be fit to be pickled."""
 
     makes: Path
     run: Callable[..., None]
     given: tuple[object, ...] = ()
 
 
-class Outcome(NamedTuple):
-    """What became of a task: the error in one line, or nothing."""
+class TaskOutcome(NamedTuple):
+    """The error of a task in one line, or None."""
 
     makes: Path
     error: str | None
 
 
 @dataclass
-class Report:
+class JobReport:
     """Files made, files that were there already, and the error of each task that failed."""
 
     made: list[Path] = field(default_factory=list)
@@ -54,17 +56,17 @@ class Report:
 
 
 class JobError(ValueError):
-    """A task failed, and the job was to stop then."""
+    """A job cannot or must not go on; what is made stays."""
 
 
 ENVIRONMENT = {"OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1, "OPENBLAS_NUM_THREADS": 1}
 """Of local workers. Not Dask's own, which makes glibc return every freed image to the system at once: half of the
-time of two workers then went into getting the same pages again."""
+time of two workers was then spent on getting the same pages again."""
 
 
 @contextmanager
-def environment_put_back() -> Iterator[None]:
-    """The environment is afterwards as it was: Dask leaves what it tells its workers in their parent too."""
+def environment_restored() -> Iterator[None]:
+    """Restore the environment afterwards: Dask sets the variables of its workers in their parent too."""
     before = dict(os.environ)
     try:
         yield
@@ -78,8 +80,9 @@ def environment_put_back() -> Iterator[None]:
 class Workers:
     """Where tasks run.
 
-    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"); without, `count` processes on this machine, or
-    this process itself for 1. `threads` are torch's in each: results are the same bits for the same number.
+    `scheduler` is the address of a Dask scheduler ("tcp://host:8786"), or "local" for one on this machine with `count`
+    processes; without, `count` processes on this machine, or this process itself for 1. `threads` are torch's in each:
+    results are identical to the bit for the same number.
     """
 
     count: int = 1
@@ -88,16 +91,16 @@ class Workers:
 
     @contextmanager
     def client(self) -> Iterator[Client]:
-        """The Dask client; its local workers are gone afterwards. Raises ValueError if Dask is missing or not there."""
+        """The Dask client; its local workers are gone afterwards. Raises ValueError without Dask or scheduler."""
         try:
             from dask import config
             from distributed import Client, LocalCluster
         except ImportError:
             raise ValueError("several workers need Dask: pip install 'arraygeom-pat[cluster]'") from None
-        if self.scheduler is None:
+        if self.scheduler in (None, "local"):
             options = {"n_workers": self.count, "threads_per_worker": 1, "processes": True, "dashboard_address": None}
             with (
-                environment_put_back(),
+                environment_restored(),
                 config.set({"distributed.nanny.pre-spawn-environ": ENVIRONMENT}),
                 LocalCluster(**options, memory_limit=0) as cluster,
                 Client(cluster) as client,
@@ -124,40 +127,67 @@ def run_tasks(
     on_error: OnError = "stop",
     title: str = "working",
     console: Console | None = None,
-) -> Report:
-    """Run all tasks; with `resume`, only those whose file is not there. Without, such files are removed first.
+) -> JobReport:
+    """Run all tasks; with `resume`, only those whose file is missing. Without, such files are removed first.
 
-    What goes wrong in a task (ValueError, OSError) is reported with its file's name and skipped, or stops the job: then
-    JobError is raised, and what is made stays.
+    An error of a task (ValueError, OSError) is reported with its file's name and the task skipped, or it stops the
+    job: then JobError is raised, and what is made stays.
     """
     if not resume:
         for task in tasks:
             task.makes.unlink(missing_ok=True)
-    kept = [t.makes for t in tasks if t.makes.exists()]
-    report = Report(kept=kept)
-    there = set(kept)
+    report = JobReport(kept=[t.makes for t in tasks if t.makes.exists()])
+    there = set(report.kept)
     left = [t for t in tasks if t.makes not in there]
+    console = console or Console(stderr=True)
     run = _in_this_process if workers.count == 1 and workers.scheduler is None else _on_dask
-    with _bar(console) as bar:
-        shown = bar.add_task(title, total=len(tasks), completed=len(kept))
-        for outcome in run(left, workers):
-            bar.advance(shown)
-            if outcome.error is None:
-                report.made.append(outcome.makes)
-                continue
-            report.failed[outcome.makes] = outcome.error
-            if on_error == "stop":
-                raise JobError(f"{outcome.makes.name}: {outcome.error} ({report}; begin again with --resume)")
-            bar.console.print(f"skipped {outcome.makes.name}: {outcome.error}", style="yellow", markup=False)
+    for outcome in followed(run(left, workers), title=title, total=len(tasks), done=len(there), console=console):
+        if outcome.error is None:
+            report.made.append(outcome.makes)
+            continue
+        report.failed[outcome.makes] = outcome.error
+        if on_error == "stop":
+            raise JobError(f"{outcome.makes.name}: {outcome.error} ({report}; begin again with --resume)")
+        console.print(f"skipped {outcome.makes.name}: {outcome.error}", style="yellow", markup=False)
     return report
 
 
-def _bar(console: Console | None) -> Progress:
+LINE_EVERY = 30.0
+"""Seconds between lines of progress where there is no terminal."""
+
+
+def followed(
+    outcomes: Iterable[T],
+    *,
+    title: str,
+    total: int,
+    done: int = 0,
+    console: Console,
+    status: Callable[[T], str] = lambda _: "",
+) -> Iterator[T]:
+    """The outcomes as they come, their number shown: as a bar on a terminal, elsewhere as a line now and then.
+
+    `status` counts an outcome and returns what else to show.
+    """
+    printed = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-    return Progress(*columns, TextColumn("left:"), TimeRemainingColumn(), console=console or Console(stderr=True))
+    further = (TextColumn("left:"), TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
+    with Progress(*columns, *further, console=console, disable=not console.is_terminal) as bar:
+        shown = bar.add_task(title, total=total, completed=done, status="")
+        for outcome in outcomes:
+            done += 1
+            text = status(outcome)
+            bar.update(shown, completed=done, status=text)
+            if not console.is_terminal and time.monotonic() - printed > LINE_EVERY:
+                printed = time.monotonic()
+                line = f"{title}: {done} of {total}" + (f": {text}" if text else "")
+                console.print(line, soft_wrap=True, highlight=False, markup=False)
+            yield outcome
 
 
-def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[Outcome]:
+def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:
+    import torch
+
     before = torch.get_num_threads()
     try:
         for task in tasks:
@@ -166,54 +196,69 @@ def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[Outcom
         torch.set_num_threads(before)
 
 
+def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
+    """Outcomes as they come; a task that kills its workers is an outcome too."""
+    for task, future in completed(attempt, [(task, workers.threads) for task in tasks], workers):
+        yield future.result() if future.status == "finished" else TaskOutcome(task[0].makes, why(future))
+
+
 AHEAD = 4
-"""Tasks handed to each worker before it is done with the first."""
+"""Tasks submitted for each worker at once, so that none of them waits for the next."""
 
 
-def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[Outcome]:
-    """Outcomes as they come. Dask repeats what a dead worker was at; what kills several is an outcome too."""
-    if not tasks:
+def completed(
+    run: Callable[..., object], items: Sequence[tuple[Any, ...]], workers: Workers
+) -> Iterator[tuple[tuple[Any, ...], Future]]:
+    """`run(*item)` of all items on Dask: each item with its future, as they complete.
+
+    Dask repeats what a dead worker was running; what kills several workers completes with an error (see `why`).
+    """
+    if not items:
         return
-    from distributed import as_completed
-
     with workers.client() as client:
-        client.wait_for_workers(1, timeout=60)
-        queue = iter(tasks)
-        task_of = {}
+        from distributed import as_completed
 
-        def submit(task: Task) -> object:
-            future = client.submit(attempt, task, workers.threads, pure=False, retries=0)
-            task_of[future.key] = task
+        client.wait_for_workers(1, timeout=60)
+        queue = iter(items)
+        running = {}
+
+        def submit(item: tuple[Any, ...]) -> Future:
+            future = client.submit(run, *item, pure=False, retries=0)
+            running[future.key] = future, item
             return future
 
         ahead = max(AHEAD * len(client.scheduler_info()["workers"]), 8)
-        first = [submit(task) for _, task in zip(range(ahead), queue)]
-        done = as_completed(first, with_results=False)
-        for future in done:
-            task = task_of.pop(future.key)
-            outcome = future.result() if future.status == "finished" else Outcome(task.makes, _why(future))
-            following = next(queue, None)
-            if following is not None:
-                done.add(submit(following))
-            yield outcome
+        done = as_completed([submit(item) for _, item in zip(range(ahead), queue)], with_results=False)
+        try:
+            for future in done:
+                _, item = running.pop(future.key)
+                following = next(queue, None)
+                if following is not None:
+                    done.add(submit(following))
+                yield item, future
+        finally:
+            client.cancel([future for future, _ in running.values()])
 
 
-def _why(future: object) -> str:
-    error = future.exception()  # type: ignore[attr-defined]
+def why(future: Future) -> str:
+    """Why a future has no result."""
+    error = future.exception()
     return f"its workers died: {error}" if type(error).__name__ == "KilledWorker" else f"{error}"
 
 
-def attempt(task: Task, threads: int) -> Outcome:
+def attempt(task: Task, threads: int) -> TaskOutcome:
     """Run a task, unless a worker that died since has done it; errors of what was given become the outcome."""
+    import torch
+
     if task.makes.exists():
-        return Outcome(task.makes, None)
+        return TaskOutcome(task.makes, None)
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
     try:
         task.run(*task.given)
     except (ValueError, OSError) as error:
-        return Outcome(task.makes, " ".join(str(error).split()))
-    return Outcome(task.makes, None)
+        return TaskOutcome(task.makes, " ".join(str(error).split()))
+    return TaskOutcome(task.makes, None)
 
 
 def cores() -> int:

@@ -1,4 +1,4 @@
-"""Memory of this process: amounts as people write them, and giving back what was freed."""
+"""Memory of this process: amounts as people write them, peaks, and the return of freed memory."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ def give_back() -> None:
 
 
 def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
-    """Look at a process until it ends; the answer waits for that and is the most it had resident, bytes (0: unknown).
+    """Watch a process until it ends; the returned function waits for that and gives its peak resident bytes, or 0.
 
-    What `wait4` tells is no less than what the parent had resident when it started the process.
+    `wait4` would count what the parent had resident when it started the process.
     """
     status, found = Path(f"/proc/{pid}/status"), [0.0]
 

@@ -29,9 +29,10 @@ MOVED |= {
 
 RENAMED = {
     "pat.batch.find_pictures": "pat.fusion.batch.find_images",
-    "pat.demo.report_figure": "pat.systems.demo.report_figure",
+    "pat.demo.report_figure": "pat.systems.demo.save_demo_figure",
     "pat.develop.ViewFiles": "pat.fusion.views.ViewFiles",
     "pat.develop.read_views": "pat.fusion.views.read_views",
+    "pat.fuse.default_field": "arraygeom.fields.default.default_field",
     "pat.fuse.FusedFrame": "pat.fusion.results.Frame",
     "pat.images.from_luma_chroma": "pat.media.colour.from_luma_chroma",
     "pat.images.luminance": "pat.media.colour.luminance",

@@ -16,18 +16,18 @@ import yaml
 T = TypeVar("T")
 
 
-def to_document(value: Any, *, whole: bool = False) -> Any:
+def to_document(value: Any, *, defaults: bool = False) -> Any:
     """Dataclasses as mappings, tuples as lists, paths as text, the rest as it is.
 
-    What is at its default is left out, if not `whole`.
+    Entries at their default are left out, unless `defaults`.
     """
     if dataclasses.is_dataclass(value):
         entries = {f: getattr(value, f.name) for f in dataclasses.fields(value)}
-        return {f.name: to_document(v, whole=whole) for f, v in entries.items() if whole or not _default(f, v)}
+        return {f.name: to_document(v, defaults=defaults) for f, v in entries.items() if defaults or not _default(f, v)}
     if isinstance(value, tuple | list):
-        return [to_document(v, whole=whole) for v in value]
+        return [to_document(v, defaults=defaults) for v in value]
     if isinstance(value, dict):
-        return {k: to_document(v, whole=whole) for k, v in value.items()}
+        return {k: to_document(v, defaults=defaults) for k, v in value.items()}
     return str(value) if isinstance(value, Path) else value
 
 
@@ -40,7 +40,7 @@ def from_document(kind: type[T], document: Any, entry: str = "") -> T:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """What a YAML file holds. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    """The content of a YAML file. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
@@ -52,13 +52,15 @@ def read_yaml(path: str | Path) -> Any:
         raise ValueError(f"{path}: not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}") from None
 
 
-def near(name: object, known: Iterable[str]) -> str:
-    """What to say after an unknown name: the nearest known one, or all of them.
+def near(name: object, known: Iterable[object]) -> str:
+    """The end of a message about an unknown name: the nearest known one, or all of them.
 
     >>> near("nois", ["noise", "clip"])
     "; did you mean 'noise'?"
     """
-    return _hint(name, tuple(known))
+    names = [str(k) for k in known]
+    close = difflib.get_close_matches(str(name), names, 1)
+    return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(names)}"
 
 
 def _default(field: dataclasses.Field[Any], value: Any) -> bool:
@@ -73,7 +75,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
         return _read_dataclass(kind, value, entry)
     if origin is typing.Literal:
         if value not in arguments:
-            raise ValueError(f"{entry}: is {value!r}{_hint(value, arguments)}")
+            raise ValueError(f"{entry}: is {value!r}{near(value, arguments)}")
         return value
     if origin is tuple:
         return _read_tuple(arguments, value, entry)
@@ -90,7 +92,7 @@ def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in fields:
-            raise ValueError(f"{_below(entry, key)}: unknown key{_hint(key, tuple(fields))}")
+            raise ValueError(f"{_below(entry, key)}: unknown key{near(key, fields)}")
     for name, field in fields.items():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and name not in value:
@@ -121,16 +123,16 @@ def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[An
 
 
 def _read_union(arguments: tuple[Any, ...], value: Any, entry: str) -> Any:
-    """The first of several types that fits; if none does, what one that is about as wanted says."""
+    """The first of several types that fits; if none does, the error of one of the same form."""
     if value is None and type(None) in arguments:
         return None
-    said = []
+    errors = []
     for kind in (k for k in arguments if k is not type(None)):
         try:
             return _read(kind, value, entry)
         except ValueError as error:
-            said.append((isinstance(value, dict) == dataclasses.is_dataclass(kind), str(error)))
-    raise ValueError(max(said, key=lambda s: s[0])[1])
+            errors.append((isinstance(value, dict) == dataclasses.is_dataclass(kind), str(error)))
+    raise ValueError(max(errors, key=lambda e: e[0])[1])
 
 
 def _read_plain(kind: Any, value: Any, entry: str) -> Any:
@@ -164,8 +166,3 @@ def _is_number(text: str) -> bool:
 
 def _below(entry: str, key: object) -> str:
     return f"{entry}.{key}" if entry else str(key)
-
-
-def _hint(given: object, known: tuple[Any, ...]) -> str:
-    near = difflib.get_close_matches(str(given), [str(k) for k in known], 1)
-    return f"; did you mean '{near[0]}'?" if near else f"; known here: {', '.join(map(str, known))}"

@@ -15,7 +15,7 @@ import torch
 
 
 def in_parallel(tasks: Sequence[Callable[[], None]]) -> None:
-    """Runs tasks on the threads that torch may use, this one included; raises what any of them raises."""
+    """Run tasks on the threads that torch may use, this one included; an error of any of them is raised."""
     left = iter(tasks)
 
     def work() -> None:

@@ -187,7 +187,7 @@ def _config(values: Any) -> TrainConfig:
 
 def config_text(config: TrainConfig) -> str:
     """The recipe as YAML, every value written out; `parse_config` reads it back."""
-    plain = to_document(config, whole=True)
+    plain = to_document(config, defaults=True)
     kind = next(name for name, (_, made_of) in NETWORKS.items() if type(config.network) is made_of)
     values = plain | {"network": {"kind": kind} | plain["network"]}
     return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=118)
@@ -213,7 +213,7 @@ def command_line(arguments: list[str]) -> TrainConfig:
         ),
         default=base,
         args=arguments,
-        config=(tyro.conf.AvoidSubcommands,),
+        config=(tyro.conf.AvoidSubcommands, tyro.conf.DisallowNone),
     )
 
 

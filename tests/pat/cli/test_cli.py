@@ -1,17 +1,27 @@
 """The command line: it does the main job, and what is wrong is one line and exit status 2."""
 
+import dataclasses
+import functools
 import json
+import re
 import shutil
+import subprocess
+import sys
+import typing
+from pathlib import Path
 
 import pytest
 import torch
 import yaml
 
 from arraygeom import Rig
-from pat.cli.main import main
+from pat.cli.main import Pat, command_paths, main
+from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
+
+ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -170,7 +180,7 @@ def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):
     def interrupted(self):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("pat.cli.main.Demo.run", interrupted)
+    monkeypatch.setattr("pat.cli.fusing.Demo.run", interrupted)
     with pytest.raises(SystemExit) as stop:
         main(["demo"])
     assert stop.value.code == 130
@@ -192,3 +202,167 @@ def test_warnings_are_one_line(small, capsys):
     assert told.startswith("pat: warning: ")
     assert "millimetres" in told
     assert ".py" not in told.replace(str(small), "")
+
+
+def run(*words: str, then: str = "") -> subprocess.CompletedProcess:
+    command = " ".join([sys.executable, "-m", "pat", *words, then])
+    return subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True)
+
+
+@pytest.mark.parametrize("words", [(), ("rig",), ("fuse", "--help"), ("--tyro-print-completion", "bash")])
+def test_help_and_completion_import_no_torch(words):
+    code = f"""
+import sys
+from pat.cli.main import Pat, command_paths, main
+from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
+try: main({list(words)})
+except SystemExit as stop: assert not stop.code
+assert not {{"torch", "numpy", "scipy", "numba", "arraygeom", "rich"}} & set(sys.modules), sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stderr == ""
+    assert "fuse" in done.stdout or "info" in done.stdout
+
+
+@pytest.mark.parametrize("path", [*command_paths()], ids=" ".join)
+def test_every_command_has_help_that_reads_well(path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*path, "--help"])
+    assert stop.value.code == 0
+    text = capsys.readouterr().out
+    first = next(line for line in text.splitlines() if line and not line.startswith(("usage", " ")))
+    assert text.count(first) == 1
+    assert "{None}" not in text
+    assert path == ("train",) or "(default: None)" not in text
+
+
+def test_names_are_those_of_the_package():
+    from arraygeom.fields.default import FIELDS
+    from pat.networks.weights import shipped
+
+    assert tuple(sorted(shipped())) == WEIGHT_NAMES
+    assert tuple(FIELDS) == FIELD_NAMES
+    assert all(dataclasses.is_dataclass(field_named(name)) for name in FIELD_NAMES)
+    assert field_named("auto") is None
+
+
+def test_help_lists_users_tools_before_authors_tools(capsys):
+    with pytest.raises(SystemExit):
+        main([])
+    text = capsys.readouterr().out
+    lines = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
+    assert lines == ["fuse", "show", "explore", "calibrate", "board", "rig", "demo", *Pat.authors]
+    assert all(len(line) <= 120 for line in text.splitlines())
+
+
+def test_the_version_is_printed(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert re.fullmatch(r"arraygeom-pat \d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+def test_commands_that_do_not_exist(capsys):
+    assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
+    assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
+    assert "known here: fuse, show" in fails(["--weights"], capsys)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["fuse", "RIG", "--alpha", "mono"],
+        ["show", "RIG"],
+        ["explore", "RIG", "--no-browser"],
+        ["rig", "show", "RIG"],
+        ["rig", "doctor", "RIG"],
+    ],
+)
+def test_a_camera_given_twice_is_refused_everywhere(command, small, capsys):
+    twice = [a for name in ("mono", "colour", "mono") for a in ("--image", f"{name}={small / 'mono.png'}")]
+    command = [str(small / "rig.yaml") if word == "RIG" else word for word in command]
+    assert fails([*command, *twice], capsys) == "pat: --image: 'mono' is given twice; give it once"
+
+
+def test_other_names_given_twice(small, capsys):
+    twice = ["--frame-rate", "mono=30", "--frame-rate", "mono=25"]
+    assert "--frame-rate: 'mono' is given twice" in fails([*arguments(small), *twice], capsys)
+    sigma = ["rig", "refine", "--rig", "r.yaml", "-o", "x.yaml", "--image", "a=b", "--sigma", "focal=1", "focal=2"]
+    assert "no such rig file" in fails(sigma, capsys)
+    sigma[3] = str(small / "rig.yaml")
+    assert "--sigma: 'focal' is given twice" in fails(sigma, capsys)
+    assert "'mono' is not NAME=NUMBER" in fails([*arguments(small), "--time-offset", "mono"], capsys)
+    assert "'mono=' is not NAME=FILE" in fails([*arguments(small), "--image", "mono="], capsys)
+
+
+def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys):
+    rig = str(small / "rig.yaml")
+    main(["rig", "info", rig])
+    as_argument = capsys.readouterr().out
+    for given in (["--rig", rig], [f"--rig={rig}"]):
+        main(["rig", "info", *given])
+        assert capsys.readouterr().out == as_argument
+    assert "--rig: give a file" in fails(["rig", "info", "--rig"], capsys)
+    for option in ("-o", "--out"):
+        main(["rig", "convert", "--rig", rig, option, str(small / f"{option}.yaml"), "--write-as", "kalibr"])
+    assert (small / "-o.yaml").read_text() == (small / "--out.yaml").read_text()
+    main(["show", "--rig", rig, "-o", str(small / "drawn")])
+    assert (small / "drawn" / "rig.png").is_file()
+    first, second = small / "first", small / "second"
+    fuse = ["fuse", *arguments(small)[3:]]
+    main([*fuse[:1], rig, *fuse[1:], "-o", str(first), "--match-levels", "--no-carry"])
+    main([*fuse, "--rig", rig, "-o", str(second), "--normalise-radiometry", "--no-propagate"])
+    assert (first / "fused.png").read_bytes() == (second / "fused.png").read_bytes()
+
+
+def test_writers_take_o_and_out():
+    """Every command with an option --out takes -o; all but those that write nothing have it."""
+    nothing = {("explore",), ("rig", "info"), ("systems", "list"), ("data", "info")}
+    for path in command_paths():
+        command = functools.reduce(lambda group, word: group.commands[word], path, Pat)
+        spellings = getattr(command, "spellings", {})
+        known = {"-o", "--out"} <= set(spellings) or spellings.get("-o") == "--out"
+        hint = typing.get_type_hints(command, include_extras=True).get("out")
+        assert path in nothing or known or "-o" in typing.get_args(hint)[-1].aliases, path
+
+
+def test_json_is_valid_where_the_rig_sees_to_infinity(small, capsys):
+    main(["rig", "info", str(small / "rig.yaml"), "--depth", "2", "inf", "--json"])
+    document = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(name))
+    assert document["pairs"][0]["depth_step"][1] is None
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (ValueError("two\n  lines"), "pat: two lines"),
+        (MemoryError(), "pat: out of memory"),
+        (KeyError("mono"), "pat: KeyError: 'mono' (--debug shows where)"),
+        (RuntimeError("CUDA\nout"), "pat: RuntimeError: CUDA out (--debug shows where)"),
+        (OverflowError("big"), "pat: OverflowError: big (--debug shows where)"),
+        (RecursionError("deep"), "pat: RecursionError: deep (--debug shows where)"),
+    ],
+)
+def test_errors_are_one_line_and_a_traceback_for_debugging(error, words, monkeypatch, capsys):
+    def failing(self):
+        raise error
+
+    monkeypatch.setattr("pat.cli.fusing.Demo.run", failing)
+    assert words in fails(["demo"], capsys)
+    with pytest.raises(type(error)):
+        main(["demo", "--debug"])
+
+
+def test_a_closed_pipe_is_quiet():
+    done = run("systems", "list", then="| true; exit ${PIPESTATUS[0]}")
+    assert (done.stdout, done.stderr) == ("", "")
+    assert done.returncode in (0, 141)
+    done = run("--help", then="| (exec 0<&-; sleep 1); exit ${PIPESTATUS[0]}")
+    assert (done.stderr, done.returncode) == ("", 141)
+
+
+def test_the_module_can_be_called_as_the_function_that_it_was(capsys):
+    from pat.cli import main as called
+
+    with pytest.raises(SystemExit):
+        called(["--version"])
+    assert "arraygeom-pat" in capsys.readouterr().out

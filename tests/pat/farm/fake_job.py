@@ -6,14 +6,14 @@ from pathlib import Path
 
 from pat.farm.folders import JobFolder, Shard
 from pat.farm.pools import local_pool
-from pat.farm.workshop import Limits, Order
+from pat.farm.workshop import Order, RetryLimits
 
 FAKE = Path(__file__).with_name("fake_worker.py")
 
 
 def order(root: Path, behaviour: dict | None = None, tag: str = "1of1", **limits: float) -> Order:
     command = (sys.executable, str(FAKE), str(root), tag, json.dumps(behaviour or {}))
-    return Order(root=root, tag=tag, command=command, limits=Limits(**limits))
+    return Order(root=root, tag=tag, command=command, limits=RetryLimits(**limits))
 
 
 def main(root: str, scenes: str, workers: str, pause: str) -> None:

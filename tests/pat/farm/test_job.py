@@ -18,9 +18,10 @@ from pat.cli.main import main
 from pat.farm.backends import rig_from_alpha
 from pat.farm.folders import JobFolder, Shard
 from pat.farm.job import Job, RenderConfig
-from pat.farm.run import Summary, check_space, render
+from pat.farm.run import RenderSummary, check_space, render
 from pat.farm.worker import _Server
-from pat.farm.workshop import Stopped
+from pat.farm.workshop import SceneOutcome
+from pat.support.jobs import JobError
 from pat.synthesis.rendered import Rendered
 from tests.pat.farm import kills
 from tests.pat.farm.journals import events, started_after_done
@@ -162,7 +163,7 @@ def test_more_scenes_than_disk_are_refused_before_the_first(config, tmp_path, mo
 def test_a_disk_that_fills_stops_the_job_cleanly(config, tmp_path, monkeypatch):
     monkeypatch.setattr("pat.farm.run.check_space", lambda *_: None)
     monkeypatch.setattr(JobFolder, "free", lambda self: 1000)
-    with pytest.raises(Stopped, match="is full: free space"):
+    with pytest.raises(JobError, match="is full: free space"):
         render(RenderConfig.load(config), scenes=3, out=tmp_path / "data")
     assert (tmp_path / "data" / "scenes.jsonl").read_text() == ""
 
@@ -218,11 +219,9 @@ def test_rigs_that_layers_cannot_show_are_refused():
 
 
 def test_the_summary_counts():
-    from pat.farm.workshop import Outcome
-
-    summary = Summary(there=3)
+    summary = RenderSummary(there=3)
     for state, refusals in (("done", 2), ("done", 0), ("given up", 20), ("stopped", 0)):
-        summary.add(Outcome(index=5, state=state, refusals=refusals, crashes=1))
+        summary.add(SceneOutcome(index=5, state=state, refusals=refusals, crashes=1))
     assert not summary.complete
     assert str(summary).startswith("2 scenes made, 3 were there")
     assert "22 refused by the check, 4 crashed, given up: 5" in str(summary)

@@ -12,7 +12,8 @@ import pytest
 
 from pat.farm.folders import JobFolder, Shard, publish
 from pat.farm.pools import dask_pool, local_pool
-from pat.farm.workshop import Limits, Outcome, Stopped, Workshop
+from pat.farm.workshop import RetryLimits, SceneOutcome, Workshop
+from pat.support.jobs import JobError, Workers
 from tests.pat.farm.fake_job import order
 from tests.pat.farm.journals import events, started_after_done
 
@@ -24,7 +25,7 @@ def importable(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
 
 
-def make(root: Path, index: int, behaviour: dict | None = None, **limits: float) -> Outcome:
+def make(root: Path, index: int, behaviour: dict | None = None, **limits: float) -> SceneOutcome:
     with Workshop(order(root, behaviour, **limits)) as workshop:
         return workshop.make(index)
 
@@ -80,11 +81,11 @@ def test_a_hanging_worker_is_ended(tmp_path):
 
 
 def test_what_would_befall_every_scene_stops_the_job(tmp_path):
-    with pytest.raises(Stopped, match="No space left"):
+    with pytest.raises(JobError, match="No space left"):
         make(tmp_path, 3, {"3": "full"})
-    with pytest.raises(Stopped, match=r"workers die when they start: .*exit status 1.*no such library"):
+    with pytest.raises(JobError, match=r"workers die when they start: .*exit status 1.*no such library"):
         make(tmp_path, 4, {"start": "die"})
-    with pytest.raises(Stopped, match="No space left"):
+    with pytest.raises(JobError, match="No space left"):
         list(local_pool(order(tmp_path, {"5": "full", "pause": 0.01}), range(20), 2))
 
 
@@ -97,7 +98,7 @@ def test_workers_are_replaced_before_they_grow_old(tmp_path):
 
 def test_a_full_disk_is_seen_before_it_is_full(tmp_path, monkeypatch):
     monkeypatch.setattr(JobFolder, "free", lambda self: 1000)
-    with pytest.raises(Stopped, match="is full: free space and run the same command again"):
+    with pytest.raises(JobError, match="is full: free space and run the same command again"):
         make(tmp_path, 3)
 
 
@@ -141,7 +142,7 @@ def test_one_run_at_a_time(tmp_path):
 
 def test_limits_are_positive():
     with pytest.raises(ValueError, match="timeout must be above 0"):
-        Limits(timeout=0)
+        RetryLimits(timeout=0)
 
 
 def is_whole(root: Path, index: int) -> bool:
@@ -205,7 +206,7 @@ def test_dask_makes_the_same_scenes(tmp_path):
     for name in ("local", "dask"):
         (tmp_path / name).mkdir()
         job = order(tmp_path / name, behaviour, crashes=2)
-        pool = local_pool(job, range(6), 2) if name == "local" else dask_pool(job, range(6), "local", 2)
+        pool = local_pool(job, range(6), 2) if name == "local" else dask_pool(job, range(6), Workers(2, "local"))
         outcomes[name] = sorted((o.index, o.state, o.refusals, o.crashes) for o in pool)
     assert outcomes["local"] == outcomes["dask"]
     assert [o[1] for o in outcomes["dask"]] == ["done", "done", "done", "given up", "done", "done"]
@@ -218,5 +219,5 @@ def test_a_scheduler_that_is_not_there_is_told(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
     client = distributed.Client
     monkeypatch.setattr(distributed, "Client", lambda address, timeout: client(address, timeout=1))
-    with pytest.raises(ValueError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
-        list(dask_pool(order(tmp_path), range(2), "tcp://127.0.0.1:9", 1))
+    with pytest.raises(ValueError, match=r"no Dask scheduler at tcp://127\.0\.0\.1:9"):
+        list(dask_pool(order(tmp_path), range(2), Workers(scheduler="tcp://127.0.0.1:9")))

@@ -1,0 +1,296 @@
+"""Commands for the development of networks: evaluate, ablate, systems, showcase, data, render, train."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from tyro.conf import Fixed, Positional, arg
+
+from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say
+
+RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
+
+
+@dataclass
+class Evaluate:
+    """Compare alpha alone, the classical baseline and the fusion on stereo pairs: PSNR, SSIM, images.
+
+    The left image made grey is alpha, the right one, reduced, is beta, the left one in colour is the ground truth.
+    Example: pat evaluate --kitti data/kitti --middlebury data/middlebury
+    """
+
+    kitti: MaybePath = None
+    """Folder of KITTI pairs: image_2 / image_3, or left.png / right.png."""
+    middlebury: MaybePath = None
+    """Folder of Middlebury's 2001 to 2006 collections."""
+    flickr1024: MaybePath = None
+    """Folder of Flickr1024 pairs: 0001_L.png / 0001_R.png."""
+    folder: MaybePath = None
+    """Folder of other pairs, named in any of these ways."""
+    rates: tuple[int, ...] = (2, 4)
+    """Factors by which beta is reduced."""
+    protocol: Literal["table1", "table2"] = "table1"
+    """The paper's: mono + colour (table1), or mono + three bands (table2)."""
+    controls: bool = False
+    """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must get worse."""
+    out: Out = Path("out/evaluate")
+    """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
+    weights: Weights = "mono-colour"
+
+    def run(self) -> None:
+        from arraygeom.atomic import write_text
+
+        from ..evaluation import protocols, stereo
+        from ..evaluation.tables import write_csv
+        from ..networks.weights import load_weights
+
+        folders = {name: getattr(self, name) for name in stereo.DATA_SETS if getattr(self, name) is not None}
+        if not folders:
+            raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
+        if not self.rates or min(self.rates) < 1:
+            raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
+        network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
+        wrong = protocols.controls(network, bands=bands) if self.controls else {}
+        methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}
+        rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out)
+        every = [row for found in rows.values() for row in found]
+        text = stereo.sets_markdown(rows, protocol=self.protocol)
+        text += "\n" + stereo.falls(every, names=wrong) if wrong else ""
+        write_text(self.out / "scores.md", text)
+        write_csv(self.out / "scores.csv", stereo.StereoRow._fields, every)
+        print(text, end="")
+        say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
+
+
+@dataclass
+class Ablate:
+    """Compare families of receptive fields with the same weights on the same scenes: what calibration is worth.
+
+    Scenes are layered photographs seen by unrectified rigs, alpha's focal length 1 to 3 times beta's.
+    Example: pat ablate --scenes 12 --out out/ablate
+    """
+
+    weights: Weights = "mono-colour"
+    photos: tuple[Path, ...] = ()
+    """Folders of photographs; those that scikit-image ships if none is given."""
+    rendered: MaybePath = None
+    """Folder of scenes written by `pat render`, instead: their first camera is alpha, their second beta."""
+    scenes: int = 12
+    """Number of scenes."""
+    hw: tuple[int, int] = (240, 320)
+    """Height and width of both images."""
+    seed: int = 0
+    """Of the scenes."""
+    out: Out = Path("out/ablate")
+    """Folder for ablation.md, ablation.csv and ablation.png."""
+
+    def run(self) -> None:
+        from ..evaluation.ablation import ablate, layered_cases, rendered_cases
+        from ..networks.weights import load_weights
+
+        if self.scenes < 1:
+            raise ValueError(f"--scenes: {self.scenes}: give at least 1")
+        if self.rendered is not None:
+            cases = rendered_cases(self.rendered, seed=self.seed)
+        else:
+            cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
+        ablate(load_weights(self.weights), cases, out=self.out)
+        print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
+        say(f"written: {self.out / 'ablation.md'}, ablation.csv and ablation.png beside it")
+
+
+@dataclass
+class Showcase:
+    """Fuse real images: stereo pairs, calibrated pairs that are not rectified, the paper's fast + slow array."""
+
+    data: Path
+    """Folder with kitti, middlebury, flickr1024, syntim and hfr_lfr."""
+    out: Out = Path("out/showcase")
+    """Folder for showcase.md, the figures and the rig files."""
+    weights: Weights = "mono-colour"
+
+    def run(self) -> None:
+        from ..systems.showcase import showcase
+
+        print(showcase(self.data, self.out, self.weights), end="")
+        say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
+
+
+@dataclass
+class SystemsList:
+    """List the paper's four arrays."""
+
+    def run(self) -> None:
+        from ..systems import NAMES, load_system
+
+        for name in NAMES:
+            print(f"{name:12s} {load_system(name).title}")
+
+
+@dataclass
+class SystemsRun:
+    """Render a scene for an array, record it, fuse it, compare with the ground truth: PSNR, SSIM and images.
+
+    Example: pat systems run fast-slow --out out/fast-slow
+    """
+
+    name: Positional[str]
+    """One of the names that `pat systems list` prints."""
+    full: bool = False
+    """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
+    photos: MaybePath = None
+    """Folder of photographs for the scene's surfaces; by default patterns and images that scikit-image ships."""
+    recording: MaybePath = None
+    """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
+    out: MaybeOut = None
+    """Folder for the results; by default out/systems/NAME."""
+    weights: Weights = "mono-colour"
+    max_memory: Memory = None
+    """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured."""
+
+    def run(self) -> None:
+        from ..systems import load_system, run_system
+        from ..systems.fast_slow.recorded import run_recorded
+
+        out = self.out or Path("out/systems") / self.name
+        if self.recording is None:
+            further: dict[str, Any] = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
+            result = run_system(self.name, out, weights=self.weights, say=say, **further)
+        elif self.name == "fast-slow":
+            result = run_recorded(self.recording, out, weights=self.weights, say=say)
+        else:
+            raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
+        print(result.table, end="")
+        expected = load_system(self.name).expected
+        if expected and self.recording is None and not self.full:
+            say(f"\nexpected:\n{expected}")
+        say(f"written: {', '.join(map(str, result.written))}")
+
+
+class Systems:
+    """Run the paper's four arrays, each from a rendered scene to figures."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"list": SystemsList, "run": SystemsRun}
+
+
+@dataclass
+class DataShow:
+    """Draw samples of rendered scenes: recorded images, search segments of some pixels, ground truth and depth."""
+
+    folder: RenderedFolder
+    out: Out = Path("out/data.png")
+    """Image to write."""
+    samples: int = 6
+    """Number of patches."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera at whose view is fused; by default the first."""
+    sensors: MaybePath = None
+    """File (YAML) with a list of steps for each camera, instead of those that follow from their responses."""
+    seed: int = 0
+    """Of the choice of patches, and of noise."""
+
+    def run(self) -> None:
+        import torch
+
+        from ..data import ScenePatches
+        from ..data.show import draw_patches
+        from ..media.figures import save_figure
+        from ..sensors import generator_for, read_chains
+        from ..support.schema import read_yaml
+
+        if self.samples < 1:
+            raise ValueError(f"--samples: {self.samples}: give a whole number from 1 up")
+        chains = None if self.sensors is None else read_chains(read_yaml(self.sensors), str(self.sensors))
+        data = ScenePatches(self.folder, alpha=self.alpha, chains=chains, seed=self.seed)
+        chosen = torch.randperm(len(data), generator=generator_for(self.seed, "show"))[: self.samples]
+        save_figure(draw_patches([data[i] for i in chosen.tolist()]), self.out)
+        say(f"written: {self.out} ({len(data)} patches of {len(data.scenes)} scenes in {self.folder})")
+
+
+@dataclass
+class DataInfo:
+    """Summarise a folder of rendered scenes: sizes, refused seeds, abandoned scenes and the reasons."""
+
+    folder: RenderedFolder
+
+    def run(self) -> None:
+        from ..farm.summary import summarise
+
+        print(summarise(self.folder))
+
+
+class Data:
+    """Inspect rendered scenes."""
+
+    commands: ClassVar[Mapping[str, Any]] = {"show": DataShow, "info": DataInfo}
+
+
+@dataclass
+class Render:
+    """Render many scenes of a rig for training: workers, retries, resuming, clusters.
+
+    Example: pat render config.yaml --scenes 900 --out data/ --workers 2. The same command again renders what is
+    missing. The file has at least `rig: rig.yaml`; see `pat.farm.job.RenderConfig`.
+    """
+
+    config: Annotated[Positional[Path], arg(metavar="CONFIG")]
+    """What to render (YAML): rig, seed, backend and its settings."""
+    scenes: int
+    """Number of scenes there should be in the end."""
+    out: Out
+    """Folder of the scenes."""
+    workers: int = 1
+    """Processes on this machine; with --scheduler local, of that cluster."""
+    shard: Annotated[str, arg(metavar="I/N")] = "1/1"
+    """Only every N-th scene from the I-th on, for batch systems."""
+    scheduler: Annotated[str | None, optional("ADDRESS")] = None
+    """Address of a Dask scheduler (tcp://...), or "local"."""
+
+    def run(self) -> None:
+        from ..farm.folders import Shard
+        from ..farm.job import RenderConfig
+        from ..farm.run import render
+        from .options import console
+
+        summary = render(
+            RenderConfig.load(self.config),
+            scenes=self.scenes,
+            out=self.out,
+            workers=self.workers,
+            shard=Shard.parse(self.shard),
+            scheduler=self.scheduler,
+            console=console(),
+        )
+        say(f"{self.out}: {summary}")
+        if not summary.complete:
+            sys.exit(1)
+
+
+@dataclass
+class Train:
+    """Train weights by a recipe, on scenes made from photographs during training.
+
+    Example: pat train mono-colour-small --photos ~/images --out runs/mine --minutes 60
+    """
+
+    spellings: ClassVar[Mapping[str, str]] = {"-o": "--out"}
+
+    recipe: Positional[str] = "mono-colour"
+    """A recipe of the package, or a YAML file."""
+    config: Fixed[Any] = None
+
+    @classmethod
+    def parse(cls, arguments: list[str]) -> Train:
+        """The command from its arguments; its options are those of the recipe."""
+        from ..training.config import command_line
+
+        return cls(config=command_line(arguments))
+
+    def run(self) -> None:
+        from ..training.train import train
+
+        say(f"written: {train(self.config)}")

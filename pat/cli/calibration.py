@@ -1,0 +1,74 @@
+"""`pat calibrate` and `pat board`: photographs of a board in, a rig out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from . import options
+from .options import Depth, Out, say
+
+BoardName = Annotated[
+    str,
+    arg(
+        metavar="BOARD",
+        help="charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm or acircles:4x11:20mm.",
+    ),
+]
+
+
+@dataclass
+class Calibrate:
+    """Calibrate a rig from photographs of a board, with a report of how good it is.
+
+    A folder for each camera, or file names like left01.jpg, right01.jpg; images of one moment have the same number.
+    Example: pat calibrate photos/ --board charuco:8x6:30mm -o rig.yaml
+    """
+
+    photos: Annotated[Positional[Path], arg(metavar="FOLDER")]
+    """Folder with the images (or videos) of all cameras."""
+    board: BoardName
+    out: Out = Path("rig.yaml")
+    """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
+    camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
+    """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
+    lens: Literal["brown-conrady", "kannala-brandt", "none"] = "brown-conrady"
+    """Lens model; kannala-brandt for fisheyes."""
+    depth: Depth = None
+    """Near and far bounds in metres of the scenes to come, written into the rig."""
+
+    def run(self) -> None:
+        from calib.boards.run import calibrate_photos
+
+        patterns = options.files_by_name(self.camera, "--camera")
+        found = calibrate_photos(
+            self.photos,
+            self.board,
+            self.out,
+            patterns={name: str(pattern) for name, pattern in patterns.items()},
+            lens=self.lens,
+            depth=self.depth,
+            progress=options.progress("detecting the board"),
+        )
+        print("\n".join(found.messages))
+        say(f"written: {', '.join(map(str, found.written))}")
+
+
+@dataclass
+class PrintBoard:
+    """Make a calibration board to print at its true size.
+
+    Example: pat board charuco:8x6:30mm -o board.pdf
+    """
+
+    board: Positional[BoardName]
+    out: Out = Path("board.pdf")
+    """File to write, ending in .pdf or .svg."""
+
+    def run(self) -> None:
+        from calib.boards.run import write_board
+
+        say(f"written: {write_board(self.board, self.out)}")

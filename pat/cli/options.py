@@ -1,0 +1,180 @@
+"""Options that several commands share: their types and help, what NAME=VALUE means, and what is printed.
+
+Nothing here or in the modules of the commands imports torch before a command runs: `pat --help` is printed at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from torch import Tensor
+
+    from arraygeom import ReceptiveField, Rig
+
+T = TypeVar("T")
+
+SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
+WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
+
+FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved"]
+FIELD_NAMES = get_args(FieldName)[1:]
+
+
+def optional(metavar: str) -> Any:
+    """Marks an option that may be left out."""
+    return arg(metavar=metavar, help_behavior_hint="")
+
+
+RigFile = Annotated[Positional[Path], arg(metavar="RIG", help="Rig file of any known format; also: --rig RIG.")]
+Images = UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=FILE")]]
+Numbers = UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=NUMBER")]]
+Out = Annotated[Path, arg(metavar="PATH", aliases=["-o"])]
+MaybeOut = Annotated[Path | None, arg(metavar="PATH", aliases=["-o"], help_behavior_hint="")]
+MaybePath = Annotated[Path | None, optional("PATH")]
+Depth = Annotated[tuple[float, float] | None, optional("NEAR FAR")]
+Memory = Annotated[str | None, optional("SIZE")]
+Weights = Annotated[str, arg(metavar="NAME|FILE", help=f"Weights: {', '.join(WEIGHT_NAMES)}, or a file.")]
+
+FIRST, LAST = "first", "last"
+
+
+def respelled(arguments: Iterable[str], command: Any) -> list[str]:
+    """The arguments with the other `spellings` of a command's options replaced.
+
+    FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig may
+    always be given so.
+    """
+    spellings = {"--rig": FIRST} if "rig" in command.__annotations__ else {}
+    spellings |= getattr(command, "spellings", {})
+    words = iter(arguments)
+    first: list[str] = []
+    rest: list[str] = []
+    last: list[str] = []
+    for word in words:
+        option, equals, value = word.partition("=")
+        new = spellings.get(option.replace("_", "-") if option.startswith("--") else option)
+        if new not in (FIRST, LAST):
+            rest.append(f"{new}{equals}{value}" if new else word)
+            continue
+        value = value if equals else next(words, "")
+        if not value:
+            raise ValueError(f"{option}: give a file")
+        (first if new == FIRST else last).append(value)
+    return [*first, *rest, *last]
+
+
+def field_named(name: str) -> ReceptiveField | None:
+    """The receptive field of that name; None for "auto"."""
+    from arraygeom.fields.default import FIELDS
+
+    return None if name == "auto" else FIELDS[name]()
+
+
+def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
+    """The rig of a file, with other depth bounds if given."""
+    from arraygeom import Rig
+
+    rig = Rig.load(path)
+    return rig if depth is None else rig.replace(depth=depth)
+
+
+def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Path]:
+    """Values of a NAME=FILE option. Raises ValueError for other text, and for a name given twice."""
+    return dict(_once(option, (_named_file(option, text) for text in texts)))
+
+
+def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
+    """Values of a NAME=NUMBER option. Raises ValueError for other text, and for a name given twice."""
+    return dict(_once(option, (_named_number(option, text) for text in texts)))
+
+
+def read_images(rig: Rig, texts: Iterable[str]) -> dict[str, Tensor]:
+    """The images of `--image NAME=FILE` by camera. Raises ValueError for a camera given twice, or not of the rig."""
+    from ..media.images import read_image
+
+    return {rig.require(name): read_image(path, name=name) for name, path in files_by_name(texts).items()}
+
+
+def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
+    """The images of `--image NAME=FILE`: the first of every camera is a frame, the second of every camera the next.
+
+    Raises ValueError for cameras with unequal numbers of images.
+    """
+    from ..media.images import read_image
+
+    files: dict[str, list[Path]] = {}
+    for name, path in (_named_file("--image", text) for text in texts):
+        files.setdefault(rig.require(name), []).append(path)
+    counts = {name: len(paths) for name, paths in files.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
+        raise ValueError(f"--image: every camera needs an image of every frame; given are {listed}")
+    frames = zip(*files.values())
+    return [{n: read_image(path, name=n) for n, path in zip(files, frame)} for frame in frames]
+
+
+def _named_file(option: str, text: str) -> tuple[str, Path]:
+    name, _, path = text.partition("=")
+    if not (name and path):
+        raise ValueError(f"{option}: '{text}' is not NAME=FILE, such as mono=a.png")
+    return name, Path(path)
+
+
+def _named_number(option: str, text: str) -> tuple[str, float]:
+    name, _, number = text.partition("=")
+    try:
+        return name, float(number)
+    except ValueError:
+        raise ValueError(f"{option}: '{text}' is not NAME=NUMBER, such as mono=30") from None
+
+
+def _once(option: str, pairs: Iterable[tuple[str, T]]) -> Iterator[tuple[str, T]]:
+    seen = set()
+    for name, value in pairs:
+        if name in seen:
+            raise ValueError(f"{option}: '{name}' is given twice; give it once")
+        seen.add(name)
+        yield name, value
+
+
+@cache
+def console() -> Console:
+    """The terminal, for what is not the result: standard error."""
+    from rich.console import Console
+
+    return Console(stderr=True, highlight=False)
+
+
+def say(text: object, style: str | None = None) -> None:
+    """Print a line on standard error."""
+    console().print(f"{text}", style=style, markup=False, soft_wrap=True)
+
+
+def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
+    """Wraps items and their number in a bar on the terminal."""
+    from rich.progress import track
+
+    return lambda items, total: track(items, title, total=total, console=console())
+
+
+def print_json(document: Any) -> None:
+    """Print a document as JSON; what is not finite is null."""
+    import json
+
+    print(json.dumps(_finite(document), indent=2))
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {name: _finite(entry) for name, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,261 @@
+"""`pat show`, `pat explore` and `pat rig ...`: rig files drawn, inspected, converted, checked and refined."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+from tyro.conf import Positional, arg
+
+from . import options
+from .options import FIRST, LAST, Depth, Images, MaybeOut, Numbers, Out, RigFile, load_rig, optional, say
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+
+@dataclass
+class Show:
+    """Draw a rig, and the search segments of some alpha pixels in the other cameras."""
+
+    rig: RigFile
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera whose pixels are chosen; by default the first."""
+    image: Images = ()
+    """Images to draw on, if wanted."""
+    out: Out = Path("out/show")
+    """Folder for rig.png (cameras in space; if calibrated) and fields.png (search segments of some pixels)."""
+
+    def run(self) -> None:
+        from arraygeom import Camera
+        from arraygeom.viz import draw_fields, draw_rig
+
+        from ..media.figures import save_figure
+
+        rig = load_rig(self.rig)
+        alpha = rig.require(self.alpha or rig.names[0])
+        images = options.read_images(rig, self.image)
+        written = []
+        if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
+            written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
+        if len(rig.names) > 1:
+            fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
+            written.append(save_figure(fields, self.out / "fields.png"))
+        say(f"written: {', '.join(map(str, written))}")
+
+
+def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
+    """Pixels (12, 2) spread over an image."""
+    from arraygeom import pixel_grid
+
+    grid = (pixel_grid((3, 4)) + 0.5) / pixel_grid((3, 4)).new_tensor([4, 3])
+    return (grid * grid.new_tensor([hw[1], hw[0]])).floor().reshape(-1, 2)
+
+
+@dataclass
+class Explore:
+    """Explore receptive fields in the browser: click an alpha pixel, see its search segments, move the rig.
+
+    Example: pat explore rig.yaml --image mono=a.png --image colour=b.png
+    """
+
+    rig: RigFile
+    image: Images
+    """An image of each camera, once each."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera to click in; by default the first with an image."""
+    port: int = 0
+    """Port on localhost; 0 takes a free one."""
+    browser: bool = True
+    """Open the browser."""
+
+    def run(self) -> None:
+        try:
+            from ..explore.page import serve
+        except ModuleNotFoundError as error:
+            raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
+        rig = load_rig(self.rig)
+        serve(rig, options.read_images(rig, self.image), alpha=self.alpha, port=self.port, browser=self.browser)
+
+
+@dataclass
+class Info:
+    """Print fields of view, baselines, pixel footprints, and how long segments are for every pair."""
+
+    rig: RigFile
+    depth: Depth = None
+    """Near and far bounds in metres, instead of the rig's."""
+    json: bool = False
+    """Print JSON instead of tables."""
+
+    def run(self) -> None:
+        from rich.console import Console
+        from rich.table import Table
+
+        from arraygeom.summary import summarise_cameras, summarise_pairs
+
+        rig = load_rig(self.rig, self.depth)
+        cameras, pairs = summarise_cameras(rig), summarise_pairs(rig)
+        if self.json:
+            document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
+            return options.print_json(document)
+        of_cameras = Table("camera", "pixels", "focal px", "view deg", "mm a pixel, near - far", box=None)
+        for c in cameras:
+            wh = f"{c.wh[0]}x{c.wh[1]}"
+            of_cameras.add_row(c.name, wh, _two(c.focal), _two(c.field_of_view, " x "), _two(c.footprint, " - "))
+        of_pairs = Table("alpha > beta", "baseline m", "rotation deg", "seen", "segment px, median - longest", box=None)
+        of_pairs.add_column("depth step m, near - far")
+        for p in pairs:
+            seen = "" if p.seen is None else f"{p.seen:.0%}"
+            further = seen, _two(p.length, " - "), _two(p.depth_step, " - ")
+            of_pairs.add_row(f"{p.alpha} > {p.beta}", f"{p.baseline:.4g}", f"{p.rotation:.2f}", *further)
+        for table in (of_cameras, of_pairs):
+            Console().print(table)
+
+
+def _two(values: tuple[float, float] | None, between: str = ", ") -> str:
+    return "" if values is None else between.join(f"{v:.4g}" for v in values)
+
+
+@dataclass
+class Convert:
+    """Convert a rig file from one format to another."""
+
+    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--out": LAST, "-o": LAST}
+
+    source: Annotated[Positional[Path], arg(metavar="RIG")]
+    """Rig file, or folder where the format is one; also: --rig RIG."""
+    target: Annotated[Positional[Path], arg(metavar="OUT")]
+    """File or folder to write; also: --out OUT."""
+    read_as: Annotated[str | None, optional("FORMAT")] = None
+    """Format of the source; by default recognised."""
+    write_as: Annotated[str, arg(metavar="FORMAT")] = "native"
+    """Format of the target."""
+
+    def run(self) -> None:
+        from arraygeom.io import read_rig, write_rig
+
+        rig = read_rig(self.source, format=self.read_as)
+        write_rig(rig, self.target, format=self.write_as)
+        say(f"written: {self.target} ({len(rig.names)} cameras)")
+
+
+@dataclass
+class Doctor:
+    """Find the usual mistakes in a rig, by features matched between one image of each camera.
+
+    Half-pixel and one-pixel shifts, R transposed, pose inverted, units, cameras swapped, images resized, cropped,
+    rotated or mirrored without the rig, x and y exchanged, distortion ignored, applied twice or with the wrong sign.
+    Example: pat rig doctor rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    """
+
+    spellings: ClassVar[Mapping[str, str]] = {"--fix": "--out"}
+
+    rig: RigFile
+    image: Images
+    """An image of each of two or more cameras."""
+    out: MaybeOut = None
+    """Rig file to write if a mistake is found: the repaired rig. Also: --fix."""
+    json: bool = False
+    """Print JSON instead of text."""
+
+    def run(self) -> None:
+        from calib.images.doctor import diagnose
+
+        rig = load_rig(self.rig)
+        found = diagnose(rig, options.read_images(rig, self.image))
+        if self.json:
+            options.print_json(json.loads(found.as_json()))
+        else:
+            print(found.as_text())
+        if self.out is None:
+            return
+        if found.named.kind == "nothing":
+            return say("no rig written: no mistake was found")
+        found.repaired.save(self.out)
+        say(f"written: {self.out} ({found.named.words}: undone)")
+
+
+@dataclass
+class Refine:
+    """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
+
+    Held-out points decide: no rig is written unless they come nearer to their epipolar lines.
+    Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
+    """
+
+    rig: RigFile
+    image: Images
+    """Once for each camera and frame: the first files of all cameras are one frame, and so on."""
+    out: Out
+    """Rig file to write."""
+    free: tuple[str, ...] = ("rotation", "centre")
+    """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation. By
+    default, translation too if that brings held-out points nearer."""
+    sigma: Annotated[tuple[str, ...], arg(metavar="KIND=NUMBER")] = ()
+    """Standard deviation of a parameter before refinement: degrees, pixels; relative for translation and focal."""
+    photometric: bool = True
+    """Also minimise the fusion's own error, after that of the points."""
+
+    def run(self) -> None:
+        from calib.images.refinement import refine
+
+        from ..attention import attend_with_statistics
+
+        rig = load_rig(self.rig)
+        deviations = options.numbers_by_name(self.sigma, "--sigma")
+        found = refine(
+            rig,
+            options.read_frames(rig, self.image),
+            free=[kind for text in self.free for kind in text.split(",")],
+            sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
+            attend=attend_with_statistics if self.photometric else None,
+        )
+        print(found.as_text())
+        if not found.accepted:
+            return say("no rig written")
+        found.rig.save(self.out)
+        say(f"written: {self.out}")
+
+
+@dataclass
+class RigFromImages:
+    """Make a rig from images alone: fundamental matrices and rough homographies, good enough to fuse with.
+
+    Example: pat rig start --image mono=a.png --image colour=b.png --focal mono=800 --out rig.yaml
+    """
+
+    image: Images
+    """An image of each camera, once each."""
+    out: Out
+    """Rig file to write."""
+    focal: Numbers = ()
+    """Rough focal lengths in pixels, if known; used where they help."""
+
+    def run(self) -> None:
+        from calib.images.from_images import rig_from_images
+
+        from ..media.images import read_image
+
+        images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
+        found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
+        print(found.as_text())
+        found.rig.save(self.out)
+        say(f"written: {self.out}")
+
+
+class RigCommands:
+    """Inspect, convert, draw, check and refine rig files."""
+
+    commands: ClassVar[Mapping[str, Any]] = {
+        "info": Info,
+        "convert": Convert,
+        "show": Show,
+        "doctor": Doctor,
+        "refine": Refine,
+        "start": RigFromImages,
+    }
