@@ -5,7 +5,7 @@ import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
 from pat.fusion.optical_flow import flow_between, warped
-from pat.fusion.sequence import SequenceFusion, KeyContribution, Timeline, flicker, fuse_sequence, mixed
+from pat.fusion.sequence import KeyContribution, SequenceFusion, Timeline, flicker, fuse_sequence, mixed
 from pat.networks.weights import load_weights
 from tests.pat.fusion import moving
 
