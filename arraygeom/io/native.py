@@ -77,12 +77,21 @@ def recognises(path: Path, head: str) -> bool:
 def read(path: Path) -> Rig:
     """The rig of a native file. Raises RigFileError naming the file, the entry and what to do."""
     try:
-        document = load_yaml(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise RigFileError(path, None, f"not valid YAML: {yaml_problem(error)[1]}") from None
+    return read_text(text, path)
+
+
+def read_text(text: str, path: str | Path) -> Rig:
+    """The rig of a native file's text; `path` names it in errors."""
+    try:
+        document = load_yaml(text)
+    except yaml.YAMLError as error:
         line, problem = yaml_problem(error)
         at = f" at line {line}" if line else ""
-        raise RigFileError(path, None, f"not valid YAML{at}: {problem}") from None
-    return _Reader(path).rig(document)
+        raise RigFileError(Path(path), None, f"not valid YAML{at}: {problem}") from None
+    return _Reader(Path(path)).rig(document)
 
 
 def write(rig: Rig) -> str:
