@@ -13,6 +13,8 @@ LARGEST_TEXT = 2**25
 """Characters. 3,000 cameras are about 1 million."""
 DEEPEST = 50
 """Nested lists and mappings. The deepest format of the project has 8."""
+MOST_VALUES = 500_000
+"""Keys and values, also those that aliases repeat. 3,000 cameras are about 200,000."""
 MOST_ALIASED = 100_000
 """Values that aliases repeat, in total, counted as if they were written out."""
 
@@ -52,6 +54,8 @@ def _check_extent(text: str) -> None:
     open_nodes: list[tuple[str | None, int]] = []  # the anchor of each, and how many values came before it
     values = aliased = 0
     for event in yaml.parse(text, _Base):
+        if values > MOST_VALUES:
+            raise _refused(f"has more than {MOST_VALUES:,} values", event.start_mark)
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in sizes:
                 raise _refused(f"alias *{event.anchor} is within, or before, what it stands for", event.start_mark)

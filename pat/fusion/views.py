@@ -131,9 +131,7 @@ def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[T
     """
     view = rig[name]
     raw = view.sensor.bayer is not None
-    image = read_image(
-        path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply"
-    )
+    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply")
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
     return develop(image, view.sensor, like=like)

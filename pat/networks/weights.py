@@ -69,7 +69,9 @@ def load_weights(name: str | Path) -> Network:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
-            raise ValueError(f"{path}: {name} holds something other than finite numbers: train it again, or copy it again")
+            raise ValueError(
+                f"{path}: {name} holds something other than finite numbers: train it again, or copy it again"
+            )
     made = network(config)
     made.load_state_dict(state)
     return made.eval().requires_grad_(False)

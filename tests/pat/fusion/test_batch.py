@@ -208,7 +208,9 @@ def test_a_field_that_is_a_function_is_refused_before_anything_is_fused(material
         batch(material, tmp_path / "out", field=lambda pair, x: None).run()
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"format": "pat-batch 1"}', "[" * 100_000, '{"format": "pat-batch 9"}'])
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"format": "pat-batch 1"}', "[" * 100_000, '{"format": "pat-batch 9"}']
+)
 def test_damaged_plans_are_named(text):
     with pytest.raises(ValueError, match=r"plan.json: not a plan of this program"):
         Batch.from_json(text)
