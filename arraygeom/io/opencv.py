@@ -78,6 +78,7 @@ def write(rig: Rig) -> str | dict[str, str]:
     }
 
 
+_NESTED_IN_LINE = rf"(?<![^\s,])(?:-[ \t]+|[^\s,:]{{1,80}}:[ \t]+){{{DEEPEST}}}"
 _HEADER = "%YAML:1.0\n---\n"
 
 
@@ -145,7 +146,7 @@ def _check_nesting(source: RigSource, text: str) -> None:
             raise source.fail(
                 f"line {text.count(chr(10), 0, token.start()) + 1}", f"is nested more than {DEEPEST} deep"
             )
-    if re.search(r"(?:-[ \t]+){%d}|(?:[^\s,:]{1,80}:[ \t]+){%d}" % (DEEPEST, DEEPEST), text):
+    if re.search(_NESTED_IN_LINE, text):
         raise source.fail(None, f"is nested more than {DEEPEST} deep in a line")
 
 

@@ -170,7 +170,7 @@ class Batch:
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
-        """The batch as text for the processes that fuse its frames. Raises ValueError for a field that is no dataclass."""
+        """The batch as text for the processes that fuse its frames. Raises ValueError for a field of one's own."""
         entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
         entries["rig"] = rig_text(self.rig)
         entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}

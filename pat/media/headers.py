@@ -106,10 +106,10 @@ def _pnm(content: bytes) -> ImageHeader | None:
 
 def _tiff(content: bytes) -> ImageHeader:
     entries = _entries(content)
-    orientation, *tag = entries.get(_ORIENTATION, (1,))
+    tag = entries.get(_ORIENTATION)
     bits = entries[_BITS][0] if _BITS in entries else 1
-    place = (tag[0], tag[1]) if tag else None
-    return ImageHeader((entries[_HEIGHT][0], entries[_WIDTH][0]), _known(orientation), bits, place)
+    size = entries[_HEIGHT][0], entries[_WIDTH][0]
+    return ImageHeader(size, _known(tag[0]) if tag else 1, bits, tag[1:] if tag else None)
 
 
 def _exif_orientation(exif: bytes) -> int:

@@ -69,11 +69,11 @@ def read_image(
 
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
-    must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of error messages.
+    must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
 
     An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
-    `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height, width), which is
-    compared before anything is decoded.
+    `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height, width), which
+    is compared before anything is decoded.
 
     Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another size than
     expected, or is larger than `MOST_PIXELS` where no size is.
@@ -107,8 +107,8 @@ def write_image(
 
     8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
     `coverage` makes the image RGBA (.png and .exr). An .exr file needs the extra `synthesis`. Raises ValueError for
-    an image with another number of channels or with values that are not finite (they are allowed with `unknown`, for maps of
-    32 bits in which some pixels are not known), and for a format that cannot hold it.
+    an image with another number of channels or with values that are not finite (allowed with `unknown`, for maps of 32
+    bits in which some pixels are not known), and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
@@ -179,7 +179,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
 
 
 def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
-    """A TIFF file's bytes with orientation 1: OpenCV applies that of TIFF files, and of no others, whatever is asked."""
+    """A TIFF file's bytes with orientation 1: OpenCV applies that of TIFF files alone, whatever is asked."""
     if header.tag is None or header.orientation == 1:
         return content
     place, form = header.tag
