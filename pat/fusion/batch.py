@@ -261,7 +261,7 @@ def field_of(document: Mapping[str, Any] | None) -> ReceptiveField | None:
     """The field of a `field_document`. Raises KeyError, TypeError or ValueError for anything else."""
     if document is None:
         return None
-    entries = {name: field_of(value) if name == "field" else value for name, value in document.items()}
+    entries: dict[str, Any] = {n: field_of(value) if n == "field" else value for n, value in document.items()}
     return FIELD_CLASSES[entries.pop("kind")](**entries)
 
 

@@ -125,7 +125,7 @@ def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Callable[..., N
     try:
         values = json.loads(metadata["config"])
         document = {renamed(key): value for key, value in values.items()} if isinstance(values, dict) else values
-        config = from_document(kind, document)
+        config: Any = from_document(kind, document)  # type: ignore[arg-type]
         for name, value in dataclasses.asdict(config).items():
             _check_numbers(name, value)
     except (KeyError, RecursionError, TypeError, ValueError) as error:
