@@ -62,6 +62,16 @@ WRITERS: dict[str, Any] = {
     "nerfstudio": nerfstudio,
 }
 
+# Recognised by a word in the file or by its suffix, and what to do instead.
+NOT_READ = {
+    ".camera": ("one camera of Strecha's data", "write K, R^T and -R^T t of all into a native rig file"),
+    "<chunk": ("a Metashape project", "export its cameras in COLMAP's format"),
+    "PinholeCamera": (
+        "a file of Open3D",
+        "write intrinsic_matrix and extrinsic (X_camera = R X + t) into a native file",
+    ),
+}
+
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
 
 
@@ -117,6 +127,9 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
+    for mark, (what, advice) in NOT_READ.items():
+        if mark in head or path.suffix == mark:
+            raise RigFileError(path, None, f"is {what}, which is not read: {advice}")
     raise RigFileError(path, None, f"is not a rig file of a known format ({', '.join(READERS)}); or name its format")
 
 

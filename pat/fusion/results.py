@@ -28,7 +28,7 @@ def save_frame(
     view: Rig | None = None,
     name: str = "",
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN as 0) and depth.png (near is bright).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (near is bright).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The image
@@ -42,7 +42,7 @@ def save_frame(
     written = [confidence]
     if frame.depth.isfinite().any():
         depths = [out / f"{prefix}depth.tif", out / f"{prefix}depth.png"]
-        write_image(depths[0], frame.depth.nan_to_num(0.0)[None], bits=32)
+        write_image(depths[0], frame.depth[None], bits=32, unknown=True)
         write_image(depths[1], colour_depth(frame.depth))
         written += depths
     if view is not None:

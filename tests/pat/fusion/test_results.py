@@ -1,6 +1,7 @@
 """Files of a fusion: bands that no image holds together are written one by one."""
 
 import pytest
+import tifffile
 import torch
 
 from pat.fusion.results import Frame, save_frame
@@ -30,3 +31,10 @@ def test_other_bands_are_written_one_by_one_and_their_mean(bands, tmp_path):
     ]
     assert torch.allclose(torch.cat([read_image(p) for p in written[1 : 1 + bands]]), frame.image, atol=1e-4)
     assert torch.allclose(read_image(written[0])[0], frame.image.mean(0), atol=1e-4)
+
+
+def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
+    depth = torch.tensor([[1.5, torch.nan, 3.0], [torch.nan, 2.0, 0.5]])
+    frame = Frame(torch.rand(3, 2, 3), depth, torch.rand(2, 3))
+    assert tmp_path / "depth.tif" in save_frame(frame, tmp_path)
+    torch.testing.assert_close(torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True)
