@@ -24,10 +24,11 @@ from math import pi
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .pixels import floating, product
 from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
@@ -68,7 +69,12 @@ class Distortion(Batched):
             given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
 
-    def distort(self, xy: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    @property
+    def is_identity(self) -> bool:
+        """Whether this lens distorts nothing: Brown-Conrady with all coefficients 0."""
+        return self.model == BROWN_CONRADY and not bool(self.coefficients.any())
+
+    def distort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Normalised pinhole points to distorted ones, and which are inside the model's range."""
         xy, finite = _finite(xy)
         if self.model == KANNALA_BRANDT:
@@ -77,7 +83,7 @@ class Distortion(Batched):
             xy_d, valid = _brown_distort(self._lifted(xy), xy)
         return xy_d, valid & finite
 
-    def undistort(self, xy_d: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def undistort(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Distorted points to normalised pinhole ones: the inverse of `distort`, iterated to convergence.
 
         A fisheye ray at 90 degrees or more has no pinhole point and is not valid: see `unproject`.
@@ -91,7 +97,7 @@ class Distortion(Batched):
             xy, valid = _brown_undistort(self._lifted(xy_d), xy_d)
         return xy, valid & finite
 
-    def project(self, X: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Points in the camera's frame (any unit) to distorted normalised points.
 
         Brown-Conrady: only points ahead (z > 0) are valid. Kannala-Brandt: any direction that the polynomial
@@ -105,7 +111,7 @@ class Distortion(Batched):
         xy_d, valid = self.distort(X[..., :2] / torch.where(ahead, X[..., 2], 1)[..., None])
         return xy_d, valid & ahead & finite
 
-    def unproject(self, xy_d: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
+    def unproject(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
         """Distorted normalised points to unit directions in the camera's frame: the inverse of `project`."""
         if self.model == KANNALA_BRANDT:
             xy_d, finite = _finite(xy_d)
@@ -283,8 +289,8 @@ def _tilt_matrix(lens: _Brown) -> Tensor | None:
         return None
     from kornia.geometry.calibration.distort import tilt_projection
 
-    tx, ty = lens.tilt
-    return tilt_projection(tx[..., None], ty[..., None])
+    tx, ty = (angle.double()[..., None] for angle in lens.tilt)  # in float64, which autocast leaves alone
+    return tilt_projection(tx, ty)
 
 
 def _tilt(lens: _Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -301,7 +307,7 @@ def _apply(H: Tensor | None, xy: Tensor) -> tuple[Tensor, Tensor]:
     """The homography H of points, and which lie on this side of the line it sends to infinity."""
     if H is None:
         return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
-    p = (H.to(xy) @ _homogeneous(xy)[..., None])[..., 0]
+    p = product(H.to(xy), _homogeneous(xy)[..., None])[..., 0]
     ahead = p[..., 2] > 1 / WIDEST
     return p[..., :2] / torch.where(ahead, p[..., 2], 1.0)[..., None], ahead
 
@@ -447,5 +453,6 @@ def _norm(xy: Tensor) -> Tensor:
 
 def _finite(points: Tensor) -> tuple[Tensor, Tensor]:
     """Points with those that hold a NaN or an infinity at the origin, and which did not."""
+    points = floating(points)
     finite = points.isfinite().all(-1)
     return torch.where(finite[..., None], points, 0.0), finite

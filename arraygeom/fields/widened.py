@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..pixels import HW
@@ -37,7 +37,7 @@ class Widened:
         if min(self.across, self.along) < 0:
             raise ValueError(f"across and along are pixels, 0 or more; got {self.across} and {self.along}")
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
         found = self.field(pair, x)
         if isinstance(found, Segments):
