@@ -106,7 +106,9 @@ def _rays(cameras: Sequence[Camera], x: Tensor) -> tuple[Tensor, Tensor, Tensor,
     """Centres and unit directions in the world, which pixels have one, and focal lengths, each (v, *n[, 3])."""
     ones = [1] * (x.ndim - 2)
     rays, usable = zip(*(c.to(x.dtype).rays(p) for c, p in zip(cameras, x)))
-    directions = torch.stack([product(r / r.norm(dim=-1, keepdim=True), c.R.to(x.dtype)) for r, c in zip(rays, cameras)])
+    directions = torch.stack(
+        [product(r / r.norm(dim=-1, keepdim=True), c.R.to(x.dtype)) for r, c in zip(rays, cameras)]
+    )
     centres = torch.stack([c.centre for c in cameras]).to(x.dtype).reshape(len(x), *ones, 3)
     focal = torch.stack([c.K[:2, :2].det().abs().sqrt() for c in cameras]).to(x.dtype).reshape(len(x), *ones)
     return centres, directions, torch.stack(usable), focal

@@ -89,7 +89,9 @@ def read(path: Path) -> Rig:
 def write(rig: Rig) -> str:
     """The text of a native file. Raises ValueError for a batch of rigs."""
     if rig.batch_shape:
-        raise ValueError(f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, rig[i]")
+        raise ValueError(
+            f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, rig[i]"
+        )
     document: dict[str, Any] = {"format": FORMAT}
     if rig.name:
         document["name"] = rig.name

@@ -180,9 +180,10 @@ def test_the_covering_displacement_of_a_batch_is_each_rigs_own():
     batch = stack(rigs).pair("alpha", "beta")
     alone = torch.stack([covering_displacement(r.pair("alpha", "beta")) for r in rigs])
     torch.testing.assert_close(covering_displacement(batch), alone)
-    torch.testing.assert_close(covering_displacement(batch, WHOLE[None].double()), torch.stack([
-        covering_displacement(r.pair("alpha", "beta"), WHOLE.double()) for r in rigs
-    ]))
+    torch.testing.assert_close(
+        covering_displacement(batch, WHOLE[None].double()),
+        torch.stack([covering_displacement(r.pair("alpha", "beta"), WHOLE.double()) for r in rigs]),
+    )
     found = sampling_locations(HomographyDisplacement(), batch)
     for i, rig in enumerate(rigs):
         assert_alike(found[i], sampling_locations(HomographyDisplacement(), rig.pair("alpha", "beta")))
