@@ -51,7 +51,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
         ray = _middle_ray(camera, R)
         if not ray[2] > NEAREST_COSINE * ray.norm():
             raise ValueError(
-                "the baseline is nearly along an optical axis (motion forwards): no homography makes rows of the lines; "
+                "the baseline is nearly along an optical axis (motion forwards): no homography turns lines into rows; "
                 "use the pair as it is, with Epipolar or Curved"
             )
     hw = hw or alpha.hw

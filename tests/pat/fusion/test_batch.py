@@ -156,6 +156,6 @@ def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_p
     job = batch(material, tmp_path, sequence=True)
     sensor = replace(job.rig["fast"].sensor, response="mono", coding="linear")
     job = replace(job, rig=job.rig.with_camera("fast", job.rig["fast"].replace(sensor=sensor)))
-    known = job._fusion().rig["fast"].sensor
+    known = job.fusion.rig["fast"].sensor
     assert (known.response, known.coding) == (LIGHT, "srgb")
     assert known.frame_rate == sensor.frame_rate
