@@ -7,6 +7,7 @@ one line as `CONVENTION`.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ..camera import Camera
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
+from ..sensor import Sensor
 from . import (
     aniposelib,
     boofcv,
@@ -105,11 +107,14 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     """Write a rig, each file atomically. Formats of several files make a folder.
 
-    Raises ValueError for an unknown format, and for a rig that the format cannot hold.
+    What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor records) is named
+    by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the format cannot hold, and a batch.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
     path, contents = Path(path), WRITERS[format].write(rig)
+    if format != "native" and (lost := _left_out(rig, format)):
+        warnings.warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning, 2)
     if isinstance(contents, Mapping):
         path.mkdir(parents=True, exist_ok=True)
         for name, text in contents.items():
@@ -136,6 +141,18 @@ def recognise(path: str | Path) -> str:
 def convention(format: str) -> str:
     """What a format's file means and the shift of pixels applied when reading it, in one line."""
     return getattr(READERS[format], "CONVENTION", "stated in the file: units and first_pixel_centre")
+
+
+def _left_out(rig: Rig, format: str) -> str:
+    """What only the native format holds and this rig states."""
+    kept = {"time_offset": 0.0} if format == "kalibr" else {}
+    sensors = (dataclasses.replace(view.sensor, **kept) for view in rig.cameras.values())
+    stated = {
+        "depth range": rig.depth is not None,
+        "links": bool(rig.links),
+        "sensors": any(sensor != Sensor() for sensor in sensors),
+    }
+    return ", ".join(name for name, is_stated in stated.items() if is_stated)
 
 
 def _scaled(rig: Rig, scale: float) -> Rig:

@@ -95,7 +95,11 @@ def read_text(text: str, path: str | Path) -> Rig:
 
 
 def write(rig: Rig) -> str:
-    """The text of a native file."""
+    """The text of a native file. Raises ValueError for a batch of rigs."""
+    if rig.batch_shape:
+        raise ValueError(
+            f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, rig[i]"
+        )
     document: dict[str, Any] = {"format": FORMAT}
     if rig.name:
         document["name"] = rig.name
@@ -156,11 +160,12 @@ class _Reader:
             return View(hw=(height, width), sensor=sensor)
         if not any(key in fields for key in CALIBRATION if key != "distortion"):
             return self.lens_view(f"{entry}.distortion", fields["distortion"], View(hw=(height, width), sensor=sensor))
+        lens = self.distortion(f"{entry}.distortion", fields.get("distortion"))
         return Camera(
             K=self.K(entry, fields, (height, width)),
             cam_from_world=self.pose(entry, fields),
             hw=(height, width),
-            distortion=self.distortion(f"{entry}.distortion", fields.get("distortion")),
+            distortion=None if lens is not None and lens.is_identity else lens,
             sensor=sensor,
         )
 

@@ -199,9 +199,9 @@ class RigSource:
         return quaternion_to_rotation_matrix(q / q.norm())
 
     def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
-        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if empty."""
+        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if all are 0."""
         c = self.numbers([] if value is None else value, None, entry)
-        if c.numel() == 0:
+        if not c.any():
             return None
         if c.numel() > 14:
             raise self.fail(entry, f"has {c.numel()} coefficients; OpenCV's model has at most 14")
