@@ -165,7 +165,7 @@ def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePos
     if mask.dtype != torch.bool:
         raise TypeError(f"the locations' mask (valid) must be bool, got {mask.dtype}: compare it, as in mask > 0")
     if samples is None:
-        samples = samples_for(Segments(*points.unbind(-2), mask[..., 0]))
+        samples = samples_for(Segments(points[..., 0, :], points[..., 1, :], mask[..., 0]))
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape
