@@ -20,6 +20,8 @@ from pat.networks.weights import misfit
 
 FORMAT = "pat-checkpoint 1"
 RETAINED = 2
+FACTS = {"step", "best", "minutes", "done", "recipe"}
+"""What a checkpoint says beside its tensors."""
 
 
 class Checkpoint(NamedTuple):
@@ -75,20 +77,32 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest complete checkpoint; None if there is none."""
-    found = (read_checkpoint(path) for path in _files(folder))
-    return next((checkpoint for checkpoint in found if checkpoint), None)
+    """The newest complete checkpoint; None if the folder has none.
+
+    Raises ValueError if it has some and none of them can be read: a run is not to begin again unasked.
+    """
+    files = _files(folder)
+    found = next((checkpoint for path in files if (checkpoint := read_checkpoint(path))), None)
+    if files and found is None:
+        names = ", ".join(path.name for path in files)
+        raise ValueError(
+            f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: restore one of them "
+            "from a copy, or remove these files to begin again at step 0, or give another --out"
+        )
+    return found
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """A checkpoint, or None for an incomplete file."""
+    """A checkpoint, or None for a file that is damaged or is none."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError):
+        facts = json.loads(metadata.get("facts", "null"))
+    except (SafetensorError, OSError, ValueError):
         return None
-    return Checkpoint(tensors, json.loads(metadata["facts"])) if metadata.get("format") == FORMAT else None
+    whole = metadata.get("format") == FORMAT and isinstance(facts, dict) and FACTS <= facts.keys()
+    return Checkpoint(tensors, facts) if whole else None
 
 
 def _files(folder: Path) -> list[Path]:
