@@ -10,13 +10,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
-from arraygeom.atomic import write_atomically
 from pat.networks.weights import misfit
+from pat.support.tensor_files import write_tensors
 
 FORMAT = "pat-checkpoint 1"
 RETAINED = 2
@@ -65,12 +64,10 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     """
     step = checkpoint.facts["step"]
     path = folder / f"step-{step:08d}.safetensors"
-    tensors = {k: v.detach().cpu().contiguous() for k, v in checkpoint.tensors.items()}
     try:
-        with write_atomically(path) as temporary:
-            save_file(tensors, temporary, {"format": FORMAT, "facts": json.dumps(checkpoint.facts)})
-    except (SafetensorError, OSError) as error:
-        raise OSError(_no_room(folder, step, tensors, error)) from None
+        write_tensors(path, checkpoint.tensors, {"format": FORMAT, "facts": json.dumps(checkpoint.facts)})
+    except OSError as error:
+        raise OSError(_no_room(folder, step, checkpoint.tensors, error)) from None
     for old in _files(folder)[RETAINED:]:
         old.unlink()
     return path
@@ -101,7 +98,7 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
         facts = json.loads(metadata.get("facts", "null"))
     except (SafetensorError, OSError, ValueError):
         return None
-    whole = metadata.get("format") == FORMAT and isinstance(facts, dict) and FACTS <= facts.keys()
+    whole = metadata.get("format") == FORMAT and isinstance(facts, dict) and facts.keys() >= FACTS
     return Checkpoint(tensors, facts) if whole else None
 
 

@@ -43,7 +43,9 @@ def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (25_000, limits[1]))
     try:
         with pytest.raises(OSError, match=r"too large: '.*/fused\.tif'$") as caught:
-            save_frame(Frame(torch.rand(3, 60, 80), torch.rand(60, 80), torch.rand(60, 80)), tmp_path, kind="tif", bits=16)
+            save_frame(
+                Frame(torch.rand(3, 60, 80), torch.rand(60, 80), torch.rand(60, 80)), tmp_path, kind="tif", bits=16
+            )
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert caught.value.filename == str(tmp_path / "fused.tif")

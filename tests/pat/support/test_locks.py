@@ -52,9 +52,11 @@ def test_a_folder_is_one_commands_until_that_is_gone(holder, tmp_path):
 
 def test_a_lock_of_another_machine_is_not_taken(tmp_path):
     (tmp_path / LOCK).write_text('{"pid": 7, "host": "far.example"}')
-    with pytest.raises(ValueError, match=r"process 7 on far.example\): wait for it, or remove .*\.lock"):
-        with folder_lock(tmp_path):
-            pass
+    with (
+        pytest.raises(ValueError, match=r"process 7 on far.example\): wait for it, or remove .*\.lock"),
+        folder_lock(tmp_path),
+    ):
+        pass
     (tmp_path / LOCK).write_text("damaged")
     with folder_lock(tmp_path):
         pass
@@ -72,10 +74,10 @@ def test_a_folder_left_empty_is_removed(tmp_path):
 def test_what_cannot_be_a_folder_is_named(tmp_path):
     (tmp_path / "file").touch()
     for out in (tmp_path / "file", tmp_path / "file" / "deeper" / "out"):
-        with pytest.raises(ValueError, match=r"cannot write there \(.*file is a file\): give another folder"):
-            with folder_lock(out):
-                pass
+        wanted = r"cannot write there \(.*file is a file\): give another folder"
+        with pytest.raises(ValueError, match=wanted), folder_lock(out):
+            pass
     for out in (Path("/proc/nothing"), Path("/proc/self")):
-        with pytest.raises(ValueError, match=r"^/proc/\w+: cannot write there \(/proc/\w+: .*\): give another folder"):
-            with folder_lock(out):
-                pass
+        wanted = r"^/proc/\w+: cannot write there \(/proc/\w+: .*\): give another folder"
+        with pytest.raises(ValueError, match=wanted), folder_lock(out):
+            pass

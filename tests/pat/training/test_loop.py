@@ -252,9 +252,13 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, wh
     newer.write_bytes(newer.read_bytes()[:1000])
     assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
     header = int.from_bytes(older.read_bytes()[:8], "little")
-    older.write_bytes(older.read_bytes()[: 8 + header].replace(b'\\"step\\"', b'\\"stop\\"') + older.read_bytes()[8 + header :])
+    older.write_bytes(
+        older.read_bytes()[: 8 + header].replace(b'\\"step\\"', b'\\"stop\\"') + older.read_bytes()[8 + header :]
+    )
     log = (config.out / "log.jsonl").read_bytes()
-    with pytest.raises(ValueError, match=r"no checkpoint there can be read \(step-00000006.*step-00000003.*begin again"):
+    with pytest.raises(
+        ValueError, match=r"no checkpoint there can be read \(step-00000006.*step-00000003.*begin again"
+    ):
         train(config)
     assert (config.out / "log.jsonl").read_bytes() == log
     for file in (newer, older):
