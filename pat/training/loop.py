@@ -19,6 +19,7 @@ from torch.utils._pytree import tree_map
 from arraygeom import ReceptiveField
 from pat.networks.paper import AttentionEngine
 from pat.networks.weights import NETWORKS, Network, load_weights, save_weights
+from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 
 from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
@@ -41,12 +42,13 @@ def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
     `steps` the result is that of an uninterrupted run, bit for bit; with `minutes` the time spent counts.
 
     Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
-    the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run.
+    the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run, or one
+    that another command is writing to.
     """
     former = former_run(config)
     if former and former.facts["done"]:
         return config.out / BEST
-    with process(config.device) as here:
+    with process(config.device) as here, folder_lock(config.out) if here.first else nullcontext():
         run = Run(config, here, field, former)
         try:
             run.work()

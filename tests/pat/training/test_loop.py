@@ -16,6 +16,7 @@ from safetensors import safe_open
 
 from pat.networks.paper import PATConfig
 from pat.networks.weights import load_weights, save_weights
+from pat.support.locks import folder_lock
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
 from pat.training.loop import new_network, shape
@@ -265,3 +266,11 @@ def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, wh
         file.unlink()
     train(config)
     assert losses(config.out) == losses(whole.out)
+
+
+def test_one_run_at_a_time_writes_to_a_folder(folder, whole):
+    config = replace(whole, out=folder / "twice")
+    with folder_lock(config.out):
+        with pytest.raises(ValueError, match="twice: another command is writing there"):
+            train(config)
+        assert [p.name for p in config.out.iterdir()] == [".lock"]
