@@ -44,7 +44,7 @@ readme: demo showcase
 
 test: $(READY)
 	@echo "== tests"
-	@$(BIN)/python -m pytest -m "not slow"
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -m "not slow" --numprocesses auto --dist worksteal
 
 test-long: $(READY)
 	@echo "== tests, longer ones included"

@@ -15,7 +15,7 @@ from torch import Tensor
 from .pixels import map_homogeneous, to_homogeneous
 
 
-class MappedPoints(NamedTuple):
+class TransformedPoints(NamedTuple):
     """Points after a homography, and which of them exist."""
 
     x: Float[Tensor, "*n 2"]
@@ -48,7 +48,7 @@ def infinite_homography(
     return K_beta @ R @ torch.linalg.inv(K_alpha)
 
 
-def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> MappedPoints:
+def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> TransformedPoints:
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
     `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters:
@@ -60,7 +60,7 @@ def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Ma
     valid = (scale > SMALLEST_SCALE) & X.isfinite() & Y.isfinite()
     scale = torch.where(valid, scale, 1.0)
     transformed = [torch.where(valid, c, 0.0) / scale for c in (X, Y)]
-    return MappedPoints(torch.stack(transformed, -1), valid)
+    return TransformedPoints(torch.stack(transformed, -1), valid)
 
 
 SMALLEST_SCALE = 1e-9

@@ -33,7 +33,7 @@ from . import (
     syntim,
 )
 from .errors import RigFileError
-from .source import RigFileWarning, RigSource, unit_doubt
+from .source import RigFileWarning, RigSource, unit_warning
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -87,7 +87,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
     rig = rig if scale == 1.0 else _scaled(rig, scale)
-    if doubt := unit_doubt(rig):
+    if doubt := unit_warning(rig):
         RigSource(path).warn(doubt)
     return rig
 

@@ -221,7 +221,7 @@ class RigSource:
         return fields
 
 
-def unit_doubt(rig: Rig) -> str | None:
+def unit_warning(rig: Rig) -> str | None:
     """What to say of baselines that suggest another unit than metres."""
     centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
     if len(centres) < 2:

@@ -155,7 +155,6 @@ def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePos
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
         points, mask, straight = torch.stack([locations.start, locations.end], -2), locations.valid[..., None], True
-        samples = samples_for(locations) if samples is None else samples
     elif isinstance(locations, Positions):
         points, mask, straight = locations.xy, locations.mask, False
         if samples not in (None, points.shape[-2]):
@@ -165,6 +164,8 @@ def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePos
         raise TypeError(f"locations must be Segments, Positions or a function that returns them, got {type(locations)}")
     if mask.dtype != torch.bool:
         raise TypeError(f"the locations' mask (valid) must be bool, got {mask.dtype}: compare it, as in mask > 0")
+    if samples is None:
+        samples = samples_for(Segments(*points.unbind(-2), mask[..., 0]))
     if samples < 1:
         raise ValueError(f"samples must be at least 1, got {samples}")
     b, _, ha, wa = query.shape

@@ -22,11 +22,11 @@ import triton.language as tl
 from torch import Tensor
 
 from arraygeom.segments import sample_fractions
-from pat.attention.reference import EDGE_SLACK, LEAST_SPREAD, SamplePositions
+from pat.attention.reference import EDGE_SLACK, LEAST_DEVIATION, SamplePositions
 
 PIXELS = 8
 """Alpha pixels of one program."""
-LEAST = tl.constexpr(LEAST_SPREAD)
+LEAST = tl.constexpr(LEAST_DEVIATION)
 SLACK = tl.constexpr(EDGE_SLACK)
 FIXED_BITS = 61
 """How much of an int64 a sum of fixed point numbers may take."""

@@ -24,8 +24,8 @@ from arraygeom.segments import sample_fractions
 BAND_BYTES = 2**27
 EDGE_SLACK = 1e-3
 """Samples this far (pixels) off the image's area still count: rounding puts clipped ends there."""
-LEAST_SPREAD = 1e-4
-"""A spread (pixels) below this reads 0: it is rounding, and its derivative noise."""
+LEAST_DEVIATION = 1e-4
+"""A deviation (pixels) below this reads 0: it is rounding, and its derivative noise."""
 
 
 class SamplePositions(NamedTuple):
@@ -59,13 +59,13 @@ class Attended(NamedTuple):
 
     value: (B, Dv, Ha, Wa), the weighted mean of the values.
     position: (B, 2, Ha, Wa), the expected (x, y) of the match, in beta's pixels.
-    spread: (B, Ha, Wa), root of the expected squared distance of the samples from `position`, in pixels.
+    deviation: (B, Ha, Wa), root of the expected squared distance of the samples from `position`, in pixels.
     peak: (B, Ha, Wa), the largest weight.
     """
 
     value: Tensor
     position: Tensor
-    spread: Tensor
+    deviation: Tensor
     peak: Tensor
 
 
@@ -89,7 +89,7 @@ def attend(
         ]
         out = Attended(*(torch.cat(part, 1) for part in zip(*bands)))
     value = out.value.to(query.dtype).permute(0, 3, 1, 2)
-    return Attended(value, out.position.permute(0, 3, 1, 2), out.spread, out.peak)
+    return Attended(value, out.position.permute(0, 3, 1, 2), out.deviation, out.peak)
 
 
 def _bands(query: Tensor, key: Tensor, value: Tensor, samples: int) -> list[tuple[int, int]]:
@@ -171,9 +171,9 @@ def _softmax(score: Tensor, counts: Tensor) -> Tensor:
 
 
 def _statistics(weight: Tensor, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Position (b, r, w, 2), spread (b, r, w) and peak (b, r, w) of weights (b, r, w, l)."""
+    """Position (b, r, w, 2), deviation (b, r, w) and peak (b, r, w) of weights (b, r, w, l)."""
     position = torch.einsum("brwl,brwlc->brwc", weight, xy)
     squared = (weight * (xy - position[..., None, :]).square().sum(-1)).sum(-1)
-    positive = squared > LEAST_SPREAD**2
-    spread = torch.where(positive, torch.where(positive, squared, 1).sqrt(), 0)
-    return position, spread, weight.max(-1).values
+    positive = squared > LEAST_DEVIATION**2
+    deviation = torch.where(positive, torch.where(positive, squared, 1).sqrt(), 0)
+    return position, deviation, weight.max(-1).values

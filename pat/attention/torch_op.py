@@ -201,7 +201,7 @@ def _input_again(t: Tensor | None) -> Tensor | None:
 
 def _side_by_side(out: Attended) -> Tensor:
     """Position, spread and peak as the operator gives them: (b, ha, wa, 4)."""
-    return torch.cat([out.position.permute(0, 2, 3, 1), out.spread[..., None], out.peak[..., None]], -1)
+    return torch.cat([out.position.permute(0, 2, 3, 1), out.deviation[..., None], out.peak[..., None]], -1)
 
 
 _attend_backward.register_autograd(_differentiate_again, setup_context=_keep_again)

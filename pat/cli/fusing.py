@@ -56,6 +56,8 @@ class Fuse:
     """Memory limit of the whole process, such as 4GiB; larger frames are fused in tiles."""
     normalise_radiometry: bool = False
     """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
+    response: Annotated[str | None, options.optional("R,G,B|fit")] = None
+    """How a mono alpha weighs red, green and blue, if not as Rec. 601 luma; fit: from matches, with gain and gamma."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -156,6 +158,7 @@ class Fuse:
                 field=options.field_named(self.field),
                 max_memory=self.max_memory,
                 match_levels=self.normalise_radiometry,
+                response=options.response_of(self.response),
                 store=store,
             )
             view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
@@ -167,6 +170,8 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        if self.response is not None:
+            raise ValueError("--response is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,

@@ -13,6 +13,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .inputs import frame_inputs
+from .response import Given, with_response
 from .results import Frame
 from .steps import steps_for
 from .tiles import Plan, fused_in_tiles, plan_frame
@@ -32,6 +33,7 @@ def fuse(
     field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
     max_memory: float | str | None = None,
     match_levels: bool = False,
+    response: Given | None = None,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
@@ -56,6 +58,9 @@ def fuse(
             is nothing else in it. Default: no limit.
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
+        response: how alpha weighs red, green and blue of its one colour beta (three numbers), where that is not Rec.
+            601 luma: a mono sensor without a filter, for instance; "fit" fits it, a gain and a gamma to matches. The
+            result then has alpha as this combination of its colours.
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
@@ -81,6 +86,8 @@ def fuse(
     plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
     if announce:
         announce(plan)
+    inputs, back = with_response(inputs, response)
+    undo.append(back)
     state = network.prepare(inputs.inputs)
     frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
     warn_of_confidence(network, frame, inputs)

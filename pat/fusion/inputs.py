@@ -52,8 +52,8 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
-        _check_overlap(on_grid, pair, name)
         betas.append(Beta(padded(views.images[name][None], m), on_grid))
+        _check_overlap(on_grid, pair, name)
         placements.append(Placement(pair, field.points if isinstance(field, Moved) else lambda x: x))
     return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo), placements, hw)
 

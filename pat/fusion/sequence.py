@@ -50,7 +50,7 @@ SYNCHRONOUS = 0.05
 """Gaps shorter than this part of alpha's frame time count as none."""
 UNKNOWN_MOTION = 0.25
 """The part of the motion in a gap that fields leave room for if no speed is given."""
-REACH = 2.0
+INTERVALS = 2.0
 """Colour is warped from key frames up to this many intervals of theirs away."""
 NEIGHBOURS = 4
 """Radiometry is normalised over this many key frames before and after."""
@@ -240,12 +240,12 @@ class SequenceFusion:
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
-        disparity = max(REACH * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
+        disparity = max(INTERVALS * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
         return [k for k in keys if gaps[k.alpha] <= disparity]
 
     def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> KeyContribution:
         gap = abs(self._time(key.alpha) - self._time(i))
-        nearness = max(1 - gap / (REACH * self.timeline.interval), 1e-3)
+        nearness = max(1 - gap / (INTERVALS * self.timeline.interval), 1e-3)
         if key.alpha == i:
             return KeyContribution(nearness, *colour)
         flow = flow_between(own, self.grey(key.alpha))
@@ -358,7 +358,7 @@ def fuse_sequence(
     job = SequenceFusion(network, rig, frames, alpha, speed, field, match_levels, options)
     keys = job.timeline.key_frames()
 
-    @lru_cache(maxsize=2 * int(REACH) + 1)
+    @lru_cache(maxsize=2 * int(INTERVALS) + 1)
     def colour(number: int) -> KeyColour:
         return job.colour(keys[number])
 

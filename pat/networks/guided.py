@@ -179,7 +179,7 @@ class GuidedPAT(nn.Module):
         query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
         attended = attend_with_statistics(query, key, self._exact(beta.image), window, samples=self.config.taps)
         value = attended.value.to(alpha)
-        facts = [of(value) - alpha, attended.peak[:, None].to(alpha), attended.spread[:, None].to(alpha)]
+        facts = [of(value) - alpha, attended.peak[:, None].to(alpha), attended.deviation[:, None].to(alpha)]
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
@@ -204,7 +204,7 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
     return FusionOutput(
         image,
         [s.attended.position for s in estimates],
-        [s.attended.spread for s in estimates],
+        [s.attended.deviation for s in estimates],
         [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in estimates],
     )
 

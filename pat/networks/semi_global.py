@@ -36,7 +36,7 @@ CONSISTENT = 0.2
 """A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
 LIKENESS = 0.08
 """Difference of brightness at which the weight of a match falls to 1 / e."""
-DOUBT = 0.25
+INCONSISTENT = 0.25
 """Weight of a match that is not consistent, before the likeness."""
 DISPARITY_FILL = (50.0, 4.0)
 """Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
@@ -324,7 +324,7 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
 def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
     """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
     unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
-    return (DOUBT + (1 - DOUBT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+    return (INCONSISTENT + (1 - INCONSISTENT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
 
 
 def diffused_from(

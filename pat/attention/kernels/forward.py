@@ -13,7 +13,7 @@ from .sampling import distribute, find_samples
 from .softmax import find_scores, softmax
 from .vectors import fma, from_index, largest, load, maximum, mul, splat, sub, take, total, zero
 
-LEAST_SPREAD = np.float32(1e-4)
+LEAST_DEVIATION = np.float32(1e-4)
 
 
 @compiled(nogil=True, cache=True)
@@ -102,5 +102,5 @@ def _find_statistics(here, statistics):
         squared = fma(w, fma(dx, dx, mul(dy, dy)), squared)
         peak = maximum(w, peak)
     spread = math.sqrt(total(squared))
-    statistics[2] = spread if spread > LEAST_SPREAD else nothing
+    statistics[2] = spread if spread > LEAST_DEVIATION else nothing
     statistics[3] = largest(peak)

@@ -48,7 +48,7 @@ def test_equals_a_loop_by_hand():
             seen, position, spread, peak = by_hand(q[0, :, y, x], key[0], value[0], xy[y, x], mask[y, x].tolist())
             torch.testing.assert_close(out.value[0, :, y, x], seen)
             torch.testing.assert_close(out.position[0, :, y, x], torch.tensor(position, dtype=torch.float64))
-            assert out.spread[0, y, x].item() == pytest.approx(spread)
+            assert out.deviation[0, y, x].item() == pytest.approx(spread)
             assert out.peak[0, y, x].item() == pytest.approx(peak)
 
 

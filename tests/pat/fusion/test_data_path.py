@@ -11,7 +11,7 @@ import pat.fusion.views
 from arraygeom import Camera, Distortion, Epipolar, Pose, Rig, Sensor, intrinsics
 from pat.fusion.fuse import fuse
 from pat.fusion.sequence import ImageFiles, fuse_sequence
-from pat.fusion.tiles import REACH
+from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
 from pat.media.images import write_image
 from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
@@ -100,7 +100,7 @@ class Counted:
 def test_each_field_is_evaluated_once_a_pixel(tiled, monkeypatch):
     torch.manual_seed(0)
     if tiled:
-        monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(HW, 32, REACH)))
+        monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(HW, 32, MAX_HALO)))
     network, field = GuidedPAT(GuidedPATConfig(**SMALL)).eval(), Counted()
     fuse(network, rig_of("ab"), {"a": smooth(1, 0), "b": smooth(3, 1)}, alpha="a", field=field)
     pixels = {xy: n for xy, n in field.asked.items() if xy[0] % 1 == 0}

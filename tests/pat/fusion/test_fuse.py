@@ -30,7 +30,7 @@ from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs
 from pat.fusion.steps import quarter_turns, resolution_ratio, without_lenses
-from pat.fusion.tiles import REACH, SLACK, tiles_within, working_memory
+from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
@@ -116,7 +116,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     off = (pieces.image - whole.image).abs().amax(0)
     assert (off > 0.005).float().mean() < 1e-3
     hw = sample.rig["mono"].hw
-    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 192, REACH)))
+    monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 192, MAX_HALO)))
     tiled = fuse(network, sample.rig, images, alpha="mono")
     assert (tiled.image - pieces.image).abs().max() < 1e-5
     assert (tiled.confidence - pieces.confidence).abs().max() < 1e-5
@@ -136,7 +136,7 @@ def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
         patched.setattr(
             pat.fusion.tiles,
             "tiles_within",
-            lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), REACH)),
+            lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), MAX_HALO)),
         )
         tiled = fuse(network, rig, images, alpha="left", field=field)
     assert (tiled.image - whole.image).abs().max() < 1e-5
@@ -185,8 +185,8 @@ def test_tiles_are_those_with_the_least_work():
 
     frame = alpha_alone(hw)
     ours = tiles_within(network, frame, limit)
-    side = int(math.sqrt(limit / SLACK / network.bytes_per_pixel)) - 2 * REACH
-    assert work(ours) < 0.95 * work(tiles_of(hw, side, REACH))
+    side = int(math.sqrt(limit / SLACK / network.bytes_per_pixel)) - 2 * MAX_HALO
+    assert work(ours) < 0.95 * work(tiles_of(hw, side, MAX_HALO))
     assert all(working_memory(network, frame.inputs, t) <= limit for t in ours)
 
 

@@ -5,7 +5,7 @@ import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
 from pat.fusion.optical_flow import flow_between, warped
-from pat.fusion.sequence import SequenceFusion, Source, Timeline, flicker, fuse_sequence, mixed
+from pat.fusion.sequence import KeyContribution, SequenceFusion, Timeline, flicker, fuse_sequence, mixed
 from pat.networks.weights import load_weights
 from tests.pat.fusion import moving
 
@@ -69,7 +69,10 @@ def test_colours_mix_by_confidence_and_disagreement_is_doubt():
     own = torch.full((1, 1, 2), 0.5)
     red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
     sure = torch.tensor([[0.9, 0.9]])
-    sources = [Source(1.0, red, sure, sure), Source(1.0, blue, torch.tensor([[0.9, 0.0]]), torch.zeros(1, 2))]
+    sources = [
+        KeyContribution(1.0, red, sure, sure),
+        KeyContribution(1.0, blue, torch.tensor([[0.9, 0.0]]), torch.zeros(1, 2)),
+    ]
     frame = mixed(own, sources)
     torch.testing.assert_close(frame.image[:, 0, 1], torch.tensor([0.7, 0.5, 0.5]), atol=1e-3, rtol=0)
     torch.testing.assert_close(frame.image[:, 0, 0], torch.tensor([0.6, 0.5, 0.6]), atol=1e-3, rtol=0)

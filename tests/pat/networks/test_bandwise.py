@@ -98,7 +98,7 @@ def test_which_cameras_are_put_together():
     assert co_located(rig, "abcd", fields, "no") == [["a"], ["b"], ["c"], ["d"]]
     assert co_located(rig, "abcd", fields | {"c": Rectified(5.0)}, "all") == [["a", "d"], ["b"], ["c"]]
     smaller = Rig({**rig.cameras, "c": rig["c"].resize((32, 48))}, depth=rig.depth)
-    assert together(smaller, "abcd", fields, "all") == [["a", "d"], ["b"], ["c"]]
+    assert co_located(smaller, "abcd", fields, "all") == [["a", "d"], ["b"], ["c"]]
 
 
 def test_only_single_bands():

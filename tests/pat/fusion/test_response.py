@@ -1,0 +1,71 @@
+"""Alpha's response: stated or fitted, applied to beta, and taken back from the result."""
+
+import pytest
+import torch
+
+from pat.data.sample_array import ALPHA, BETA, load_sample
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.fusion.response import Response, fit, stated_response
+from pat.media.colour import REC601, luminance
+from pat.networks.weights import load_weights
+
+WEIGHTS = (0.2, 0.4, 0.4)
+
+
+def combined(image, weights=WEIGHTS):
+    return (image * torch.as_tensor(weights).to(image)[:, None, None]).sum(-3, keepdim=True)
+
+
+@pytest.mark.parametrize("response", [Response(torch.tensor(WEIGHTS).double()), stated_response((0.1, 0.5, 0.6))])
+def test_neutral_stays_neutral_and_luma_becomes_what_alpha_sees(response):
+    image = torch.rand(2, 3, 8, 9, dtype=torch.float64)
+    applied = response.applied(image)
+    seen = response.gain * combined(image, response.weights)
+    torch.testing.assert_close(luminance(applied), seen)
+    torch.testing.assert_close(response.undone(applied), response.gain * image)
+    grey = torch.rand(1, 1, 8, 9, dtype=torch.float64).expand(-1, 3, -1, -1)
+    torch.testing.assert_close(response.applied(grey), response.gain * grey)
+
+
+@pytest.mark.parametrize("gamma", [0.77, 1.0, 1.3])
+@pytest.mark.parametrize("weights", [REC601, WEIGHTS, (0.6, 0.3, 0.1)])
+def test_a_response_is_recovered_from_colourful_points(weights, gamma):
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(3, 4000, generator=g) * 0.9 + 0.05
+    alpha = 0.8 * (torch.tensor(weights)[:, None] * x**gamma).sum(0) + 0.01 * torch.randn(4000, generator=g)
+    alpha[::20] = torch.rand(200, generator=g)  # wrong matches
+    found = fit(x, alpha)
+    assert found.gamma == gamma
+    assert found.gain == pytest.approx(0.8, abs=0.03)
+    assert (found.weights - torch.tensor(weights)).abs().max() < 0.03
+    assert found.is_rec601 is False
+
+
+def test_grey_points_leave_rec601():
+    g = torch.Generator().manual_seed(0)
+    x = (torch.rand(1, 4000, generator=g) * 0.9 + 0.05).expand(3, -1) + 0.005 * torch.randn(3, 4000, generator=g)
+    assert fit(x, x.mean(0) + 0.01 * torch.randn(4000, generator=g)).is_rec601
+
+
+def test_fusion_of_another_response():
+    """Taken for Rec. 601, the colours of this alpha are several dB off; with its response stated they are not."""
+    sample, network = load_sample(), load_weights("mono-colour-small")
+    images = {ALPHA: combined(sample.ground_truth), BETA: sample.images[BETA]}
+
+    def psnr(response, given=images):
+        frame = fuse(network, sample.rig, given, alpha=ALPHA, response=response)
+        return score(frame.image.clamp(0, 1), sample.ground_truth).psnr, frame
+
+    ideal, _ = psnr(None, images | {ALPHA: luminance(sample.ground_truth)})
+    plain, _ = psnr(None)
+    stated, frame = psnr(WEIGHTS)
+    torch.testing.assert_close(combined(frame.image), images[ALPHA], atol=1e-4, rtol=0)
+    assert stated > ideal - 1.0
+    assert stated > plain + 2.0
+
+
+@pytest.mark.parametrize("wrong", [(0.5, 0.5), (0.5, -0.1, 0.6), (0.0, 0.0, 0.0), (float("nan"), 1.0, 1.0)])
+def test_wrong_responses_are_refused(wrong):
+    with pytest.raises(ValueError, match="three weights, of red, green and blue"):
+        stated_response(wrong)
