@@ -47,10 +47,15 @@ class Batched:
         return map_tensors(self, chosen)
 
     def to(self: T, *args: Any, **kwargs: Any) -> T:
-        """Like `Tensor.to`, for every tensor; a change of dtype leaves masks alone."""
+        """Like `Tensor.to`, for every tensor; a change of dtype leaves masks alone.
+
+        Raises TypeError for a dtype that is not floating point.
+        """
 
         def moved(t: Tensor, axes: int) -> Tensor:
             there = t.to(*args, **kwargs)
+            if t.is_floating_point() and not there.is_floating_point():
+                raise TypeError(f"the numbers of a {type(self).__name__} are floating point; got {there.dtype}")
             return there if t.is_floating_point() else there.to(t.dtype)
 
         return map_tensors(self, moved)

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, TypeVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
 from .distortion import Distortion
-from .pixels import HW, map_homogeneous, resize_matrix, rot90_matrix, shift_matrix, to_homogeneous
+from .pixels import HW, floating, map_homogeneous, product, resize_matrix, rot90_matrix, shift_matrix, to_homogeneous
 from .pose import Pose
 from .sensor import Sensor
 from .text import view_text
@@ -56,15 +56,15 @@ class View(Batched):
         """The camera of the image whose pixels are x' ~ A x, of size `hw`."""
         return self.replace(hw=hw)
 
-    def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Undistorted pixels, and which of them are within the lens model's range."""
-        return x, torch.ones_like(x[..., 0], dtype=torch.bool)
+        return floating(x), torch.ones_like(x[..., 0], dtype=torch.bool)
 
-    def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def distort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Undistorted pixels to those of the image: the inverse of `undistort`."""
-        return x, torch.ones_like(x[..., 0], dtype=torch.bool)
+        return floating(x), torch.ones_like(x[..., 0], dtype=torch.bool)
 
-    def contains(self, x: Float[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
+    def contains(self, x: Real[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
         """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
         h, w = self.hw
         return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
@@ -91,29 +91,30 @@ class LensView(View):
     K: Float[Tensor, "*b 3 3"]
     distortion: Distortion | None = None
 
-    def project_local(self, X: Float[Tensor, "*n 3"]) -> Projected:
+    def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
+        X = floating(X)
         normalised, valid = self._through_lens(X)
         return Projected(map_homogeneous(self.K[..., :2, :], normalised), X[..., 2], valid)
 
-    def rays(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
+    def rays(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*m 3"], Bool[Tensor, "*m"]]:
         """The rays of pixels in the camera's frame, z = 1 for pinholes, and their validity."""
         normalised = map_homogeneous(torch.linalg.inv(self.K)[..., :2, :], x)
         if self.distortion is None:
             return to_homogeneous(normalised), torch.ones_like(normalised[..., 0], dtype=torch.bool)
         return self.distortion.unproject(normalised)
 
-    def undistort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def undistort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Pixels of a pinhole with the same K, and which are within the lens model's range."""
         return self._each_through(Distortion.undistort, x)
 
-    def distort(self, x: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def distort(self, x: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Undistorted pixels to those of the image: the inverse of `undistort`."""
         return self._each_through(Distortion.distort, x)
 
     def transformed(self: AnyLensView, A: Float[Tensor, "3 3"], hw: HW) -> AnyLensView:
         """The camera of the image whose pixels are x' ~ A x, of size `hw`: K' = A K."""
-        return self.replace(K=A.to(self.K) @ self.K, hw=hw)
+        return self.replace(K=product(A.to(self.K), self.K), hw=hw)
 
     def _through_lens(self, X: Tensor) -> tuple[Tensor, Tensor]:
         if self.distortion is not None:
@@ -165,11 +166,11 @@ class Camera(LensView):
         """The optical centre in the world, metres."""
         return self.cam_from_world.centre
 
-    def project(self, X: Float[Tensor, "*n 3"]) -> Projected:
-        """World points (*n, 3) to pixels; with a batched camera (*b), points are (*b, n, 3)."""
+    def project(self, X: Real[Tensor, "*n 3"]) -> Projected:
+        """World points (*n, 3) to pixels; with a batched camera (*b), points are (*b, ..., 3)."""
         return self.project_local(self.cam_from_world.apply(X))
 
-    def unproject(self, x: Float[Tensor, "*n 2"], depth: Float[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
+    def unproject(self, x: Real[Tensor, "*n 2"], depth: Real[Tensor, "*n"]) -> Float[Tensor, "*n 3"]:
         """Pixels at depth z (metres) to world points. Pixels outside the lens's range give NaN.
 
         Raises nothing: `rays` gives the validity.
@@ -213,13 +214,27 @@ class Camera(LensView):
 
 
 def intrinsics(
-    focal: tuple[float, float] | float, hw: HW, centre: tuple[float, float] | None = None
+    focal: tuple[Any, Any] | float | Tensor, hw: HW, centre: tuple[Any, Any] | Tensor | None = None
 ) -> Float[Tensor, "3 3"]:
-    """K from focal lengths and the principal point in pixels; by default the image's middle.
+    """K in float64 from focal lengths and the principal point in pixels; by default the image's middle.
+
+    Tensors of one or two numbers serve as well, with their gradient.
 
     >>> intrinsics(500.0, (480, 640))[0].tolist()
     [500.0, 0.0, 319.5]
     """
-    fx, fy = focal if isinstance(focal, tuple) else (focal, focal)
-    cx, cy = centre or ((hw[1] - 1) / 2, (hw[0] - 1) / 2)
-    return torch.tensor([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], dtype=torch.float64)
+    fx, fy = _two(focal, "focal")
+    cx, cy = _two(((hw[1] - 1) / 2, (hw[0] - 1) / 2) if centre is None else centre, "centre")
+    entries = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
+    device = next((v.device for v in entries if isinstance(v, Tensor)), None)
+    return torch.stack([torch.as_tensor(v, dtype=torch.float64, device=device) for v in entries]).reshape(3, 3)
+
+
+def _two(value: Any, name: str) -> tuple[Any, Any]:
+    """Two numbers; a single one counts for both."""
+    if isinstance(value, Tensor) and value.numel() > 1:
+        value = tuple(value)
+    pair = tuple(value) if isinstance(value, tuple | list) else (value, value)
+    if len(pair) != 2:
+        raise ValueError(f"{name} is one number or two, in pixels; got {len(pair)}: make one K a camera and stack them")
+    return tuple(v.reshape(()) if isinstance(v, Tensor) else v for v in pair)  # type: ignore[return-value]

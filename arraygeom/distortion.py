@@ -24,10 +24,11 @@ from math import pi
 from typing import ClassVar
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .pixels import floating, product
 from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
@@ -43,6 +44,10 @@ WIDEST = 1e3
 POLE = 0.9
 # How far beyond the limit the search for an inverse may pass (in squared radius); short of a pole.
 BEYOND = 1.1
+# Squared radii are at least this in divisions, for lenses that are valid nowhere.
+TINY = 1e-30
+# An inverse counts as found from this residual on, in units of rounding.
+SOLVED = 64
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -68,7 +73,12 @@ class Distortion(Batched):
             given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
 
-    def distort(self, xy: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    @property
+    def is_identity(self) -> bool:
+        """Whether this lens distorts nothing: Brown-Conrady with all coefficients 0."""
+        return self.model == BROWN_CONRADY and not bool(self.coefficients.any())
+
+    def distort(self, xy: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Normalised pinhole points to distorted ones, and which are inside the model's range."""
         xy, finite = _finite(xy)
         if self.model == KANNALA_BRANDT:
@@ -77,7 +87,7 @@ class Distortion(Batched):
             xy_d, valid = _brown_distort(self._lifted(xy), xy)
         return xy_d, valid & finite
 
-    def undistort(self, xy_d: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def undistort(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Distorted points to normalised pinhole ones: the inverse of `distort`, iterated to convergence.
 
         A fisheye ray at 90 degrees or more has no pinhole point and is not valid: see `unproject`.
@@ -91,7 +101,7 @@ class Distortion(Batched):
             xy, valid = _brown_undistort(self._lifted(xy_d), xy_d)
         return xy, valid & finite
 
-    def project(self, X: Float[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    def project(self, X: Real[Tensor, "*n 3"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
         """Points in the camera's frame (any unit) to distorted normalised points.
 
         Brown-Conrady: only points ahead (z > 0) are valid. Kannala-Brandt: any direction that the polynomial
@@ -105,7 +115,7 @@ class Distortion(Batched):
         xy_d, valid = self.distort(X[..., :2] / torch.where(ahead, X[..., 2], 1)[..., None])
         return xy_d, valid & ahead & finite
 
-    def unproject(self, xy_d: Float[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
+    def unproject(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 3"], Bool[Tensor, "*n"]]:
         """Distorted normalised points to unit directions in the camera's frame: the inverse of `project`."""
         if self.model == KANNALA_BRANDT:
             xy_d, finite = _finite(xy_d)
@@ -148,7 +158,7 @@ def _brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     limit = _brown_limit(lens).to(xy)
     squared = xy.square().sum(-1)
     inside = squared < limit
-    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared)).sqrt())
+    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())
     planar, jacobian = _brown_planar(lens, xy * pull[..., None])
     tilted, ahead = _tilt(lens, planar)
     return tilted, inside & _orients(jacobian) & ahead
@@ -232,7 +242,7 @@ def _brown_inverse(lens: _Brown, target: Tensor, limit: Tensor) -> tuple[Tensor,
     for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
         attempt = _brown_solve(lens, torch.where(valid[..., None], solved, begin), target, limit)
         planar, jacobian = _brown_planar(lens, attempt)
-        tolerance = 64 * torch.finfo(target.dtype).eps * (1 + _norm(target))
+        tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + _norm(target))
         valid = (_norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & _orients(jacobian)
         solved = torch.where(valid[..., None], attempt, start)
         if bool(valid.all()):
@@ -283,8 +293,8 @@ def _tilt_matrix(lens: _Brown) -> Tensor | None:
         return None
     from kornia.geometry.calibration.distort import tilt_projection
 
-    tx, ty = lens.tilt
-    return tilt_projection(tx[..., None], ty[..., None])
+    tx, ty = (angle.double()[..., None] for angle in lens.tilt)  # in float64, which autocast leaves alone
+    return tilt_projection(tx, ty)
 
 
 def _tilt(lens: _Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
@@ -301,7 +311,7 @@ def _apply(H: Tensor | None, xy: Tensor) -> tuple[Tensor, Tensor]:
     """The homography H of points, and which lie on this side of the line it sends to infinity."""
     if H is None:
         return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
-    p = (H.to(xy) @ _homogeneous(xy)[..., None])[..., 0]
+    p = product(H.to(xy), _homogeneous(xy)[..., None])[..., 0]
     ahead = p[..., 2] > 1 / WIDEST
     return p[..., :2] / torch.where(ahead, p[..., 2], 1.0)[..., None], ahead
 
@@ -316,7 +326,7 @@ def _fisheye_project(c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
     v = u * ratio.square()
     limit = _fisheye_limit(c).to(v)
     inside = v < limit
-    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, v)).sqrt())
+    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, v.clamp(min=TINY))).sqrt())
     p, _ = _fisheye_factor(c, torch.where(inside, v, limit))
     return xy * (ratio * pull * p)[..., None], inside & ((u > 0) | (z > 0))
 
@@ -327,7 +337,7 @@ def _fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     u_d = xy_d.square().sum(-1)
     outermost = limit * _fisheye_factor(c, limit)[0].square()
     inside = u_d < outermost
-    pull = torch.where(inside, 1.0, (outermost / torch.where(inside, 1.0, u_d)).sqrt())
+    pull = torch.where(inside, 1.0, (outermost / torch.where(inside, 1.0, u_d.clamp(min=TINY))).sqrt())
     xy_d = xy_d * pull[..., None]
     u_d = torch.where(inside, u_d, outermost)
     v = _fisheye_start(c, u_d, limit)
@@ -335,6 +345,7 @@ def _fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
         p, slope = _fisheye_factor(c, v)
         v = v - (v * p.square() - u_d) / (p * slope)
     p, _ = _fisheye_factor(c, v)
+    inside = inside & ((v * p.square() - u_d).abs() <= SOLVED * torch.finfo(u_d.dtype).eps * (1 + u_d))
     cosine, sinc = _cosine_and_sinc(v)
     return _unit(torch.cat([xy_d * (sinc / p)[..., None], cosine[..., None]], -1)), inside
 
@@ -387,18 +398,30 @@ def _cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _first_root(coefficients: Tensor) -> Tensor:
-    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none.
+    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none, 0 if an a is not finite.
 
     `coefficients` (*b, n + 1) starts with the 1. The roots are the inverses of those of the reversed
     polynomial, which is monic, so a leading coefficient of 0 needs no care: eigenvalues of its companion.
+    Huge coefficients, with which LAPACK crashes, are scaled down first (u = s w, with s a power of 2).
     """
     a = coefficients[..., 1:]
     n = a.shape[-1]
+    finite = a.isfinite().all(-1)
+    a = torch.where(finite[..., None], a, 0.0)
+    powers = torch.arange(1, n + 1).to(a)
+    size = (a.abs() ** (1 / powers)).amax(-1)
+    scale = torch.where(size > HUGE, torch.exp2(-size.clamp(min=1.0).log2().ceil()), 1.0)
+    a = a * scale[..., None] ** powers
     companion = torch.diag_embed(torch.ones_like(a[..., 1:]), offset=-1)
     companion = companion - torch.cat([a[..., None, :], a.new_zeros((*a.shape[:-1], n - 1, n))], -2)
     inverse_roots = torch.linalg.eigvals(companion)
     positive = (inverse_roots.imag == 0) & (inverse_roots.real > 0)
-    return 1 / torch.where(positive, inverse_roots.real, 0.0).amax(-1)
+    root = scale / torch.where(positive, inverse_roots.real, 0.0).amax(-1)
+    return torch.where(finite, root, 0.0)
+
+
+HUGE = 1e4
+"""Coefficients from the n-th power of this on are scaled before their roots are sought; no lens has such."""
 
 
 def _invert_increasing(
@@ -412,16 +435,25 @@ def _invert_increasing(
     y = torch.where(reached, y, 0.0)
     low, top = torch.zeros_like(y), high
     r = torch.minimum(y, high)
-    for _ in range(iterations):
+    step = high.expand_as(r)
+    for i in range(iterations):
         value, slope = f(r)
         low, top = torch.where(value < y, r, low), torch.where(value > y, r, top)
         newton = r - (value - y) / slope
-        following = torch.where((newton >= low) & (newton <= top), newton, (low + top) / 2)
-        moved = (following - r).abs() > 4 * torch.finfo(y.dtype).eps * following
+        enough = 4 * torch.finfo(y.dtype).eps * r
+        # Newton's steps can cycle within the bracket: from some iteration on either they halve or the bracket does.
+        cycles = ((newton - r).abs() > torch.maximum(step / 2, enough)) & (i >= PATIENCE)
+        following = torch.where((newton >= low) & (newton <= top) & ~cycles, newton, (low + top) / 2)
+        step = (following - r).abs()
+        moved = step > enough
         r = following
         if not bool(moved.any()):
             break
     return torch.where(reached, r, high)
+
+
+PATIENCE = 12
+"""Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket."""
 
 
 def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Tensor]:
@@ -447,5 +479,6 @@ def _norm(xy: Tensor) -> Tensor:
 
 def _finite(points: Tensor) -> tuple[Tensor, Tensor]:
     """Points with those that hold a NaN or an infinity at the origin, and which did not."""
+    points = floating(points)
     finite = points.isfinite().all(-1)
     return torch.where(finite[..., None], points, 0.0), finite

@@ -9,26 +9,26 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .pixels import HW, map_homogeneous, to_homogeneous
+from .homography import infinite_homography
+from .pixels import HW, floating, map_homogeneous, product, to_homogeneous
 from .pose import Pose, cross_matrix, matvec
 from .segments import FLAT, Segments
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
     """E = [t]x R (H&Z 9.12)."""
-    return cross_matrix(beta_from_alpha.t) @ beta_from_alpha.R
+    return product(cross_matrix(beta_from_alpha.t), beta_from_alpha.R)
 
 
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
     """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0."""
-    from kornia.geometry.epipolar import fundamental_from_essential
-
-    return fundamental_from_essential(essential_matrix(beta_from_alpha), K_alpha, K_beta)
+    E = essential_matrix(beta_from_alpha)
+    return product(product(torch.linalg.inv(K_beta).mT, E), torch.linalg.inv(K_alpha))
 
 
 def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor, "*b 3 3"]:
@@ -38,10 +38,10 @@ def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor
     """
     T = torch.eye(3, dtype=F.dtype, device=F.device)
     T[:2, 2] = first_pixel
-    return T.T @ F @ T
+    return product(product(T.T, F), T)
 
 
-def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
+def epipolar_lines(F: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m 3"]:
     """l_beta = F x_alpha, scaled so that l . (x, y, 1) is a distance in pixels.
 
     At alpha's epipole, and where F is zero, there is no line: all zeros. Batched F as in `map_homogeneous`.
@@ -65,10 +65,10 @@ def epipoles(F: Float[Tensor, "*b 3 3"]) -> tuple[Float[Tensor, "*b 3"], Float[T
 
 
 def epipolar_distance(
-    F: Float[Tensor, "*b 3 3"], x_alpha: Float[Tensor, "*n 2"], x_beta: Float[Tensor, "*n 2"]
+    F: Float[Tensor, "*b 3 3"], x_alpha: Real[Tensor, "*n 2"], x_beta: Real[Tensor, "*n 2"]
 ) -> Float[Tensor, "*n"]:
     """Signed distance in pixels from x_beta to the line of x_alpha."""
-    return (epipolar_lines(F, x_alpha) * to_homogeneous(x_beta)).sum(-1)
+    return (epipolar_lines(F, x_alpha) * to_homogeneous(floating(x_beta))).sum(-1)
 
 
 class Track(NamedTuple):
@@ -92,14 +92,14 @@ def track(
     K_alpha: Float[Tensor, "*b 3 3"],
     K_beta: Float[Tensor, "*b 3 3"],
     beta_from_alpha: Pose,
-    x: Float[Tensor, "*n 2"],
+    x: Real[Tensor, "*n 2"],
 ) -> Track:
     """The track in beta of each alpha pixel. Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
 
     Matrices are composed in their own precision, pixels computed in that of `x`.
     """
-    a = map_homogeneous(K_beta @ beta_from_alpha.R @ torch.linalg.inv(K_alpha), x)
-    b = matvec(K_beta, beta_from_alpha.t).to(x.dtype)
+    a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
+    b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)
     return Track(a, _beside(b, a.ndim, trailing=1))
 
 
@@ -176,7 +176,7 @@ class Depth(NamedTuple):
     valid: Bool[Tensor, "*n"]
 
 
-def depth_from_track(track: Track, x: Float[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None) -> Depth:
+def depth_from_track(track: Track, x: Real[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None) -> Depth:
     """Depth in alpha of the point of a track nearest to beta's pixels `x`.
 
     `deviation` is the standard deviation of x along the track in pixels (default 0); the depth's is
@@ -184,6 +184,7 @@ def depth_from_track(track: Track, x: Float[Tensor, "*n 2"], deviation: Float[Te
     the depth is not positive or the point not in front of beta.
     """
     a, b = track
+    x = floating(x)
     c, e = (v[..., :2] - x * v[..., 2:] for v in (a, b))
     along = b[..., :2] * a[..., 2:] - a[..., :2] * b[..., 2:]
     slope = (e * along).sum(-1)

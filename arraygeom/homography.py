@@ -9,10 +9,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .pixels import map_homogeneous, to_homogeneous
+from .pixels import map_homogeneous, product, to_homogeneous
 
 
 class TransformedPoints(NamedTuple):
@@ -38,17 +38,18 @@ def plane_homography(
     (Z_beta / Z_alpha) (x_beta, 1), so its third entry is positive for points in front of both cameras.
     A plane through alpha's centre (d = 0) has no homography: the result is not finite.
     """
-    return K_beta @ (R - t[..., :, None] * (normal / d[..., None])[..., None, :]) @ torch.linalg.inv(K_alpha)
+    plane = R - t[..., :, None] * (normal / d[..., None])[..., None, :]
+    return product(product(K_beta, plane), torch.linalg.inv(K_alpha))
 
 
 def infinite_homography(
     K_alpha: Float[Tensor, "*#b 3 3"], K_beta: Float[Tensor, "*#b 3 3"], R: Float[Tensor, "*#b 3 3"]
 ) -> Float[Tensor, "*b 3 3"]:
     """H = K_beta R K_alpha^-1: where points at infinite depth go (Hartley & Zisserman, section 13.4)."""
-    return K_beta @ R @ torch.linalg.inv(K_alpha)
+    return product(product(K_beta, R), torch.linalg.inv(K_alpha))
 
 
-def apply_homography(H: Float[Tensor, "*b 3 3"], x: Float[Tensor, "*n 2"]) -> TransformedPoints:
+def apply_homography(H: Float[Tensor, "*b 3 3"], x: Real[Tensor, "*n 2"]) -> TransformedPoints:
     """Map points (*n, 2); with batched H (*b), points are (*b, ..., 2).
 
     `valid` where the result is finite and its homogeneous scale is positive. The sign of H matters:
@@ -72,38 +73,90 @@ def fit_similarity(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"]) -> Float[Te
 
     Umeyama 1991 in two dimensions, in closed form: as complex numbers y = a x + b.
     """
+    dtype = torch.promote_types(x.dtype, y.dtype)
+    x, y = x.double(), y.double()
     x_mean, y_mean = x.mean(0), y.mean(0)
     u, v = x - x_mean, y - y_mean
     squared = u.square().sum()
     a = (u * v).sum() / squared
     b = (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]).sum() / squared
     linear = torch.stack([torch.stack([a, -b]), torch.stack([b, a])])
-    return _affine(linear, y_mean - linear @ x_mean)
+    return _affine(linear, y_mean - linear @ x_mean).to(dtype)
 
 
 def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: int = 10) -> Float[Tensor, "3 3"]:
     """The homography that takes x nearest to y, least squares in the pixels of y; n >= 4.
 
-    Gauss-Newton from the affine fit, on points centred and scaled (Hartley & Zisserman, section 4.4); oriented
-    so that the scale is positive at the points. Differentiable, through the steps.
+    Levenberg and Marquardt's steps from the better of the affine and the linear fit (Hartley & Zisserman, algorithm
+    4.2), on points centred and scaled (section 4.4), computed in float64; oriented so that the scale is positive at the
+    points. Differentiable, through `steps` of Gauss and Newton at the end. Raises ValueError where there is no such
+    homography: points on a line, or some that would be behind.
     """
+    dtype = torch.promote_types(x.dtype, y.dtype)
+    x, y = x.double(), y.double()
     A, B = _normalising(x), _normalising(y)
     u, v = x @ A[:2, :2].T + A[:2, 2], y @ B[:2, :2].T + B[:2, 2]
     u1 = to_homogeneous(u)
-    H = torch.cat([torch.linalg.lstsq(u1, v).solution.T, u.new_tensor([[0.0, 0.0, 1.0]])])
+    H = _damped_fit(u1.detach(), v.detach())
     for _ in range(steps):
-        w = u1 @ H[2]
-        transformed = (u1 @ H[:2].T) / w[:, None]
-        p = u1 / w[:, None]
-        zero = torch.zeros_like(p)
-        slopes = [
-            torch.cat([*block, -m * p[:, :2]], -1)
-            for block, m in (([p, zero], transformed[:, :1]), ([zero, p], transformed[:, 1:]))
-        ]
-        J, residual = torch.cat(slopes), (v - transformed).T.reshape(-1)
-        step = torch.linalg.solve(J.T @ J + 1e-12 * torch.eye(8).to(J), J.T @ residual)
-        H = H + torch.nn.functional.pad(step, (0, 1)).reshape(3, 3)
-    return torch.linalg.inv(B) @ H @ A
+        trial = _stepped(H, u1, v, 1e-12)
+        with torch.no_grad():
+            kept = _cost(trial, u1, v) <= _cost(H, u1, v) * (1 + 1e-9) + 1e-24
+        H = torch.where(kept, trial, H)
+    if not bool(_cost(H.detach(), u1, v).isfinite()):
+        raise ValueError("no homography takes these points to those, all of them in front: check the matches")
+    return (torch.linalg.inv(B) @ H @ A).to(dtype)
+
+
+@torch.no_grad()
+def _damped_fit(u1: Tensor, v: Tensor, iterations: int = 50) -> Tensor:
+    """The least squares homography of normalised points, H[2, 2] = 1 where possible."""
+    affine = torch.cat([torch.linalg.lstsq(u1, v).solution.T, u1.new_tensor([[0.0, 0.0, 1.0]])])
+    linear = _linear_fit(u1, v)
+    linear = linear / torch.where(linear[2, 2] > 0, linear[2, 2], 1.0)
+    H = min((affine, linear), key=lambda start: float(_cost(start, u1, v)))
+    damping, cost = 1e-6, _cost(H, u1, v)
+    for _ in range(iterations):
+        trial = _stepped(H, u1, v, damping)
+        reached = _cost(trial, u1, v)
+        better = bool(reached < cost)
+        if better and bool(cost - reached <= 1e-15 * cost):
+            return trial
+        H, cost = (trial, reached) if better else (H, cost)
+        damping = max(damping / 10, 1e-12) if better else damping * 10
+        if damping > 1e6:
+            break
+    return H
+
+
+def _linear_fit(u1: Tensor, v: Tensor) -> Tensor:
+    """Least algebraic error (algorithm 4.1), oriented by the points."""
+    zero = torch.zeros_like(u1)
+    rows = torch.cat([torch.cat([u1, zero, -v[:, :1] * u1], 1), torch.cat([zero, u1, -v[:, 1:] * u1], 1)])
+    H = torch.linalg.eigh(rows.T @ rows).eigenvectors[:, 0].reshape(3, 3)
+    return H / torch.where((u1 @ H[2]).mean() > 0, 1.0, -1.0) / H.norm()
+
+
+def _cost(H: Tensor, u1: Tensor, v: Tensor) -> Tensor:
+    """Sum of squared distances; infinite if a point is not in front."""
+    w = u1 @ H[2]
+    squared = ((u1 @ H[:2].T) / w[:, None] - v).square().sum()
+    return torch.where((w > 0).all() & squared.isfinite(), squared, torch.inf)
+
+
+def _stepped(H: Tensor, u1: Tensor, v: Tensor, damping: float) -> Tensor:
+    """H after one Gauss-Newton step in all of its entries but the scale."""
+    w = u1 @ H[2]
+    transformed = (u1 @ H[:2].T) / w[:, None]
+    p = u1 / w[:, None]
+    zero = torch.zeros_like(p)
+    slopes = [
+        torch.cat([*block, -m * p[:, :2]], -1)
+        for block, m in (([p, zero], transformed[:, :1]), ([zero, p], transformed[:, 1:]))
+    ]
+    J, residual = torch.cat(slopes), (v - transformed).T.reshape(-1)
+    step = torch.linalg.solve(J.T @ J + damping * torch.eye(8).to(J), J.T @ residual)
+    return H + torch.nn.functional.pad(step, (0, 1)).reshape(3, 3)
 
 
 def _normalising(x: Tensor) -> Tensor:

@@ -7,7 +7,7 @@ K' = A K, fundamental matrices by F' = A_beta^-T F A_alpha^-1.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 HW = tuple[int, int]
@@ -53,13 +53,34 @@ def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
     return A
 
 
-def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:
-    """M (x, y, 1) for every point, in the precision of `x`.
+def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
+    """Pixels in float32 or float64: integers and half precision, which holds no pixel position, become float32."""
+    return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Tensor, "*d i k"]:
+    """The matrix product of small matrices in the wider of their types, float32 or float64.
+
+    Float32 by multiplications and additions of its own: TF32 and autocast lower `matmul` to ten or eight bits.
+    """
+    dtype = torch.promote_types(torch.promote_types(A.dtype, B.dtype), torch.float32)
+    A, B = A.to(dtype), B.to(dtype)
+    if dtype == torch.float64:
+        return A @ B
+    total = A[..., :1] * B[..., :1, :]
+    for j in range(1, A.shape[-1]):
+        total = torch.addcmul(total, A[..., j, None], B[..., j, None, :])
+    return total
+
+
+def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:
+    """M (x, y, 1) for every point, in the precision of `x` (`floating`).
 
     A batch of matrices (*b, k, 3) takes points (*b, ..., 2), or with axes of length 1 in place of *b.
     By multiplications and additions of its own rather than by `matmul`, whose precision TF32 and autocast lower
     to ten or eight bits: pixels need all of them. Raises ValueError for points without the batch's axes.
     """
+    x = floating(x)
     batch = M.ndim - 2
     if x.ndim - 1 < batch:
         raise ValueError(

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .pixels import floating, product
 from .text import pose_text
 
 
@@ -35,16 +36,27 @@ class Pose(Batched):
         return cls(R, -matvec(R, centre))
 
     def __matmul__(self, other: Pose) -> Pose:
-        return Pose(self.R @ other.R, matvec(self.R, other.t) + self.t)
+        return Pose(product(self.R, other.R), matvec(self.R, other.t) + self.t)
 
     def inverse(self) -> Pose:
         """`from_to_to`: the transform the other way."""
         Rt = self.R.transpose(-1, -2)
         return Pose(Rt, -matvec(Rt, self.t))
 
-    def apply(self, X: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
-        """Points (*n, 3) to R X + t. With batched poses (*b), points are (*b, n, 3)."""
-        return X @ self.R.transpose(-1, -2) + (self.t if self.t.ndim == 1 else self.t[..., None, :])
+    def apply(self, X: Real[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
+        """Points (*n, 3) to R X + t. With batched poses (*b), points are (*b, ..., 3).
+
+        Raises ValueError for points without the batch's axes.
+        """
+        X, batch = floating(X), self.batch_shape
+        if X.ndim - 1 < len(batch):
+            raise ValueError(f"poses batched over {tuple(batch)} need points (*batch, ..., 3), got {tuple(X.shape)}")
+        beside = (..., *[None] * (X.ndim - 1 - len(batch)))
+        t = self.t.expand(*batch, 3).movedim(-1, 0)[beside].movedim(0, -1)
+        if X.ndim - 1 == len(batch):
+            return matvec(self.R, X) + t
+        R = self.R.expand(*batch, 3, 3).movedim((-2, -1), (0, 1))[beside[:-1]].movedim((0, 1), (-2, -1))
+        return product(X, R.mT) + t
 
     @property
     def centre(self) -> Float[Tensor, "*b 3"]:
@@ -59,7 +71,7 @@ class Pose(Batched):
         The rounding of the product is taken out again, so that steps do not add up to a drift.
         `rotation` is a rotation vector in radians, about the axes of `to`.
         """
-        R = self.R if rotation is None else nearest_rotation(rotation_from_vector(rotation) @ self.R)
+        R = self.R if rotation is None else nearest_rotation(product(rotation_from_vector(rotation), self.R))
         return Pose(R, self.t if translation is None else self.t + translation)
 
     def _text(self) -> str:
@@ -75,7 +87,7 @@ def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
     """The matrix times the vector."""
-    return (M @ v[..., None])[..., 0]
+    return product(M, v[..., None])[..., 0]
 
 
 def rotation_from_vector(w: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
@@ -101,11 +113,11 @@ def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:
     """A matrix that is a rotation but for rounding, made one to rounding squared: R (3 I - R^T R) / 2."""
-    return 1.5 * R - 0.5 * R @ (R.transpose(-1, -2) @ R)
+    return 1.5 * R - product(0.5 * R, product(R.mT, R))
 
 
 def rotation_error(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b"]:
     """How far R is from a rotation: the largest entry of |R R^T - I|, or 2 for a reflection."""
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    error = (R @ R.transpose(-1, -2) - eye).abs().amax((-1, -2))
+    error = (product(R, R.mT) - eye).abs().amax((-1, -2))
     return torch.where(torch.linalg.det(R) > 0, error, error.clamp(min=2.0))

@@ -9,7 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .camera import Camera, intrinsics
-from .pixels import HW
+from .homography import infinite_homography
+from .pixels import HW, product
 from .pose import Pose, cross_matrix, matvec, rotation_from_vector, rotation_vector
 from .rig import Pair
 
@@ -34,7 +35,8 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     The new images have the size `hw` (alpha's) and the intrinsics `K`; by default the smaller of the two focal
     lengths, and the centres of the old images about the middle of the new. The same R_alpha and R_beta as
     OpenCV's `stereoRectify` for a horizontal pair; a vertical one is rotated by 90 degrees, so that lines are rows
-    here too. Differentiable in everything. Raises ValueError for lenses, batches, and without a baseline.
+    here too. Differentiable in everything. Raises ValueError for lenses, batches, without a baseline, and where the
+    baseline is so near an optical axis (motion forwards) that the new images would lie beside the old ones.
     """
     alpha, beta = pair.cameras
     if alpha.distortion is not None or beta.distortion is not None:
@@ -45,31 +47,38 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     if not pose.t.norm() > 1e-12:
         raise ValueError("two co-located cameras cannot be rectified: there is no baseline")
     R_alpha, R_beta = rectifying_rotations(pose)
+    for camera, R in ((alpha, R_alpha), (beta, R_beta)):
+        ray = _middle_ray(camera, R)
+        if not ray[2] > NEAREST_COSINE * ray.norm():
+            raise ValueError(
+                "the baseline is nearly along an optical axis (motion forwards): no homography turns lines into rows; "
+                "use the pair as it is, with Epipolar or Curved"
+            )
     hw = hw or alpha.hw
     K = middle_intrinsics((alpha, beta), (R_alpha, R_beta), hw) if K is None else K
     new_alpha, new_beta = (
-        Camera(K=K, cam_from_world=Pose(R @ c.R, matvec(R, c.t)), hw=hw, sensor=c.sensor)
+        Camera(K=K, cam_from_world=Pose(product(R, c.R), matvec(R, c.t)), hw=hw, sensor=c.sensor)
         for c, R in ((alpha, R_alpha), (beta, R_beta))
     )
-    H_alpha, H_beta = (K @ R @ torch.linalg.inv(c.K) for c, R in ((alpha, R_alpha), (beta, R_beta)))
+    H_alpha, H_beta = (infinite_homography(c.K, K, R) for c, R in ((alpha, R_alpha), (beta, R_beta)))
     return Rectification(R_alpha, R_beta, H_alpha, H_beta, Pair(new_alpha, new_beta, pair.depth))
 
 
 def rectifying_rotations(beta_from_alpha: Pose) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3 3"]]:
     """(R_alpha, R_beta): both frames rotated half way to one another, then until the baseline is along x."""
     half = rotation_from_vector(0.5 * rotation_vector(beta_from_alpha.R))
-    t = half.T @ beta_from_alpha.t
+    t = matvec(half.T, beta_from_alpha.t)
     direction = t / t.norm()
     x = torch.where(t[0] > 0, 1.0, -1.0) * t.new_tensor([1.0, 0, 0])
     to_x = rotation_to(direction, x)
-    return to_x @ half, to_x @ half.T
+    return product(to_x, half), product(to_x, half.T)
 
 
 def rotation_to(a: Float[Tensor, "3"], b: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """The shortest rotation that takes unit vector a to unit vector b, less than 180 degrees away."""
     v = torch.linalg.cross(a, b)
     W = cross_matrix(v)
-    return torch.eye(3).to(v) + W + W @ W / (1 + a @ b)
+    return torch.eye(3).to(v) + W + product(W, W) / (1 + (a * b).sum())
 
 
 def middle_intrinsics(
@@ -79,9 +88,17 @@ def middle_intrinsics(
     focal = torch.stack([(c.K[:2, :2].det().abs()).sqrt() for c in cameras]).min()
     seen = []
     for camera, R in zip(cameras, rotations):
-        h, w = camera.hw
-        middle = camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2])
-        ray = R @ camera.rays(middle)[0]
+        ray = _middle_ray(camera, R)
         seen.append(ray[:2] / ray[2])
     centre = intrinsics(1.0, hw).to(focal)[:2, 2] - focal * torch.stack(seen).mean(0)
     return torch.cat([torch.cat([focal * torch.eye(2).to(focal), centre[:, None]], 1), focal.new_tensor([[0, 0, 1.0]])])
+
+
+NEAREST_COSINE = 0.1
+"""The middle of an old image is to be within 84 degrees of the new optical axis."""
+
+
+def _middle_ray(camera: Camera, R: Tensor) -> Tensor:
+    """The ray of the image's middle in the rotated frame."""
+    h, w = camera.hw
+    return matvec(R, camera.rays(camera.K.new_tensor([(w - 1) / 2, (h - 1) / 2]))[0])

@@ -18,7 +18,7 @@ from .batching import Batched
 from .camera import Camera, LensView, View
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
-from .pixels import HW, resize_matrix, rot90_matrix, shift_matrix
+from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
 from .text import baseline_text, depth_text, rig_html, rig_text, view_text
 
@@ -50,8 +50,8 @@ class Link(Batched):
         """The link between images whose pixels are A x of the old ones."""
         A_alpha, A_beta = A_alpha.to(self.F), A_beta.to(self.F)
         back = torch.linalg.inv(A_alpha)
-        F = torch.linalg.inv(A_beta).T @ self.F @ back
-        return Link(F, None if self.H is None else A_beta @ self.H @ back)
+        F = product(product(torch.linalg.inv(A_beta).T, self.F), back)
+        return Link(F, None if self.H is None else product(product(A_beta, self.H), back))
 
 
 @dataclass(frozen=True, eq=False, repr=False)

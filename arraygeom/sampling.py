@@ -5,11 +5,11 @@ from __future__ import annotations
 from typing import Literal, NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from .pixels import HW
+from .pixels import HW, floating
 
 Interpolation = Literal["bilinear", "nearest", "bicubic"]
 
@@ -21,19 +21,21 @@ class Sampled(NamedTuple):
     valid: Bool[Tensor, "b *n"]
 
 
-def to_grid(x: Float[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:
+def to_grid(x: Real[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:
     """Pixels to the coordinates of `grid_sample(align_corners=False)`, where -1 and 1 are the area's edges.
 
     >>> to_grid(torch.tensor([-0.5, 9.5]), (10, 20)).tolist()
     [-1.0, 1.0]
     """
     h, w = hw
+    x = floating(x)
     return (2 * x + 1) / x.new_tensor([w, h]) - 1
 
 
-def on_image(x: Float[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
+def on_image(x: Real[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
     """Whether positions lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to 1e-3 pixels."""
     h, w = hw
+    x = floating(x)
     limits = x.new_tensor([w, h]) - 0.5 + SLACK
     return ((x >= -0.5 - SLACK) & (x <= limits)).all(-1)
 
@@ -43,16 +45,19 @@ SLACK = 1e-3
 
 
 def sample(
-    image: Float[Tensor, "b c h w"], x: Float[Tensor, "k *n 2"], *, interpolation: Interpolation = "bilinear"
+    image: Float[Tensor, "b c h w"], x: Real[Tensor, "k *n 2"], *, interpolation: Interpolation = "bilinear"
 ) -> Sampled:
     """Images (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
 
     On the outer half pixel of the area the nearest pixels count. Outside it values are 0 and valid is False.
     """
     batch, hw = len(image), (image.shape[-2], image.shape[-1])
-    x = x.expand(batch, *x.shape[1:])
+    dtype = torch.promote_types(image.dtype, floating(x).dtype)
+    x = floating(x).expand(batch, *x.shape[1:])
     valid = on_image(x, hw)
     grid = to_grid(torch.where(valid[..., None], x, 0.0), hw).reshape(batch, 1, -1, 2)
-    values = grid_sample(image, grid, mode=interpolation, padding_mode="border", align_corners=False)
+    values = grid_sample(
+        image.to(dtype), grid.to(dtype), mode=interpolation, padding_mode="border", align_corners=False
+    )
     values = values.reshape(batch, image.shape[1], *x.shape[1:-1])
-    return Sampled(values * valid[:, None], valid)
+    return Sampled(torch.where(valid[:, None], values, 0.0).to(image.dtype), valid)

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .camera import Camera
 from .epipolar import Depth, depth_from_track, track
+from .pixels import floating, product
 from .rig import Pair
 
 
@@ -27,7 +28,7 @@ class Triangulated(NamedTuple):
 
 def triangulate(
     cameras: Sequence[Camera],
-    x: Float[Tensor, "v *n 2"],
+    x: Real[Tensor, "v *n 2"],
     *,
     seen: Bool[Tensor, "v *n"] | None = None,
     refinements: int = 3,
@@ -42,6 +43,7 @@ def triangulate(
     """
     if len(cameras) != len(x) or len(cameras) < 2:
         raise ValueError(f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}")
+    x = floating(x)
     centres, rays, usable, focal = _rays(cameras, x)
     if seen is not None:
         usable = usable & seen
@@ -63,7 +65,7 @@ def triangulate(
 
 
 def depth_of(
-    pair: Pair, x: Float[Tensor, "*n 2"], x_beta: Float[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None
+    pair: Pair, x: Real[Tensor, "*n 2"], x_beta: Real[Tensor, "*n 2"], deviation: Float[Tensor, "*n"] | None = None
 ) -> Depth:
     """Depth in alpha of what its pixels x see at beta's pixels `x_beta`; through lenses too.
 
@@ -71,6 +73,7 @@ def depth_of(
     to first order. Raises ValueError for uncalibrated pairs.
     """
     alpha, beta = pair.cameras
+    x, x_beta = floating(x), floating(x_beta)
     if alpha.distortion is None and beta.distortion is None:
         return depth_from_track(track(alpha.K, beta.K, pair.beta_from_alpha, x), x_beta, deviation)
     pose = pair.beta_from_alpha
@@ -103,7 +106,9 @@ def _rays(cameras: Sequence[Camera], x: Tensor) -> tuple[Tensor, Tensor, Tensor,
     """Centres and unit directions in the world, which pixels have one, and focal lengths, each (v, *n[, 3])."""
     ones = [1] * (x.ndim - 2)
     rays, usable = zip(*(c.to(x.dtype).rays(p) for c, p in zip(cameras, x)))
-    directions = torch.stack([(r / r.norm(dim=-1, keepdim=True)) @ c.R.to(x.dtype) for r, c in zip(rays, cameras)])
+    directions = torch.stack(
+        [product(r / r.norm(dim=-1, keepdim=True), c.R.to(x.dtype)) for r, c in zip(rays, cameras)]
+    )
     centres = torch.stack([c.centre for c in cameras]).to(x.dtype).reshape(len(x), *ones, 3)
     focal = torch.stack([c.K[:2, :2].det().abs().sqrt() for c in cameras]).to(x.dtype).reshape(len(x), *ones)
     return centres, directions, torch.stack(usable), focal
@@ -116,7 +121,7 @@ def _meet(across: Tensor, centres: Tensor, weight: Tensor) -> tuple[Tensor, Tens
     scale = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
     normal = information / torch.where(scale > 0, scale, 1.0)
     solvable = torch.linalg.det(normal) > 1e3 * torch.finfo(normal.dtype).eps ** 2
-    target = (weighted @ centres[..., None]).sum(0) / torch.where(scale > 0, scale, 1.0)
+    target = product(weighted, centres[..., None]).sum(0) / torch.where(scale > 0, scale, 1.0)
     eye = torch.eye(3, dtype=across.dtype, device=across.device)
     safe = torch.where(solvable[..., None, None], normal, eye)
     return torch.linalg.solve(safe, target)[..., 0], information, solvable

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from .camera import AnyLensView, Camera, LensView
-from .pixels import coarse_grid, pixel_grid
+from .pixels import coarse_grid, pixel_grid, product
 from .sampling import Interpolation, Sampled, sample
 
 WIDEST = math.radians(62)
@@ -31,7 +31,7 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
     if not near_axis.any():
         raise ValueError("no pixel of the image is within its lens's range: check the distortion's coefficients")
     seen = rays[near_axis]
-    x = (seen[:, :2] / seen[:, 2:]) @ camera.K[:2, :2].mT + camera.K[:2, 2]
+    x = product(seen[:, :2] / seen[:, 2:], camera.K[:2, :2].mT) + camera.K[:2, 2]
     low, high = x.detach().amin(0).floor(), x.detach().amax(0).ceil()
     K = camera.K.clone()
     K[:2, 2] = K[:2, 2] - low

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
 from ..epipolar import FRONT
-from ..pixels import HW, map_homogeneous
+from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
 from ..segments import Positions, Segments, sample_fractions
 from ..undistortion import pinhole_view
@@ -36,10 +36,11 @@ class Curved:
     far: float | None = None
     nodes: int = 64
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2), differentiable in all numbers of the rig, lenses included."""
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
         near, far = Epipolar(self.near, self.far).bounds(pair)
+        x = floating(x)
         curve = _Curve.of(pair, near, far, x)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
         nodes, seen = curve.at(even)
@@ -63,12 +64,12 @@ class ThroughLenses:
     field: ReceptiveField
     samples: int = 96
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with lenses."""
         alpha, beta = (_Straight.of(view) for view in (pair.alpha, pair.beta))
         link = None if pair.link is None else pair.link.transformed(alpha.A, beta.A)
         straight = dataclasses.replace(pair, alpha=alpha.pinhole, beta=beta.pinhole, link=link)
-        there, seen = alpha.undistort(x)
+        there, seen = alpha.undistort(floating(x))
         found = self.field(straight, there)
         found = found.positions(self.samples) if isinstance(found, Segments) else found
         xy, shown = beta.distort(found.xy)
@@ -88,7 +89,7 @@ class _Straight(NamedTuple):
         if not isinstance(view, LensView) or view.distortion is None:
             return cls(view, view, torch.eye(3, dtype=torch.float64))
         pinhole = pinhole_view(view)
-        return cls(view, pinhole, pinhole.K @ torch.linalg.inv(view.K))
+        return cls(view, pinhole, product(pinhole.K, torch.linalg.inv(view.K)))
 
     def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
         straight, valid = self.view.to(x.dtype).undistort(x)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
-from ..pixels import pixel_grid
+from ..pixels import floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions
 from .straight import require_straight
@@ -28,9 +28,10 @@ class NearestVoxels:
     count: int = 96
     window: int = 80
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, count, 2), in beta's pixels. Not differentiable: pixels are whole. Not for lenses."""
         require_straight(pair)
+        x = floating(x)
         with torch.no_grad():
             line = epipolar_lines(pair.fundamental, x)
             centre, placed = apply_homography(pair.homography, x)
@@ -96,9 +97,10 @@ class Local:
     size: int = 5
     spacing: float = 1.0
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, size^2, 2), row by row, centred on H x. Raises ValueError for lenses."""
         require_straight(pair)
+        x = floating(x)
         centre, placed = apply_homography(pair.homography, x)
         offsets = pixel_grid((self.size, self.size), dtype=x.dtype, device=x.device) - (self.size - 1) / 2
         xy = centre[..., None, :] + self.spacing * offsets.reshape(-1, 2)
@@ -111,8 +113,9 @@ class Dense:
 
     stride: int = 1
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Positions:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, H W / stride^2, 2), the same for every alpha pixel."""
+        x = floating(x)
         grid = pixel_grid(pair.beta.hw, dtype=x.dtype, device=x.device)[:: self.stride, :: self.stride]
         xy = grid.reshape(-1, 2).expand(*x.shape[:-1], -1, 2)
         return Positions(xy, torch.ones_like(xy[..., 0], dtype=torch.bool))

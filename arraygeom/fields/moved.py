@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
+from ..pixels import floating
 from ..rig import Pair
 from ..sampling import sample
 from .protocol import ReceptiveField, SamplingLocations
@@ -25,12 +26,13 @@ class Moved:
     field: ReceptiveField
     displacement: Float[Tensor, "2 h w"]
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """The field's sampling locations for the points where alpha's pixels x will be."""
         return self.field(pair, self.points(x))
 
-    def points(self, x: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
+    def points(self, x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
         """Where alpha's pixels are when beta records."""
+        x = floating(x)
         h, w = self.displacement.shape[-2:]
         inside = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
         step = sample(self.displacement[None].to(x), inside.reshape(1, -1, 2)).values[0]

@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from typing import Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..camera import Camera
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
-from ..pixels import HW
+from ..pixels import HW, floating
 from ..rig import Depths, Pair, depth_range
 from ..segments import Segments, clip_to_image
 from .protocol import CHUNK, all_pixels, in_chunks
@@ -33,7 +33,7 @@ class Epipolar:
     near: float | None = None
     far: float | None = None
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
         require_pinholes(pair)
         return _between(pair, *self.bounds(pair), x)
@@ -54,7 +54,7 @@ class EpipolarLine:
     either end. From F, an alpha pixel on the epipole has no line, and the segment is invalid.
     """
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments across beta's image. Raises ValueError for lenses."""
         if pair.link is None and pair.calibrated:
             zero, infinite = (torch.tensor(d, dtype=torch.float64) for d in (NEAREST, torch.inf))
@@ -66,7 +66,7 @@ class EpipolarLine:
             middle = x.new_tensor([(w - 1) / 2, (h - 1) / 2])
             return line_piece(epipolar_lines(F, x), middle, x.new_tensor(float(h + w)), (h, w))
 
-        return in_chunks(across, x)
+        return in_chunks(across, pair, floating(x))
 
 
 NEAREST = 1e-4
@@ -86,31 +86,33 @@ class HomographyDisplacement:
 
     displacement: float | None = None
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments centred on the point of the line nearest to H x, then clipped to beta's image.
 
         Raises ValueError for lenses.
         """
         require_straight(pair)
         F, H, hw = pair.fundamental, pair.homography, pair.beta.hw
-        given = self.displacement
+        x, given = floating(x), self.displacement
         disparity = (covering_displacement(pair) if given is None else torch.tensor(given)).to(x)
+        disparity = disparity[(..., *[None] * (x.ndim - 1 - disparity.ndim))] if disparity.ndim else disparity
 
         def around(x: Tensor) -> Segments:
             centre, placed = apply_homography(H, x)
             piece = line_piece(epipolar_lines(F, x), centre, disparity, hw)
             return Segments(piece.start, piece.end, piece.valid & placed)
 
-        return in_chunks(around, x)
+        return in_chunks(around, pair, x)
 
 
-def covering_displacement(pair: Pair, x: Float[Tensor, "*n 2"] | None = None) -> Float[Tensor, ""]:
-    """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta.
+def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
+    """The displacement from H x that reaches both near and far for every pixel of x, pixels of beta; one for each rig.
 
     Of depth-bounded segments as beta's image clips them; 0 if there are none. Without x: for all of alpha's
     pixels. Raises ValueError for an uncalibrated pair.
     """
-    largest = _squared_reach(pair, _widest(pair) if x is None else x).max()
+    squared = _squared_reach(pair, _widest(pair) if x is None else floating(x))
+    largest = squared.flatten(len(pair.batch_shape)).amax(-1) if squared.ndim > len(pair.batch_shape) else squared
     return torch.where(largest > 0, torch.where(largest > 0, largest, 1.0).sqrt(), 0.0)
 
 
@@ -147,9 +149,10 @@ class Rectified:
     max_disparity: float | None = None
     alpha_is: Literal["left", "right", "either"] = "left"
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from the largest disparity (near) to none (far)."""
         (ha, wa), (hb, wb) = pair.alpha.hw, pair.beta.hw
+        x = floating(x)
         column = (x[..., 0] + 0.5) * (wb / wa) - 0.5
         row = (x[..., 1] + 0.5) * (hb / ha) - 0.5
         near, far = self._run(column, wb)
@@ -165,7 +168,7 @@ class Rectified:
         return {"left": (left, column), "right": (right, column), "either": (left, right)}[self.alpha_is]
 
 
-def pinhole_track(pair: Pair, x: Float[Tensor, "*n 2"]) -> Track:
+def pinhole_track(pair: Pair, x: Real[Tensor, "*n 2"]) -> Track:
     """The track in beta of alpha's pixels. Raises ValueError unless both cameras are pinholes."""
     alpha, beta = require_pinholes(pair)
     return track(alpha.K, beta.K, pair.beta_from_alpha, x)
@@ -195,16 +198,16 @@ def foot_on_line(line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"]) ->
 
 
 def line_piece(
-    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], disparity: Float[Tensor, ""], hw: HW
+    line: Float[Tensor, "*#n 3"], point: Float[Tensor, "*#n 2"], disparity: Float[Tensor, "*#d"], hw: HW
 ) -> Segments:
     """The piece of each line within `disparity` of the foot of `point`, clipped to the image.
 
     It runs along (l1, -l0), which for a calibrated F is from near to far. Without a line: the point itself.
     """
     foot = foot_on_line(line, point)
-    along = disparity * torch.stack([-line[..., 1], line[..., 0]], -1)
+    along = disparity[..., None] * torch.stack([-line[..., 1], line[..., 0]], -1)
     return clip_to_image(foot + along, foot - along, hw)
 
 
 def _between(pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> Segments:
-    return in_chunks(lambda x: segments_between(pinhole_track(pair, x), near, far, pair.beta.hw), x)
+    return in_chunks(lambda x: segments_between(pinhole_track(pair, x), near, far, pair.beta.hw), pair, floating(x))

@@ -6,13 +6,16 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Real
 from torch import Tensor
 
-from ..pixels import HW
+from ..pixels import HW, shift_matrix
 from ..rig import Pair
 from ..segments import Positions, Segments, clip_to_image
+from .curved import Curved, ThroughLenses
+from .moved import Moved
 from .protocol import ReceptiveField, SamplingLocations
+from .straight import Epipolar, EpipolarLine, HomographyDisplacement
 
 
 @dataclass(frozen=True)
@@ -37,9 +40,9 @@ class Widened:
         if min(self.across, self.along) < 0:
             raise ValueError(f"across and along are pixels, 0 or more; got {self.across} and {self.along}")
 
-    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> SamplingLocations:
+    def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> SamplingLocations:
         """Segments if `across` is 0 and the field gives segments, else positions (*n, rows * samples, 2)."""
-        found = self.field(pair, x)
+        found = self._evaluated(pair, x)
         if isinstance(found, Segments):
             longer = self._longer(found)
             if self.across == 0:
@@ -49,6 +52,17 @@ class Widened:
         else:
             found = self._stretched(found)
         return self._band(found, pair.beta.hw)
+
+    def _evaluated(self, pair: Pair, x: Tensor) -> SamplingLocations:
+        """The field about beta's image too, as far as it may be brought in; fields of sizes alone on the image."""
+        margin = math.ceil(self.across + self.along)
+        if margin == 0 or not _follows_beta(self.field, pair):
+            return self.field(pair, x)
+        h, w = pair.beta.hw
+        found = self.field(pair.transform_beta(shift_matrix(-margin, -margin), (h + 2 * margin, w + 2 * margin)), x)
+        if isinstance(found, Segments):
+            return Segments(found.start - margin, found.end - margin, found.valid)
+        return Positions(found.xy - margin, found.mask)
 
     @classmethod
     def for_motion(cls, field: ReceptiveField, pixels: float, **options: int) -> Widened:
@@ -79,6 +93,16 @@ class Widened:
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
+def _follows_beta(field: ReceptiveField, pair: Pair) -> bool:
+    """Whether the field of a beta that is padded is the same in its pixels: it is by F or calibration, not by sizes."""
+    if isinstance(field, ThroughLenses | Moved):
+        return _follows_beta(field.field, pair)
+    if isinstance(field, HomographyDisplacement):
+        known = pair.calibrated if pair.link is None else pair.link.H is not None
+        return field.displacement is not None and known
+    return isinstance(field, Epipolar | EpipolarLine | Curved)
+
+
 def direction(step: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
     """Unit vectors; along x for steps shorter than 1e-3 pixels."""
     squared = step.square().sum(-1, keepdim=True)
@@ -87,9 +111,10 @@ def direction(step: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n 2"]:
 
 
 def tangents(p: Positions) -> Float[Tensor, "*n l 2"]:
-    """The direction of the curve at each position, from its neighbours."""
+    """The direction of the curve at each position, from those of its neighbours that count."""
     if p.xy.shape[-2] < 2:
         return direction(torch.zeros_like(p.xy))
-    before, after = p.xy[..., :1, :], p.xy[..., -1:, :]
-    padded = torch.cat([before, p.xy, after], -2)
-    return direction(padded[..., 2:, :] - padded[..., :-2, :])
+    here, counts = p.xy, p.mask[..., None]
+    after = torch.where(counts[..., 1:, :], here[..., 1:, :], here[..., :-1, :])
+    before = torch.where(counts[..., :-1, :], here[..., :-1, :], here[..., 1:, :])
+    return direction(torch.cat([after, here[..., -1:, :]], -2) - torch.cat([here[..., :1, :], before], -2))

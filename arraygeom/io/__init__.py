@@ -7,6 +7,7 @@ one line as `CONVENTION`.
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from ..camera import Camera
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
+from ..sensor import Sensor
 from . import (
     aniposelib,
     boofcv,
@@ -62,6 +64,16 @@ WRITERS: dict[str, Any] = {
     "nerfstudio": nerfstudio,
 }
 
+# Recognised by a word in the file or by its suffix, and what to do instead.
+NOT_READ = {
+    ".camera": ("one camera of Strecha's data", "write K, R^T and -R^T t of all into a native rig file"),
+    "<chunk": ("a Metashape project", "export its cameras in COLMAP's format"),
+    "PinholeCamera": (
+        "a file of Open3D",
+        "write intrinsic_matrix and extrinsic (X_camera = R X + t) into a native file",
+    ),
+}
+
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
 
 
@@ -95,11 +107,14 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     """Write a rig, each file atomically. Formats of several files make a folder.
 
-    Raises ValueError for an unknown format, and for a rig that the format cannot hold.
+    What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor records) is named
+    by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the format cannot hold, and a batch.
     """
     if format not in WRITERS:
         raise ValueError(f"cannot write rig format '{format}' (known: {', '.join(WRITERS)})")
     path, contents = Path(path), WRITERS[format].write(rig)
+    if format != "native" and (lost := _left_out(rig, format)):
+        warnings.warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning, 2)
     if isinstance(contents, Mapping):
         path.mkdir(parents=True, exist_ok=True)
         for name, text in contents.items():
@@ -117,12 +132,27 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
+    for mark, (what, advice) in NOT_READ.items():
+        if mark in head or path.suffix == mark:
+            raise RigFileError(path, None, f"is {what}, which is not read: {advice}")
     raise RigFileError(path, None, f"is not a rig file of a known format ({', '.join(READERS)}); or name its format")
 
 
 def convention(format: str) -> str:
     """What a format's file means and the shift of pixels applied when reading it, in one line."""
     return getattr(READERS[format], "CONVENTION", "stated in the file: units and first_pixel_centre")
+
+
+def _left_out(rig: Rig, format: str) -> str:
+    """What only the native format holds and this rig states."""
+    kept = {"time_offset": 0.0} if format == "kalibr" else {}
+    sensors = (dataclasses.replace(view.sensor, **kept) for view in rig.cameras.values())
+    stated = {
+        "depth range": rig.depth is not None,
+        "links": bool(rig.links),
+        "sensors": any(sensor != Sensor() for sensor in sensors),
+    }
+    return ", ".join(name for name, is_stated in stated.items() if is_stated)
 
 
 def _scaled(rig: Rig, scale: float) -> Rig:

@@ -24,6 +24,8 @@ from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
 
+AGAIN = "calibrate again with --models pinhole-radtan, or pinhole-equi for wide angles"
+
 
 def recognises(path: Path, head: str) -> bool:
     return "cam0:" in head and "camera_model" in head
@@ -79,7 +81,7 @@ def _poses(source: RigSource, chain: dict[str, dict[str, Any]]) -> dict[str, Pos
 def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
     model = source.get(fields, "camera_model", name)
     if model != "pinhole":
-        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: pinhole")
+        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: pinhole: {AGAIN}")
     width, height = source.numbers(source.get(fields, "resolution", name), (2,), f"{name}.resolution").tolist()
     K = source.focal_and_centre(source.get(fields, "intrinsics", name), f"{name}.intrinsics")
     offset = source.number(fields.get("timeshift_cam_imu", 0.0), f"{name}.timeshift_cam_imu")
@@ -101,7 +103,7 @@ def _lens(source: RigSource, name: str, fields: dict[str, Any]) -> Distortion | 
         return source.brown_conrady(source.numbers(coefficients, (4,), entry), entry)
     if model == "equidistant":
         return source.kannala_brandt(source.numbers(coefficients, (4,), entry), entry)
-    raise source.fail(f"{name}.distortion_model", f"is '{model}'; supported: radtan, equidistant, none")
+    raise source.fail(f"{name}.distortion_model", f"is '{model}'; supported: radtan, equidistant, none: {AGAIN}")
 
 
 def _entry(name: str, camera: Camera) -> dict[str, Any]:

@@ -8,6 +8,7 @@ world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose:
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from ..extras import needs
 from ..pixels import pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
+from .matfile import readable_variables
 from .source import RigSource
 
 CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
@@ -63,10 +65,10 @@ def _document(source: RigSource) -> dict[str, Any]:
     with needs("calibration", "reading .mat files"):
         from scipy.io import loadmat
     try:
-        loaded = loadmat(source.path, simplify_cells=True)
-    except Exception:
+        loaded = loadmat(BytesIO(data), simplify_cells=True, variable_names=readable_variables(data))
+    except Exception as error:
         # Whatever the parser trips over in a damaged file, the cause is the file.
-        raise source.fail(None, "is not a .mat file that can be read; was it cut off?") from None
+        raise source.fail(None, f"is not a .mat file that can be read ({error}); was it cut off?") from None
     return {name: value for name, value in loaded.items() if not name.startswith("__")}
 
 

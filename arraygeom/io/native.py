@@ -54,6 +54,7 @@ from ..epipolar import shift_origin
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
+from ..safe_yaml import load_yaml, yaml_problem
 from ..sensor import PATTERNS, Band, Curve, Sensor
 from .errors import RigFileError
 from .source import RigSource
@@ -76,18 +77,29 @@ def recognises(path: Path, head: str) -> bool:
 def read(path: Path) -> Rig:
     """The rig of a native file. Raises RigFileError naming the file, the entry and what to do."""
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" at line {mark.line + 1}" if mark else ""
-        raise RigFileError(
-            path, None, f"not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}"
-        ) from None
-    return _Reader(path).rig(document)
+        text = path.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise RigFileError(path, None, f"not valid YAML: {yaml_problem(error)[1]}") from None
+    return read_text(text, path)
+
+
+def read_text(text: str, path: str | Path) -> Rig:
+    """The rig of a native file's text; `path` names it in errors."""
+    try:
+        document = load_yaml(text)
+    except yaml.YAMLError as error:
+        line, problem = yaml_problem(error)
+        at = f" at line {line}" if line else ""
+        raise RigFileError(Path(path), None, f"not valid YAML{at}: {problem}") from None
+    return _Reader(Path(path)).rig(document)
 
 
 def write(rig: Rig) -> str:
-    """The text of a native file."""
+    """The text of a native file. Raises ValueError for a batch of rigs."""
+    if rig.batch_shape:
+        raise ValueError(
+            f"a rig file holds one rig and this is a batch of {tuple(rig.batch_shape)}: write one each, rig[i]"
+        )
     document: dict[str, Any] = {"format": FORMAT}
     if rig.name:
         document["name"] = rig.name
@@ -127,22 +139,33 @@ class _Reader:
             if not 0 < near <= far:
                 raise self.fail("depth", f"is [{near:g}, {far:g}] m; wanted [near, far] with 0 < near <= far")
             depth = (near, far)
-        links = dict(self.link(f"links[{i}]", link, cameras) for i, link in enumerate(document.get("links") or []))
-        return Rig(cameras, depth=depth, links=links, name=str(document.get("name", "")))
+        return Rig(cameras, depth=depth, links=self.links(document, cameras), name=str(document.get("name", "")))
+
+    def links(self, document: dict[str, Any], cameras: Mapping[str, View]) -> dict[tuple[str, str], Link]:
+        links: dict[tuple[str, str], Link] = {}
+        for i, fields in enumerate(document.get("links") or []):
+            names, link = self.link(f"links[{i}]", fields, cameras)
+            if names in links:
+                first = list(links).index(names)
+                raise self.fail(f"links[{i}]", f"is between '{names[0]}' and '{names[1]}', as links[{first}]: keep one")
+            links[names] = link
+        return links
 
     def camera(self, entry: str, fields: Any) -> View:
         self.keys(fields, CAMERA, entry)
         width, height = (self.whole(n, f"{entry}.size") for n in self.pair(fields.get("size"), f"{entry}.size"))
+        height, width = RigSource(self.path).bounded((height, width), f"{entry}.size")
         sensor = self.sensor(entry, fields)
         if not any(key in fields for key in CALIBRATION):
             return View(hw=(height, width), sensor=sensor)
         if not any(key in fields for key in CALIBRATION if key != "distortion"):
             return self.lens_view(f"{entry}.distortion", fields["distortion"], View(hw=(height, width), sensor=sensor))
+        lens = self.distortion(f"{entry}.distortion", fields.get("distortion"))
         return Camera(
             K=self.K(entry, fields, (height, width)),
             cam_from_world=self.pose(entry, fields),
             hw=(height, width),
-            distortion=self.distortion(f"{entry}.distortion", fields.get("distortion")),
+            distortion=None if lens is not None and lens.is_identity else lens,
             sensor=sensor,
         )
 

@@ -8,6 +8,7 @@ size.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from ..extras import needs
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
+from ..safe_yaml import DEEPEST, LARGEST_TEXT
 from .export import brown_conrady, calibrated, focal_and_centre
 from .source import RigSource
 
@@ -28,6 +30,8 @@ D_NAMES = (
     *("D{}", "distCoeffs{}", "distortion_coefficients{}", "Distortion_Coefficients{}"),
     *("dist_coeffs{}", "distortionCoefficients{}"),
 )
+MOST_NUMBERS = 10_000
+"""Of a matrix; a file may state any number."""
 PARTS = ("intrinsic", "extrinsic")
 
 
@@ -74,6 +78,7 @@ def write(rig: Rig) -> str | dict[str, str]:
     }
 
 
+_NESTED_IN_LINE = rf"(?<![^\s,])(?:-[ \t]+|[^\s,:]{{1,80}}:[ \t]+){{{DEEPEST}}}"
 _HEADER = "%YAML:1.0\n---\n"
 
 
@@ -116,12 +121,33 @@ def _nodes(source: RigSource) -> dict[str, Any]:
     text = source.text()
     with needs("calibration", "reading OpenCV's files"):
         import cv2
+    _check_nesting(source, text)
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
         root = storage.root()
         return {name: _value(root.getNode(name)) for name in root.keys()}  # noqa: SIM118
     except (cv2.error, SystemError):
         raise source.fail(None, "is not an OpenCV FileStorage (YAML, XML or JSON); is the file whole?") from None
+
+
+def _check_nesting(source: RigSource, text: str) -> None:
+    """OpenCV's parsers recurse without a limit, and crash on files that nest deeply."""
+    if len(text) > LARGEST_TEXT:
+        raise source.fail(None, f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
+    depth = 0
+    # Tags, brackets, and what nests within a line of YAML: "- - - 1" and "a: b: c: 1".
+    for token in re.finditer(r"<(/?)[\w!?](?:[^<>]*?(/?)>)?|[\[{]|[\]}]", text):
+        mark = token[0]
+        if mark in "]}" or token[1]:
+            depth -= 1
+        elif mark in "[{" or not (token[2] or mark[1] in "!?"):
+            depth += 1
+        if depth > DEEPEST:
+            raise source.fail(
+                f"line {text.count(chr(10), 0, token.start()) + 1}", f"is nested more than {DEEPEST} deep"
+            )
+    if re.search(_NESTED_IN_LINE, text):
+        raise source.fail(None, f"is nested more than {DEEPEST} deep in a line")
 
 
 def _value(node: Any) -> Any:
@@ -132,7 +158,8 @@ def _value(node: Any) -> Any:
     if node.isSeq():
         return [_value(node.at(i)) for i in range(node.size())]
     if node.isMap() and not node.getNode("data").empty():
-        return node.mat()
+        count = node.getNode("rows").real() * node.getNode("cols").real()
+        return node.mat() if 0 <= count <= MOST_NUMBERS else None
     return None
 
 

@@ -18,10 +18,13 @@ from ..distortion import Distortion
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
+from ..safe_yaml import load_yaml, yaml_problem
 from .errors import RigFileError
 
 # A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array.
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
+# A size beyond these bounds is more likely a damaged number than an image (the largest sensors have some 4e8 pixels).
+LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
 # Rotations in text files are rounded: this much of a deviation is put right, more is refused.
 ROUNDED = 1e-3
 
@@ -79,11 +82,10 @@ class RigSource:
         """The file as a YAML mapping without repeated keys."""
         text = self.text()
         try:
-            return self.mapping(yaml.load(text, _UniqueKeys), None)
+            return self.mapping(load_yaml(text), None)
         except yaml.YAMLError as error:
-            mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None)
-            line = f"line {mark.line + 1}" if mark else None
-            raise self.fail(line, f"is not YAML ({problem or 'unreadable'}); is the file whole?") from None
+            line, problem = yaml_problem(error)
+            raise self.fail(f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?") from None
 
     def mapping(self, value: Any, entry: str | None) -> dict[str, Any]:
         """A value that has to be a mapping with something in it."""
@@ -121,7 +123,18 @@ class RigSource:
         w, h = self.number(width, entry), self.number(height, entry)
         if min(w, h) < 1 or w != int(w) or h != int(h):
             raise self.fail(entry, f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
-        return int(h), int(w)
+        return self.bounded((int(h), int(w)), entry)
+
+    def bounded(self, hw: HW, entry: str) -> HW:
+        """A size, once it is one that images have."""
+        h, w = hw
+        if max(h, w) > LARGEST_SIDE or h * w > MOST_PIXELS:
+            raise self.fail(
+                entry,
+                f"is {w} x {h}; images of up to {LARGEST_SIDE} pixels a side and {MOST_PIXELS / 1e6:.0f} "
+                "million in all are supported: is it in pixels?",
+            )
+        return hw
 
     def size_unstated(self, K: Tensor) -> HW:
         """The size for a format that states none: as given by the user, else guessed, with a warning."""
@@ -186,9 +199,9 @@ class RigSource:
         return quaternion_to_rotation_matrix(q / q.norm())
 
     def brown_conrady(self, value: Any, entry: str) -> Distortion | None:
-        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if empty."""
+        """A lens from OpenCV's coefficients, padded with zeros to a number that the model has; none if all are 0."""
         c = self.numbers([] if value is None else value, None, entry)
-        if c.numel() == 0:
+        if not c.any():
             return None
         if c.numel() > 14:
             raise self.fail(entry, f"has {c.numel()} coefficients; OpenCV's model has at most 14")
@@ -238,14 +251,3 @@ def unit_warning(rig: Rig) -> str | None:
             "Then read it with scale=1000"
         )
     return None
-
-
-class _UniqueKeys(yaml.SafeLoader):
-    """YAML in which a repeated key is an error, not silently the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = [self.construct_object(key, deep=True) for key, _ in node.value]
-        for i, key in enumerate(keys):
-            if key in keys[:i]:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key}' occurs twice", node.start_mark)
-        return super().construct_mapping(node, deep)

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
 from .detect import Grey, to_grey
 
@@ -23,6 +24,9 @@ VIDEOS = {".mp4", ".avi", ".mov", ".mkv", ".m4v", ".webm", ".mpg", ".mpeg"}
 MOST_FRAMES = 80
 """Largest number of frames used of a video: every first, second, fourth, eighth ..., so that videos of somewhat
 different lengths share them."""
+
+ORIENTATION = 274
+"""EXIF's tag."""
 
 FrameKey = int | str
 
@@ -113,14 +117,34 @@ def _moments(name: str, files: list[Path]) -> dict[FrameKey, Photo]:
         )
     if videos:
         return dict(_video_frames(videos[0]))
+    _check_orientations(name, files)
     keys = frame_keys([f.stem for f in files])
     if len(set(keys)) < len(keys):
         raise ValueError(f"{name}: two images have the same number, such as {files[0].name}: give each its own")
     return {key: Photo(file.name, partial(_decode_file, file)) for key, file in zip(keys, files)}
 
 
+def _check_orientations(name: str, files: list[Path]) -> None:
+    """Tags are applied, so images of one camera that were stored alike would otherwise be rotated differently."""
+    first: dict[int, Path] = {}
+    for file in files:
+        first.setdefault(_orientation(file), file)
+    if len(first) > 1:
+        listed = ", ".join(f"{tag} in {file.name}" for tag, file in first.items())
+        raise ValueError(f"{name}: its images have different orientation tags ({listed}): remove the tags from all")
+
+
+def _orientation(file: Path) -> int:
+    """The EXIF orientation, 1 if there is none or the file cannot be read, which is reported when it is decoded."""
+    try:
+        with Image.open(file) as image:
+            return int(image.getexif().get(ORIENTATION, 1))
+    except (OSError, SyntaxError, TypeError, ValueError):
+        return 1
+
+
 def _decode_file(path: Path) -> np.ndarray:
-    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
+    flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR  # orientation tags are applied, as when images are fused
     image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
     if image is None:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")

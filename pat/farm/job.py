@@ -13,6 +13,7 @@ import yaml
 
 from arraygeom.atomic import write_text
 from arraygeom.rig import Rig
+from arraygeom.safe_yaml import load_yaml
 from pat.sensors import seed_for
 from pat.support.schema import from_document, read_yaml, to_document
 from pat.synthesis.check import CheckLimits
@@ -94,7 +95,7 @@ class RenderConfig:
 
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""
-        rig = yaml.safe_load(self.rig.read_text(encoding="utf-8")) if self.rig.is_file() else str(self.rig)
+        rig = load_yaml(self.rig.read_text(encoding="utf-8")) if self.rig.is_file() else str(self.rig)
         settings = to_document(self.settings)
         return {
             "backend": self.backend,

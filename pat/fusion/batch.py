@@ -11,10 +11,9 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import pickle
 import re
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -25,8 +24,22 @@ from rich.console import Console
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from arraygeom import ReceptiveField, Rig
-from arraygeom.atomic import sweep, write_atomically, write_text
+from arraygeom import (
+    Curved,
+    Dense,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Local,
+    NearestVoxels,
+    ReceptiveField,
+    Rectified,
+    Rig,
+    ThroughLenses,
+    Widened,
+)
+from arraygeom.atomic import sweep, write_text
+from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
 
 from ..media.images import read_image
@@ -44,7 +57,16 @@ from .views import ViewFiles
 
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
 INPUTS = "inputs.json"
-SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.pickle"
+SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
+
+PLAN_FORMAT = "pat-batch 1"
+FIELD_CLASSES: dict[str, Callable[..., ReceptiveField]] = {
+    kind.__name__: kind
+    for kind in (
+        *(Curved, Dense, Epipolar, EpipolarLine, HomographyDisplacement),
+        *(Local, NearestVoxels, Rectified, ThroughLenses, Widened),
+    )
+}
 
 
 @dataclass(frozen=True)
@@ -174,11 +196,31 @@ class Batch:
             sweep(folder)
         write_text(file, text)
         write_text(self.out / INPUTS, json.dumps(now, indent=1))
-        with write_atomically(self.out / KEYS / PLAN) as temporary:
-            temporary.write_bytes(pickle.dumps(self))
+        write_text(self.out / KEYS / PLAN, self.to_json())
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+    def to_json(self) -> str:
+        """The batch as text for the processes that fuse its frames. Raises ValueError for a field of one's own."""
+        entries = {entry.name: getattr(self, entry.name) for entry in dataclasses.fields(self)}
+        entries["rig"] = rig_text(self.rig)
+        entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
+        entries["out"] = str(self.out)
+        entries["field"] = field_document(self.field)
+        return json.dumps({"format": PLAN_FORMAT, **entries})
+
+    @classmethod
+    def from_json(cls, text: str, source: str = PLAN) -> Batch:
+        """The batch of `to_json`'s text. Raises ValueError naming `source`."""
+        try:
+            entries = json.loads(text)
+            if entries.pop("format") != PLAN_FORMAT:
+                raise ValueError("another version's")
+            entries["rig"] = rig_of_text(entries["rig"], source)
+            entries["files"] = {name: [Path(file) for file in files] for name, files in entries["files"].items()}
+            entries["out"] = Path(entries["out"])
+            entries["field"] = field_of(entries["field"])
+            return cls(**entries)
+        except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
+            raise ValueError(f"{source}: not a plan of this program ({error}): start the job again") from None
 
     @cached_property
     def fusion(self) -> SequenceFusion:
@@ -235,6 +277,26 @@ class Batch:
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 
 
+def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
+    """A field as its class's name and entries. Raises ValueError for other fields than the families of arraygeom."""
+    if field is None:
+        return None
+    if FIELD_CLASSES.get(type(field).__name__) is not type(field):
+        known = ", ".join(FIELD_CLASSES)
+        raise ValueError(f"a batch's field is written to a file, which {field!r} cannot be: give one of {known}")
+    entries = {entry.name: getattr(field, entry.name) for entry in dataclasses.fields(field)}  # type: ignore[arg-type]
+    inner = {"field": field_document(entries["field"])} if "field" in entries else {}
+    return {"kind": type(field).__name__, **entries, **inner}
+
+
+def field_of(document: Mapping[str, Any] | None) -> ReceptiveField | None:
+    """The field of a `field_document`. Raises KeyError, TypeError or ValueError for anything else."""
+    if document is None:
+        return None
+    entries: dict[str, Any] = {n: field_of(value) if n == "field" else value for n, value in document.items()}
+    return FIELD_CLASSES[entries.pop("kind")](**entries)
+
+
 def fuse_key(plan: Path, key: KeyFrame) -> None:
     """The task of a key frame."""
     _planned(plan, plan.stat().st_mtime_ns).fuse_key(key)
@@ -268,7 +330,7 @@ def _read_inputs(file: Path) -> dict[str, str]:
 
 @lru_cache(maxsize=2)
 def _planned(plan: Path, time: int) -> Batch:
-    return pickle.loads(plan.read_bytes())
+    return Batch.from_json(plan.read_text(encoding="utf-8", errors="replace"), str(plan))
 
 
 @lru_cache(maxsize=2)

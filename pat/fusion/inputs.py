@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Moved, Pair, depth_from_track, pixel_grid
+from arraygeom import Moved, Pair, Segments, depth_from_track, pixel_grid
 from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
@@ -76,11 +76,25 @@ def padded(image: Tensor, multiple: int) -> Tensor:
     return pad(image, (0, -w % multiple, 0, -h % multiple), mode="replicate")
 
 
+def _within(where: Float[Tensor, "h w 2"], segments: Segments) -> Float[Tensor, "h w 2"]:
+    """Positions, those beyond an end of their segment moved along it to that end."""
+    h, w = where.shape[:2]
+    start, end = (t[0, :h, :w].to(where) for t in (segments.start, segments.end))
+    way = end - start
+    length2 = way.square().sum(-1)
+    share = ((where - start) * way).sum(-1) / length2.clamp(min=1e-12)
+    beyond = segments.valid[0, :h, :w] & (length2 > 1e-6) & ((share < 0) | (share > 1))
+    moved = where + (share.clamp(0, 1) - share)[..., None] * way
+    return torch.where(beyond[..., None], moved, where)
+
+
 def depth_and_confidence(
     output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the least confidence.
 
+    A position that a network found beyond the end of its segment counts as that end, so that depth is within the
+    bounds that were searched: a pixel beyond the far end may otherwise stand for any distance.
     `corner` is the (x, y) of the part's first pixel in alpha; `hw` the size of the part without padding.
     """
     h, w = hw
@@ -90,7 +104,10 @@ def depth_and_confidence(
     for beta, (pair, points), position, confidence in zip(part.betas, placements, output.position, output.confidence):
         if pair.link is not None or not pair.calibrated:
             continue
-        where = position[0, :, :h, :w].movedim(0, -1) + like.new_tensor(beta.offset)
+        where = position[0, :, :h, :w].movedim(0, -1)
+        if beta.field.pixels is not None:
+            where = _within(where, beta.field.pixels)
+        where = where + like.new_tensor(beta.offset)
         found = depth_from_track(pinhole_track(pair, points(x)), where.reshape(-1, 2))
         valid = found.valid.reshape(h, w)
         weight = torch.where(valid & (confidence[0, :h, :w] > UNSEEN), confidence[0, :h, :w], 0.0)

@@ -29,7 +29,7 @@ def save_frame(
     view: Rig | None = None,
     name: str = "",
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN as 0) and depth.png (near is bright).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (near is bright).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. Without any
@@ -43,7 +43,7 @@ def save_frame(
     with write_together(out, last=last) as folder:
         write_image(folder / f"{prefix}confidence.png", frame.confidence[None])
         if frame.depth.isfinite().any():
-            write_image(folder / f"{prefix}depth.tif", frame.depth.nan_to_num(0.0)[None], bits=32)
+            write_image(folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True)
             write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth))
         if view is not None:
             view.save(folder / "view.yaml")

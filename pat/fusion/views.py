@@ -16,7 +16,7 @@ from torch import Tensor
 from arraygeom import Pair, ReceptiveField, Rig, Sensor
 
 from ..media.colour import luminance_of as grey
-from ..media.images import Images, check_size, read_image
+from ..media.images import Images, read_image
 from ..media.raw import develop, developed_rig
 
 Fields = Mapping[str, ReceptiveField | None]
@@ -138,8 +138,8 @@ def read_view(rig: Rig, name: str, path: str | Path, *, like: Sensor) -> Float[T
     than the rig says, or is in colour where the rig says raw.
     """
     view = rig[name]
-    image = read_image(path, name=name, bits=view.sensor.bits)
-    check_size(image, view.hw, f"{name}: {path}")
+    raw = view.sensor.bayer is not None
+    image = read_image(path, name=name, bits=view.sensor.bits, hw=view.hw, orientation="ignore" if raw else "apply")
     if view.sensor.bayer and image.shape[0] != 1:
         raise ValueError(f"{name}: {path}: is in colour, and the rig says raw {view.sensor.bayer}: drop 'bayer'")
     return develop(image, view.sensor, like=like)

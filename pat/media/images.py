@@ -6,22 +6,28 @@ images), colours in the order red, green, blue. Files are written atomically.
 
 from __future__ import annotations
 
+import struct
+import warnings
 from collections.abc import ItemsView, Iterator, KeysView
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Literal, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
-from tifffile import TiffFile
 from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 
+from .headers import HW, ImageHeader, image_header
+
 _ROWS = 256
 """Rows processed at once, to limit memory."""
+
+MOST_PIXELS = 2**28
+"""Images with more are read only where their size is expected: some 3 GiB in colour."""
 
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
@@ -51,19 +57,39 @@ class Images(Protocol):
         ...
 
 
-def read_image(path: str | Path, *, name: str | None = None, bits: int | None = None) -> Float[Tensor, "c h w"]:
-    """The image in a PNG, TIFF, JPEG or PNM file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+def read_image(
+    path: str | Path,
+    *,
+    name: str | None = None,
+    bits: int | None = None,
+    hw: HW | None = None,
+    orientation: Literal["apply", "ignore"] = "apply",
+) -> Float[Tensor, "c h w"]:
+    """The image in a PNG, TIFF, JPEG, PNM, BMP or WebP file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
-    must hold 0..1. A wholly opaque alpha channel is dropped. Rotation tags (EXIF) are ignored: pixels are where the
-    sensor, hence its calibration, has them. `name` (such as a camera's) goes in front of error messages.
+    must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
 
-    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image.
+    An orientation tag (EXIF, TIFF) is applied, with a warning, as viewers and OpenCV's `imread` do; with
+    `orientation="ignore"` the pixels are as stored, as raw images need it. `hw` is the expected (height, width), which
+    is compared before anything is decoded.
+
+    Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another size than
+    expected, or is larger than `MOST_PIXELS` where no size is.
     """
     path = Path(path)
     label = f"{name}: {path}" if name else f"{path}"
-    values, packed = _decode(path, label)
+    if not path.is_file():
+        raise FileNotFoundError(f"{label}: no such image: check the path")
+    content = path.read_bytes()
+    header = image_header(content)
+    if header is None:
+        raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
+    applied = _applied(header, orientation, label)
+    _check_header(header.upright if applied > 1 else header.hw, hw, label)
+    values, packed = _decode(content, header, label)
+    values = _upright(values, applied)
     values = _opaque(values, label)
     planes = values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
@@ -75,12 +101,14 @@ def write_image(
     *,
     bits: int = 8,
     coverage: Float[Tensor, "1 h w"] | None = None,
+    unknown: bool = False,
 ) -> None:
     """Write a grey or RGB image atomically, in the format its name ends in (.png, .tif, .jpg, .exr).
 
     8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
     `coverage` makes the image RGBA (.png and .exr). An .exr file needs the extra `synthesis`. Raises ValueError for
-    an image with NaN or another number of channels, and for a format that cannot hold it.
+    an image with another number of channels or with values that are not finite (allowed with `unknown`, for maps of 32
+    bits in which some pixels are not known), and for a format that cannot hold it.
     """
     path = Path(path)
     planes = image.detach().cpu().numpy()
@@ -90,7 +118,7 @@ def write_image(
         if path.suffix.lower() not in (".png", ".exr"):
             raise ValueError(f"{path}: only PNG and EXR hold coverage (rgba)")
         planes = np.concatenate([planes, coverage.detach().cpu().numpy()])
-    if not np.isfinite(planes).all():
+    if not (unknown and bits == 32) and not np.isfinite(planes).all():
         raise ValueError(f"{path}: the image to write has NaN or infinite values")
     if path.suffix.lower() == ".exr":
         return _write_exr(path, planes, bits)
@@ -100,23 +128,64 @@ def write_image(
         temporary.write_bytes(content)
 
 
-def _decode(path: Path, label: str) -> tuple[NDArray, int]:
-    """The values, and how many bits a value has in a TIFF file that packs them into less than 16; 0 if none does."""
-    if not path.is_file():
-        raise FileNotFoundError(f"{label}: no such image: check the path")
-    content = np.frombuffer(path.read_bytes(), np.uint8)
-    values = _decode_bytes(content)
+def _applied(header: ImageHeader, orientation: str, label: str) -> int:
+    """The orientation to apply, 1 for none; a tag is reported either way."""
+    if header.orientation == 1:
+        return 1
+    if orientation == "ignore":
+        warnings.warn(f"{label}: orientation tag {header.orientation} is ignored: pixels are as stored", stacklevel=3)
+        return 1
+    h, w = header.upright
+    warnings.warn(
+        f"{label}: orientation tag {header.orientation} is applied, which makes it {w}x{h}; "
+        "remove the tag if the calibration is of the pixels as stored",
+        stacklevel=3,
+    )
+    return header.orientation
+
+
+def _check_header(got: HW, wanted: HW | None, label: str) -> None:
+    if wanted is None and got[0] * got[1] > MOST_PIXELS:
+        raise ValueError(f"{label}: is {got[1]}x{got[0]}, more than {MOST_PIXELS / 1e6:.0f} million pixels: reduce it")
+    if wanted is not None and got != wanted:
+        (h, w), (wanted_h, wanted_w) = got, wanted
+        raise ValueError(
+            f"{label}: is {w}x{h}, the rig says {wanted_w}x{wanted_h}: resize the rig, or give the right image"
+        )
+
+
+def _upright(values: NDArray, orientation: int) -> NDArray:
+    """The image that a viewer shows for an EXIF orientation."""
+    if orientation >= 5:
+        values = values.swapaxes(0, 1)
+    # After the transposition of 5 to 8.
+    columns = slice(None, None, -1 if orientation in (2, 3, 6, 7) else 1)
+    rows = slice(None, None, -1 if orientation in (3, 4, 7, 8) else 1)
+    return values[rows, columns]
+
+
+def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, int]:
+    """The values as stored, and how many bits a value has in a TIFF file that packs them into less than 16; else 0.
+
+    OpenCV shifts packed values up to 16 bits.
+    """
+    values = _decode_bytes(np.frombuffer(_without_orientation(content, header), np.uint8))
     if values is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
-    return values, _packed_bits(path) if values.dtype == np.uint16 and path.suffix.lower() in (".tif", ".tiff") else 0
+    if values.shape[:2] != header.hw:
+        raise ValueError(f"{label}: its header says another size than its pixels have: save it again")
+    packed = header.bits if values.dtype == np.uint16 and header.bits < 16 else 0
+    return values, packed
 
 
-def _packed_bits(path: Path) -> int:
-    """OpenCV shifts packed values up to 16 bits; the number of bits that they had, or 0 for 16."""
-    with TiffFile(path) as file:
-        bits = file.pages.first.tags.valueof("BitsPerSample", default=16)
-    bits = bits[0] if isinstance(bits, tuple) else bits
-    return 0 if bits == 16 else int(bits)
+def _without_orientation(content: bytes, header: ImageHeader) -> bytes:
+    """A TIFF file's bytes with orientation 1: OpenCV applies that of TIFF files alone, whatever is asked."""
+    if header.tag is None or header.orientation == 1:
+        return content
+    place, form = header.tag
+    changed = bytearray(content)
+    struct.pack_into(form, changed, place, 1)
+    return bytes(changed)
 
 
 def _log_level(level: int) -> int:
@@ -218,10 +287,3 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
         rows = np.clip(colours[top : top + _ROWS], 0, 1).astype(np.float64)
         counts[top : top + _ROWS] = np.rint(rows * np.iinfo(kind).max)
     return counts
-
-
-def check_size(image: Float[Tensor, "c h w"], hw: tuple[int, int], label: str) -> None:
-    """Raises ValueError unless the image has this height and width."""
-    if tuple(image.shape[1:]) != hw:
-        got, wanted = (f"{w}x{h}" for h, w in (image.shape[1:], hw))
-        raise ValueError(f"{label}: is {got}, the rig says {wanted}: resize the rig, or give the right image")

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
+import torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from ..support.schema import from_document
 from ..support.tensor_files import write_tensors
 from .bandwise import BandwisePAT, BandwisePATConfig
 from .guided import GuidedPAT, GuidedPATConfig
@@ -22,6 +25,10 @@ NETWORKS = {
     "GuidedPAT": (GuidedPAT, GuidedPATConfig),
     "BandwisePAT": (BandwisePAT, BandwisePATConfig),
 }
+
+LARGEST, MOST_ENTRIES = 1024, 16
+"""Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
+MAY_BE_ZERO = ("head_dim",)
 
 Network = PAT | GuidedPAT | BandwisePAT
 
@@ -49,15 +56,21 @@ def load_weights(name: str | Path) -> Network:
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
-            state = {renamed(key): file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+            keys = {renamed(key): key for key in file.keys()}  # noqa: SIM118
+            network, config = _described(path, metadata)
+            shapes = {name: tuple(file.get_slice(key).get_shape()) for name, key in keys.items()}
+            _check_shapes(path, network, config, shapes)
+            state = {name: file.get_tensor(key) for name, key in keys.items()}
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
-    network = _network(path, metadata)
-    wrong = misfit(network, state)
-    if wrong:
-        raise ValueError(f"{path}: the weights do not fit the {metadata['network']} that the file describes: {wrong}")
-    network.load_state_dict(state)
-    return network.eval().requires_grad_(False)
+    for name, tensor in state.items():
+        if not tensor.is_floating_point() or not tensor.float().isfinite().all():
+            raise ValueError(
+                f"{path}: {name} holds something other than finite numbers: train it again, or copy it again"
+            )
+    made = network(config)
+    made.load_state_dict(state)
+    return made.eval().requires_grad_(False)
 
 
 _OLD_NAMES = {"trust": "confidence", "carry": "propagation"}
@@ -73,8 +86,11 @@ def renamed(key: str) -> str:
 
 def misfit(network: nn.Module, state: Mapping[str, Tensor]) -> str:
     """The first tensor that is missing, too many, or of another shape than the network's; empty if all fit."""
+    return _misfit(network, {k: tuple(v.shape) for k, v in state.items()})
+
+
+def _misfit(network: nn.Module, given: Mapping[str, tuple[int, ...]]) -> str:
     own = {k: tuple(v.shape) for k, v in network.state_dict().items()}
-    given = {k: tuple(v.shape) for k, v in state.items()}
     for name in [*own, *given]:
         if own.get(name) != given.get(name):
             return f"{name} is {given.get(name, 'missing')}, wanted {own.get(name, 'none')}"
@@ -94,16 +110,43 @@ def find_weights(name: str | Path) -> Path:
     raise FileNotFoundError(f"no weights '{name}': neither a file nor one of {', '.join(shipped())}")
 
 
-def _network(path: Path, metadata: Mapping[str, str]) -> Network:
+def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Callable[..., Network], Any]:
+    """The class of the network that a file describes, and its configuration, of plausible numbers."""
     if metadata.get("format", "").startswith("pat-checkpoint"):
         raise ValueError(f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above")
     if metadata.get("format") != FORMAT or metadata.get("network") not in NETWORKS:
         found = f"it is '{metadata.get('format')}' of a {metadata.get('network')}" if metadata else "it says nothing"
         raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
-    network, config = NETWORKS[metadata["network"]]
+    network, kind = NETWORKS[metadata["network"]]
     try:
-        config_values = json.loads(metadata["config"]).items()
-        values = {renamed(k): tuple(v) if isinstance(v, list) else v for k, v in config_values}
-        return network(config(**values))
-    except (KeyError, TypeError, ValueError) as error:
+        values = json.loads(metadata["config"])
+        document = {renamed(key): value for key, value in values.items()} if isinstance(values, dict) else values
+        config: Any = from_document(kind, document)  # type: ignore[arg-type]
+        for name, value in dataclasses.asdict(config).items():
+            _check_numbers(name, value)
+    except (KeyError, RecursionError, TypeError, ValueError) as error:
         raise ValueError(f"{path}: its configuration does not fit this version ({error})") from None
+    return network, config
+
+
+def _check_numbers(name: str, value: object) -> None:
+    values = value if isinstance(value, tuple) else (value,)
+    if len(values) > MOST_ENTRIES:
+        raise ValueError(f"{name} has {len(values)} entries; at most {MOST_ENTRIES} are read")
+    least = 0 if name in MAY_BE_ZERO else 1
+    for number in values:
+        if isinstance(number, int | float) and not isinstance(number, bool) and not least <= number <= LARGEST:
+            raise ValueError(f"{name} is {number}; wanted {least} to {LARGEST}")
+
+
+def _check_shapes(
+    path: Path, network: Callable[..., Network], config: object, shapes: Mapping[str, tuple[int, ...]]
+) -> None:
+    """Compare the shapes with the network's before it, or any tensor, takes memory."""
+    try:
+        with torch.device("meta"):
+            wrong = _misfit(network(config), shapes)
+    except Exception as error:  # whatever a constructor runs into, the cause is the configuration
+        raise ValueError(f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})") from None
+    if wrong:
+        raise ValueError(f"{path}: the weights do not fit the {network.__name__} that the file describes: {wrong}")

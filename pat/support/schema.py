@@ -13,6 +13,8 @@ from typing import Any, TypeVar
 
 import yaml
 
+from arraygeom.safe_yaml import load_yaml, yaml_problem
+
 T = TypeVar("T")
 
 
@@ -45,11 +47,11 @@ def read_yaml(path: str | Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
+        return load_yaml(path.read_text(encoding="utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = f" at line {mark.line + 1}" if mark else ""
-        raise ValueError(f"{path}: not valid YAML{line}: {getattr(error, 'problem', None) or 'not text'}") from None
+        line, problem = yaml_problem(error)
+        at = f" at line {line}" if line else ""
+        raise ValueError(f"{path}: not valid YAML{at}: {problem}") from None
 
 
 def near(name: object, known: Iterable[object]) -> str:

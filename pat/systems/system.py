@@ -258,8 +258,7 @@ def fused_apart(
     peak = f"allowed {how.max_memory}, at most {most() / 2**30:.2f} GiB resident"
     depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
-    unknown = torch.full_like(confidence, torch.nan)
-    depth = unknown if depth is None else torch.where(depth > 0, depth, unknown)
+    depth = torch.full_like(confidence, torch.nan) if depth is None else depth
     return Frame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
 
 

@@ -12,6 +12,7 @@ import tyro
 import yaml
 
 from arraygeom.atomic import write_text
+from arraygeom.safe_yaml import load_yaml
 from pat.networks.bandwise import BandwisePATConfig
 from pat.networks.guided import GuidedPATConfig
 from pat.networks.paper import PATConfig
@@ -168,7 +169,7 @@ def load_config(name: str | Path) -> TrainConfig:
 def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
     try:
-        values = yaml.safe_load(text) or {}
+        values = load_yaml(text) or {}
     except yaml.YAMLError as error:
         raise ValueError(f"{name}: not YAML: {' '.join(str(error).split())}") from None
     try:

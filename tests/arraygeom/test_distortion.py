@@ -1,3 +1,5 @@
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -5,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch.autograd import gradcheck, gradgradcheck
 
+from arraygeom import distortion
 from arraygeom.distortion import Distortion
 from tests.oracles import Oracle
 
@@ -272,3 +275,38 @@ def test_what_does_not_exist_is_refused():
         Distortion("brown-conrady", torch.zeros(6))
     with pytest.raises(ValueError, match="takes 4 coefficients, got 5"):
         Distortion("kannala-brandt", torch.zeros(5))
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_the_inverse_of_any_fisheye_is_right_or_invalid(dtype):
+    """Newton's steps inside a bracket can cycle: 5 of 3,000 such lenses were off by up to 1.8 rad, and valid."""
+    g = torch.Generator().manual_seed(0)
+    k = (torch.rand(3000, 4, generator=g, dtype=torch.float64) * 2 - 1) * 0.05
+    lenses = Distortion("kannala-brandt", k.to(dtype))
+    end = distortion._fisheye_limit(lenses.coefficients).sqrt()
+    theta = torch.linspace(0.001, 0.999, 200, dtype=torch.float64) * end[:, None]
+    X = torch.stack([theta.sin(), 0 * theta, theta.cos()], -1).to(dtype)
+    xy, seen = lenses.project(X)
+    ray, valid = lenses.unproject(xy)
+    error = (ray - X).norm(dim=-1)
+    assert valid[seen].all()
+    assert error[seen].max() < (1e-9 if dtype == torch.float64 else 3e-2)
+
+
+@pytest.mark.parametrize("huge", [1e20, 1e76, 1e154, 1e300, float("inf"), float("nan")])
+def test_lenses_of_huge_coefficients_see_nothing_but_their_middle(huge):
+    xy = torch.tensor([[0.1, 0.2], [2.0, 1.0]], dtype=torch.float64)
+    for model, n in ((distortion.BROWN_CONRADY, 8), (distortion.KANNALA_BRANDT, 4)):
+        for i in range(n):
+            if model == distortion.BROWN_CONRADY and i in (2, 3):
+                continue
+            for sign in (1, -1):
+                c = torch.full((n,), -0.1, dtype=torch.float64)
+                c[i] = sign * huge
+                lens = Distortion(model, c)
+                bent, seen = lens.distort(xy)
+                back, valid = lens.undistort(bent)
+                assert ((back - xy).norm(dim=-1)[seen & valid] < 1e-6).all()
+                assert seen.dtype == valid.dtype == torch.bool
+                if not math.isfinite(huge):
+                    assert not seen.any()

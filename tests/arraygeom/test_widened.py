@@ -1,8 +1,19 @@
 import pytest
 import torch
 
-from arraygeom import Curved, Epipolar, NearestVoxels, Pair, Rectified, Segments, View, Widened
-from arraygeom.fields.widened import direction
+from arraygeom import (
+    Curved,
+    Epipolar,
+    NearestVoxels,
+    Pair,
+    Positions,
+    Rectified,
+    Segments,
+    ThroughLenses,
+    View,
+    Widened,
+)
+from arraygeom.fields.widened import direction, tangents
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom.rigs import random_rig, two_cameras
 
@@ -105,3 +116,24 @@ def test_directions_of_nothing_have_no_slope():
 def test_negative_widths_are_refused():
     with pytest.raises(ValueError, match="0 or more"):
         Widened(Epipolar(), across=-1.0)
+
+
+def test_samples_that_do_not_count_turn_no_tangent():
+    xy = torch.stack([torch.arange(9.0), torch.full((9,), 20.0)], -1) + 10
+    mask = torch.ones(9, dtype=torch.bool)
+    mask[[0, 3, 4, 8]] = False
+    p = Positions(torch.where(mask[:, None], xy, 0.0), mask)
+    assert tangents(p)[mask].tolist() == [[1.0, 0.0]] * 5
+
+
+@pytest.mark.parametrize("field", [Epipolar(), Curved(64), ThroughLenses(Epipolar(), 64)], ids=repr)
+def test_lines_beside_the_image_are_brought_in(field):
+    """Cameras that differ by a shift of the principal point: lines of alpha's first rows pass above beta's."""
+    rig = two_cameras(centre=(0.2, 0.0, 0.0))
+    rig = rig.with_camera("beta", rig["beta"].crop(2, 0, (46, 64)))
+    pair = rig.pair("alpha", "beta")
+    x = torch.tensor([[40.0, 0.6]], dtype=torch.float64)  # row -1.4 of beta
+    band = Widened(field, across=3.0)(pair, x)
+    assert band.mask.any()
+    assert band.xy[band.mask][:, 1].max() == pytest.approx(1.6)
+    assert not Widened(field, across=0.5)(pair, x).mask.any()

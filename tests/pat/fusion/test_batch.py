@@ -1,7 +1,10 @@
 """Many frames and sequences on disk: resumed to the same bits, whole files only, one bad image costs one frame."""
 
 import errno
+import json
+import math
 import os
+import pickle
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -10,9 +13,10 @@ import pytest
 import torch
 
 import arraygeom.atomic
-from arraygeom import Rig
+from arraygeom import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, Rig, ThroughLenses, Widened
+from arraygeom.io.native import write as rig_text
 from pat.cli.main import main
-from pat.fusion.batch import Batch, find_images
+from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.fusion.checks import LowConfidenceWarning
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
@@ -216,3 +220,54 @@ def test_frames_that_hardly_match_are_warned_of_once_and_fail_if_strict(material
         replace(job, strict=True).run()
     assert isinstance(stopped.value.__cause__, LowConfidenceWarning)
     assert not list((tmp_path / "out").glob("*_fused.png"))
+
+
+class Payload:
+    """Unpickled, it would write a file."""
+
+    def __reduce__(self):
+        return os.system, ("touch unpickled",)
+
+
+def test_a_plan_in_the_output_folder_cannot_run_code(material, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for plan in ("plan.pickle", PLAN):
+        (tmp_path / plan).write_bytes(pickle.dumps(Payload()))
+        with pytest.raises(ValueError, match=plan):
+            fuse_one(tmp_path / plan, 0)
+    assert not (tmp_path / "unpickled").exists()
+    batch(material, tmp_path / "out")._begin(resume=False)
+    assert json.loads((tmp_path / "out" / KEYS / PLAN).read_text())["alpha"] == "fast"
+
+
+@pytest.mark.parametrize(
+    "field",
+    [
+        None,
+        Epipolar(near=2.0, far=math.inf),
+        HomographyDisplacement(12.5),
+        Rectified(7.0, alpha_is="either"),
+        Widened(ThroughLenses(EpipolarLine(), 64), across=1.5),
+    ],
+)
+def test_a_plan_comes_back_exactly(material, tmp_path, field):
+    job = batch(material, tmp_path, field=field, match_levels=True, max_memory="2GiB", bits=16)
+    again = Batch.from_json(job.to_json())
+    assert rig_text(again.rig) == rig_text(job.rig)
+    for name in job.rig.names:
+        for part in ("K", "R", "t"):
+            assert torch.equal(getattr(again.rig[name], part), getattr(job.rig[name], part))
+    assert replace(again, rig=job.rig) == job
+
+
+def test_a_field_that_is_a_function_is_refused_before_anything_is_fused(material, tmp_path):
+    with pytest.raises(ValueError, match="a batch's field is written to a file"):
+        batch(material, tmp_path / "out", field=lambda pair, x: None).run()
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{}", '{"format": "pat-batch 1"}', "[" * 100_000, '{"format": "pat-batch 9"}']
+)
+def test_damaged_plans_are_named(text):
+    with pytest.raises(ValueError, match=r"plan.json: not a plan of this program"):
+        Batch.from_json(text)

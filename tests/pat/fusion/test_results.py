@@ -3,6 +3,7 @@
 import resource
 
 import pytest
+import tifffile
 import torch
 
 from pat.fusion.results import Frame, save_frame
@@ -56,3 +57,10 @@ def test_depth_of_a_former_frame_does_not_stay_beside_one_without(tmp_path):
     save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), torch.rand(6, 8)), tmp_path)
     save_frame(frame_of(3), tmp_path)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["confidence.png", "fused.png"]
+
+
+def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):
+    depth = torch.tensor([[1.5, torch.nan, 3.0], [torch.nan, 2.0, 0.5]])
+    frame = Frame(torch.rand(3, 2, 3), depth, torch.rand(2, 3))
+    assert tmp_path / "depth.tif" in save_frame(frame, tmp_path)
+    torch.testing.assert_close(torch.from_numpy(tifffile.imread(tmp_path / "depth.tif")), depth, equal_nan=True)

@@ -1,12 +1,18 @@
 import os
+import struct
+import warnings
+import zlib
 
 import cv2
 import numpy as np
 import pytest
+import tifffile
 import torch
+from PIL import Image, ImageOps
 
 from arraygeom.atomic import sweep, write_atomically
 from pat.media.colour import from_luma_chroma, luminance, to_luma_chroma
+from pat.media.headers import image_header
 from pat.media.images import read_image, write_image
 
 RED = torch.tensor([1.0, 0.0, 0.0])[:, None, None]
@@ -182,3 +188,82 @@ def test_coverage_is_written_beside_the_colours(tmp_path, suffix):
         assert [round(float(channels[c].pixels[0, 0]), 4) for c in "RGBA"] == [0.2, 0.4, 0.6, 0.8]
     with pytest.raises(ValueError, match="only PNG and EXR hold coverage"):
         write_image(tmp_path / "a.jpg", rgb, coverage=coverage)
+
+
+def with_orientation(path, image: np.ndarray, orientation: int) -> None:
+    """Write an image with an orientation tag by Pillow or tifffile."""
+    if path.suffix == ".tif":
+        tag = (274, 3, 1, orientation, True)
+        kind = "rgb" if image.ndim == 3 else "minisblack"
+        tifffile.imwrite(path, image, photometric=kind, extratags=[tag])
+        return
+    exif = Image.Exif()
+    exif[274] = orientation
+    options = {".jpg": {"quality": 100, "subsampling": 0}, ".webp": {"lossless": True}}.get(path.suffix, {})
+    Image.fromarray(image).save(path, exif=exif, **options)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+@pytest.mark.parametrize("suffix", ["tif", "png", "jpg", "webp"])
+def test_orientation_tags_are_applied_as_viewers_do_and_said(tmp_path, suffix, orientation):
+    path = tmp_path / f"a.{suffix}"
+    image = np.random.default_rng(0).integers(0, 255, (16, 24, 3), np.uint8)
+    with_orientation(path, image, orientation)
+    # Pillow rotates TIFF files itself.
+    stored = np.asarray(Image.open(path)) if suffix == "jpg" else image
+    shown = np.asarray(ImageOps.exif_transpose(Image.open(path)))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        for how, wanted in (("apply", shown), ("ignore", stored)):
+            read = read_image(path, orientation=how, hw=wanted.shape[:2])
+            assert (read.permute(1, 2, 0).numpy() * 255).round().astype(np.uint8).tolist() == wanted.tolist()
+    words = [f"a.{suffix}: orientation tag {orientation} is {how}" for how in ("applied", "ignored")]
+    assert len(said) == (0 if orientation == 1 else 2)
+    assert all(word in str(warning.message) for word, warning in zip(words, said))
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16, np.float32])
+@pytest.mark.filterwarnings("ignore:.*orientation tag")
+def test_orientation_does_not_depend_on_the_type_of_values(tmp_path, kind):
+    image = np.arange(24).reshape(4, 6).astype(kind) / (np.float32(24) if kind == np.float32 else kind(1))
+    white = 1 if kind == np.float32 else np.iinfo(kind).max
+    for orientation in range(1, 9):
+        with_orientation(tmp_path / "a.tif", image.astype(kind), orientation)
+        stored = read_image(tmp_path / "a.tif", orientation="ignore")[0]
+        assert torch.allclose(stored, torch.from_numpy(image.astype(np.float32)) / white)
+        shape = (4, 6) if orientation < 5 else (6, 4)
+        assert read_image(tmp_path / "a.tif").shape[1:] == shape
+
+
+def png_that_claims(width: int, height: int) -> bytes:
+    head = struct.pack(">II5B", width, height, 8, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + b"IHDR" + head + struct.pack(">I", zlib.crc32(b"IHDR" + head))
+
+
+def test_the_size_is_compared_before_anything_is_decoded(tmp_path, monkeypatch):
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("decoded"))
+    (tmp_path / "a.png").write_bytes(png_that_claims(30_000, 30_000))
+    with pytest.raises(ValueError, match=r"mono: .*a.png: is 30000x30000, the rig says 640x400: resize the rig"):
+        read_image(tmp_path / "a.png", name="mono", hw=(400, 640))
+    with pytest.raises(ValueError, match=r"a.png: is 30000x30000, more than 268 million pixels"):
+        read_image(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif", "jpg", "ppm", "pgm", "bmp", "webp"])
+@pytest.mark.parametrize("shape", [(1, 1), (3, 700), (300, 5)])
+def test_headers_state_the_size_of_every_format(tmp_path, suffix, shape):
+    colours = 1 if suffix == "pgm" else 3
+    write_image(tmp_path / f"a.{suffix}", torch.rand(colours, *shape))
+    content = (tmp_path / f"a.{suffix}").read_bytes()
+    assert image_header(content).hw == shape
+    for cut in range(0, len(content), max(1, len(content) // 40)):
+        image_header(content[:cut])
+
+
+def test_comments_bigtiff_and_damaged_orientation(tmp_path):
+    (tmp_path / "a.pgm").write_bytes(b"P5 # by hand\n#\n3\t2\n255\n" + bytes(6))
+    assert read_image(tmp_path / "a.pgm").shape == (1, 2, 3)
+    tifffile.imwrite(tmp_path / "big.tif", np.zeros((3, 4), np.uint16), bigtiff=True, byteorder=">")
+    assert image_header((tmp_path / "big.tif").read_bytes())[:3] == ((3, 4), 1, 16)
+    with_orientation(tmp_path / "b.png", np.zeros((3, 4, 3), np.uint8), 9)
+    assert read_image(tmp_path / "b.png").shape == (3, 3, 4)

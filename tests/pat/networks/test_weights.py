@@ -1,12 +1,16 @@
 """Weights files: what is written is read back, what does not fit is named."""
 
+import dataclasses
+import json
+import resource
+
 import pytest
 import torch
 from safetensors.torch import save_file
 
 from pat.networks.guided import GuidedPAT, GuidedPATConfig
 from pat.networks.paper import PAT, PATConfig
-from pat.networks.weights import load_weights, save_weights, shipped
+from pat.networks.weights import FORMAT, load_weights, save_weights, shipped
 
 NETWORKS = [PAT(PATConfig(betas=2, dim=8)), GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))]
 
@@ -71,4 +75,58 @@ def test_the_tensor_that_does_not_fit_is_named(tmp_path):
     network.config = GuidedPATConfig(widths=(8, 8, 8, 16))
     save_weights(network, tmp_path / "w.safetensors")
     with pytest.raises(ValueError, match=r"do not fit .*: \S+ is \(.*\), wanted \("):
+        load_weights(tmp_path / "w.safetensors")
+
+
+def weights_file(path, config, network="GuidedPAT", state=None) -> None:
+    text = config if isinstance(config, str) else json.dumps(config)
+    metadata = {"format": FORMAT, "network": network, "config": text}
+    save_file(state or {"a": torch.zeros(1)}, path, metadata)
+
+
+@pytest.mark.parametrize(
+    ("network", "config", "problem"),
+    [
+        ("GuidedPAT", {"widths": [16, 32, 40, 10**9]}, r"widths is 1000000000; wanted 1 to 1024"),
+        ("GuidedPAT", {"widths": [1024] * 4, "fine_dim": 1024, "head_dim": 1024}, "do not fit the GuidedPAT"),
+        ("GuidedPAT", {"propagation_steps": [1] * 10**5}, "propagation_steps has 100000 entries"),
+        ("GuidedPAT", {"widths": 5}, "widths: is 5; wanted a list"),
+        ("GuidedPAT", {"widths": [16, 32, 40, "x"]}, r"widths\[3\]: is 'x'; wanted a whole number"),
+        ("GuidedPAT", {"taps": 0}, "taps is 0; wanted 1 to"),
+        ("GuidedPAT", {"taps": 10**400}, "wanted 1 to"),
+        ("GuidedPAT", '{"window": NaN}', "window: is NaN"),
+        ("GuidedPAT", '{"window": Infinity}', "window is inf"),
+        ("GuidedPAT", {"nonsense": 1}, "nonsense: unknown key"),
+        ("BandwisePAT", {"bands": 3}, "one band at a time"),
+        ("PAT", {"dim": 1024, "betas": 1024, "scale": 1024}, "do not fit the PAT"),
+        ("PAT", {"betas": -1}, "betas is -1"),
+        ("PAT", {"interpolation": "cubic"}, "interpolation: is 'cubic'"),
+        ("PAT", "[1, 2]", "wanted a mapping"),
+        ("PAT", "null", "wanted a mapping"),
+        ("PAT", "not json", "does not fit this version"),
+        ("PAT", "[" * 100_000, "does not fit this version"),
+    ],
+)
+def test_hostile_configurations_are_refused_without_building_anything(tmp_path, network, config, problem):
+    weights_file(tmp_path / "w.safetensors", config, network)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(ValueError, match=rf"w.safetensors: .*{problem}"):
+        load_weights(tmp_path / "w.safetensors")
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300e3  # KiB
+
+
+@pytest.mark.parametrize("bad", [torch.nan, torch.inf])
+def test_weights_that_are_not_finite_are_refused(tmp_path, bad):
+    network = PAT(PATConfig(dim=8))
+    next(network.parameters()).data.view(-1)[3] = bad
+    save_weights(network, tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match="holds something other than finite numbers"):
+        load_weights(tmp_path / "w.safetensors")
+
+
+def test_weights_of_integers_are_refused(tmp_path):
+    network = PAT(PATConfig(dim=8))
+    state = {name: torch.zeros_like(tensor, dtype=torch.int32) for name, tensor in network.state_dict().items()}
+    weights_file(tmp_path / "w.safetensors", dataclasses.asdict(network.config), "PAT", state)
+    with pytest.raises(ValueError, match="holds something other than finite numbers"):
         load_weights(tmp_path / "w.safetensors")

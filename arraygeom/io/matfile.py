@@ -1,0 +1,143 @@
+"""MAT-files of version 5, walked before scipy reads them: scipy trusts their lengths, and a damaged one can crash it.
+
+Layout: "MAT-File Format" (MathWorks). A header of 128 bytes, then elements of a tag (type, bytes) and data, padded to 8
+bytes; a matrix is an element whose data are elements again: flags, dimensions, name, contents.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterator
+from typing import NamedTuple
+
+LARGEST = 2**26
+"""Bytes of a file, and of a variable that is unpacked."""
+DEEPEST = 20
+"""Structs and cells within one another."""
+MATRIX, COMPRESSED = 14, 15
+SIZES = {1: 1, 2: 1, 3: 2, 4: 2, 5: 4, 6: 4, 7: 4, 9: 8, 12: 8, 13: 8, 16: 1, 17: 2, 18: 4}
+"""Bytes a value of the types of data."""
+CELL, STRUCT, TEXT, NUMBERS = 1, 2, 4, range(6, 16)
+COMPLEX = 0x800
+
+
+class _Element(NamedTuple):
+    kind: int
+    data: memoryview
+
+
+def readable_variables(content: bytes) -> list[str]:
+    """Names of the variables that consist of structs, cells, text and numbers only.
+
+    Raises ValueError for a file that is not a MAT-file of version 5, or is damaged.
+    """
+    if len(content) > LARGEST:
+        raise ValueError(f"it has {len(content)} bytes; at most {LARGEST} are read")
+    if len(content) < 136 or content[124:128] not in (b"\0\1IM", b"\1\0MI"):
+        raise ValueError("it is not of version 5 to 7")
+    order = "<" if content[126:128] == b"IM" else ">"
+    names = []
+    for element in _elements(memoryview(content)[128:], order):
+        if element.kind == COMPRESSED:
+            element = next(_elements(_unpacked(element.data), order))
+        if element.kind != MATRIX:
+            raise ValueError("a variable is no matrix")
+        name = _check_matrix(element.data, order, 0)
+        if name is not None:
+            names.append(name)
+    if len(set(names)) < len(names):
+        raise ValueError("two variables have one name")
+    return names
+
+
+def _unpacked(data: memoryview) -> memoryview:
+    unpack = zlib.decompressobj()
+    try:
+        content = unpack.decompress(data, LARGEST)
+    except zlib.error as error:
+        raise ValueError(f"a variable cannot be unpacked: {error}") from None
+    if unpack.unconsumed_tail or not unpack.eof:
+        raise ValueError("a variable is too large, or cut off")
+    return memoryview(content)
+
+
+def _elements(data: memoryview, order: str) -> Iterator[_Element]:
+    at = 0
+    while at < len(data):
+        if at + 8 > len(data):
+            raise ValueError("it ends within a tag")
+        kind, length = struct.unpack_from(order + "II", data, at)
+        small = kind >> 16
+        if small:
+            if small > 4:
+                raise ValueError("a short element is too long")
+            yield _Element(kind & 0xFFFF, data[at + 4 : at + 4 + small])
+            at += 8
+            continue
+        if at + 8 + length > len(data):
+            raise ValueError("it ends within an element")
+        yield _Element(kind, data[at + 8 : at + 8 + length])
+        at += 8 + length + (0 if kind == COMPRESSED else -length % 8)
+
+
+def _check_matrix(data: memoryview, order: str, depth: int) -> str | None:
+    """The name of a matrix, None for one of a class that is not read; raises ValueError for a damaged one."""
+    if depth > DEEPEST:
+        raise ValueError(f"it is nested more than {DEEPEST} deep")
+    parts = _elements(data, order)
+    flags, dims, name = (next(parts, _Element(0, data[:0])) for _ in range(3))
+    if flags.kind != 6 or len(flags.data) != 8:
+        raise ValueError("a matrix has no flags")
+    word = struct.unpack_from(order + "I", flags.data)[0]
+    kind, is_complex = word & 0xFF, bool(word & COMPLEX)
+    if kind not in (CELL, STRUCT, TEXT, *NUMBERS):
+        return None
+    if dims.kind != 5 or len(dims.data) % 4 or not 8 <= len(dims.data) <= 32 or name.kind != 1:
+        raise ValueError("a matrix has no dimensions or no name")
+    lengths = struct.unpack(f"{order}{len(dims.data) // 4}i", dims.data)
+    if min(lengths) < 0:
+        raise ValueError("a matrix has a negative dimension")
+    readable = _check_contents(parts, order, depth, (kind, math.prod(lengths), is_complex))
+    return bytes(name.data).decode("ascii") if readable else None
+
+
+def _check_contents(parts: Iterator[_Element], order: str, depth: int, what: tuple[int, int, bool]) -> bool:
+    kind, count, is_complex = what
+    if kind in (CELL, STRUCT):
+        wanted = count * (_fields(parts, order) if kind == STRUCT else 1)
+        inner = [_check_matrix(part.data, order, depth + 1) if len(part.data) else "" for part in _matrices(parts)]
+        if len(inner) != wanted:
+            raise ValueError("a struct or cell has another number of entries than it states")
+        return None not in inner
+    rest = list(parts)
+    if len(rest) != (2 if is_complex else 1):
+        raise ValueError("a matrix has another number of parts than it states")
+    for part in rest:
+        size = SIZES.get(part.kind)
+        # Text may be coded with a varying number of bytes.
+        if size is None or (len(part.data) != count * size and not (kind == TEXT and part.kind == 16)):
+            raise ValueError("a matrix has another number of values than it states")
+    return True
+
+
+def _fields(parts: Iterator[_Element], order: str) -> int:
+    """How many fields a struct has."""
+    length, names = (next(parts, _Element(0, memoryview(b""))) for _ in range(2))
+    if length.kind != 5 or len(length.data) != 4 or names.kind != 1:
+        raise ValueError("a struct has no field names")
+    each = struct.unpack_from(order + "i", length.data)[0]
+    if not 1 <= each <= 64 or len(names.data) % each:
+        raise ValueError("the field names of a struct are damaged")
+    found = [bytes(names.data[i : i + each]) for i in range(0, len(names.data), each)]
+    if len(set(found)) < len(found) or not all(0 in name for name in found):
+        raise ValueError("the field names of a struct are damaged")
+    return len(found)
+
+
+def _matrices(parts: Iterator[_Element]) -> Iterator[_Element]:
+    for part in parts:
+        if part.kind != MATRIX:
+            raise ValueError("an entry of a struct or cell is no matrix")
+        yield part

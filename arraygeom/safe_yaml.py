@@ -1,0 +1,97 @@
+"""YAML from files of unknown origin: bounded in size, nesting and aliases, without repeated keys.
+
+The one loader of the project. It builds plain values only (`yaml.SafeLoader`'s), so nothing in a file can run code.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+LARGEST_TEXT = 2**25
+"""Characters. 3,000 cameras are about 1 million."""
+DEEPEST = 50
+"""Nested lists and mappings. The deepest format of the project has 8."""
+MOST_VALUES = 500_000
+"""Keys and values, also those that aliases repeat. 3,000 cameras are about 200,000."""
+MOST_ALIASED = 100_000
+"""Values that aliases repeat, in total, counted as if they were written out."""
+
+_Base: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+def load_yaml(text: str) -> Any:
+    """The document of a YAML text.
+
+    Raises yaml.YAMLError, with the line where one is known, for text that is not YAML, for repeated keys (1 and "1" are
+    the same key, and so are 1 and true), and for a document beyond the limits of this module.
+    """
+    if len(text) > LARGEST_TEXT:
+        raise _refused(f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
+    try:
+        _check_extent(text)
+        return yaml.load(text, _SafeLoader)
+    except yaml.YAMLError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
+        raise _refused(f"holds a value that cannot be read ({' '.join(str(error).split())[:200]})") from None
+
+
+def yaml_problem(error: Exception) -> tuple[int | None, str]:
+    """The line of an error (from 1; None if unknown) and what is wrong, for messages."""
+    mark = getattr(error, "problem_mark", None)
+    return (mark.line + 1 if mark else None), getattr(error, "problem", None) or "not text"
+
+
+def _refused(problem: str, mark: Any = None) -> yaml.YAMLError:
+    return yaml.constructor.ConstructorError(None, None, problem, mark)
+
+
+def _check_extent(text: str) -> None:
+    """Refuse, before anything is built, what would nest too deeply or grow too large by its aliases."""
+    sizes: dict[str, int] = {}
+    open_nodes: list[tuple[str | None, int]] = []  # the anchor of each, and how many values came before it
+    values = aliased = 0
+    for event in yaml.parse(text, _Base):
+        if values > MOST_VALUES:
+            raise _refused(f"has more than {MOST_VALUES:,} values", event.start_mark)
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in sizes:
+                raise _refused(f"alias *{event.anchor} is within, or before, what it stands for", event.start_mark)
+            values += sizes[event.anchor]
+            aliased += sizes[event.anchor]
+            if aliased > MOST_ALIASED:
+                raise _refused(f"aliases repeat more than {MOST_ALIASED:,} values", event.start_mark)
+        elif isinstance(event, yaml.CollectionStartEvent):
+            open_nodes.append((event.anchor, values))
+            values += 1
+            if len(open_nodes) > DEEPEST:
+                raise _refused(f"is nested more than {DEEPEST} deep", event.start_mark)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = open_nodes.pop()
+            if anchor is not None:
+                sizes[anchor] = values - before
+        elif isinstance(event, yaml.ScalarEvent):
+            values += 1
+            if event.anchor is not None:
+                sizes[event.anchor] = 1
+
+
+class _SafeLoader(_Base):  # type: ignore[misc]
+    """YAML in which a repeated key is an error, not silently the last one."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        lines: dict[Any, int] = {}
+        for key_node, _ in node.value:
+            if key_node.tag == "tag:yaml.org,2002:merge":
+                continue
+            key, line = self.construct_object(key_node, deep=True), key_node.start_mark.line + 1
+            # Other keys (lists, say) are left to the parent, which refuses what cannot be a key.
+            spellings = (key, str(key)) if isinstance(key, str | int | float | None) else ()
+            former = next((lines[s] for s in spellings if s in lines), None)
+            if former is not None:
+                problem = f"'{key}' occurs twice, in lines {former} and {line}: keep one"
+                raise _refused(problem, key_node.start_mark)
+            lines |= dict.fromkeys(spellings, line)
+        return dict(super().construct_mapping(node, deep))

@@ -1,0 +1,94 @@
+"""Files that crash the parsers underneath (OpenCV's, scipy's): refused before these see them."""
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from arraygeom import Rig
+from arraygeom.io import RigFileError, read_rig
+from arraygeom.io.matfile import readable_variables
+
+DEEP = 100_000
+YAML = "%YAML:1.0\n---\na: "
+XML = '<?xml version="1.0"?>\n<opencv_storage>'
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        XML + "<a>" * DEEP + "</a>" * DEEP + "</opencv_storage>",
+        XML + "<a>" * DEEP,
+        '{"a": ' + "[" * DEEP + "]" * DEEP + "}",
+        '{"a":' * DEEP + "1" + "}" * DEEP,
+        YAML + "[" * DEEP + "]" * DEEP,
+        YAML + "{a: " * DEEP + "}" * DEEP,
+        YAML + "\n  " + "- " * DEEP + "1",
+        "%YAML:1.0\n---\n" + "a: " * DEEP + "1",
+    ],
+)
+def test_deep_nesting_never_reaches_opencv(text, tmp_path):
+    pytest.importorskip("cv2")
+    (tmp_path / "a.yml").write_text(text)
+    with pytest.raises(RigFileError, match="nested more than 50 deep"):
+        read_rig(tmp_path / "a.yml", format="opencv")
+
+
+def test_a_matrix_that_claims_a_size_takes_no_memory(tmp_path):
+    pytest.importorskip("cv2")
+    text = "%YAML:1.0\n---\ncamera_matrix: !!opencv-matrix\n   rows: 20000\n   cols: 20000\n   dt: d\n   data: [1]\n"
+    (tmp_path / "a.yml").write_text(text)
+    with pytest.raises(RigFileError, match="has no M or cameraMatrix"):
+        read_rig(tmp_path / "a.yml", format="opencv")
+
+
+def struct_file(path: Path, *, compressed: bool) -> bytes:
+    camera = {"IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]), "ImageSize": [400.0, 640.0]}
+    camera["RadialDistortion"] = np.array([0.1, 0.01])
+    pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
+    pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
+    others = {"empty": np.zeros((0, 3)), "cells": np.array([1, "b"], object), "z": np.array([1 + 2j]), "t": ["a", "bc"]}
+    pytest.importorskip("scipy.io").savemat(path, {"s": pair, **others}, do_compression=compressed)
+    return path.read_bytes()
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+def test_damaged_mat_files_are_read_or_refused(compressed, tmp_path):
+    """Of these, scipy alone crashes the process on seed 50, among others."""
+    path = tmp_path / "pair.mat"
+    whole = struct_file(path, compressed=compressed)
+    assert readable_variables(whole) == ["s", "empty", "cells", "z", "t"]
+    assert Rig.load(path).names == ("camera1", "camera2")
+    refused = 0
+    for seed in range(200):
+        source, content = random.Random(seed), bytearray(whole)
+        for _ in range(source.choice([1, 1, 2, 4, 8])):
+            content[source.randrange(128, len(content))] = source.choice([0, 255, 127, 1, source.randrange(256)])
+        path.write_bytes(content[: source.choice([len(content), source.randrange(len(content))])])
+        try:
+            Rig.load(path)
+        except RigFileError:
+            refused += 1
+    assert refused > 100
+
+
+def test_mat_files_of_other_versions_are_refused(tmp_path):
+    pytest.importorskip("scipy.io").savemat(tmp_path / "a.mat", {"K": np.eye(3)}, format="4")
+    with pytest.raises(RigFileError, match="not of version 5 to 7"):
+        Rig.load(tmp_path / "a.mat")
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "advice"),
+    [
+        ("0000.png.camera", "2759.48 0 1520.69\n0 2764.16 1006.81\n0 0 1\n", "native rig file"),
+        ("a.xml", '<?xml version="1.0"?>\n<document version="2.0.0">\n<chunk label="a">', "COLMAP"),
+        ("a.json", '{"class_name": "PinholeCameraParameters", "extrinsic": []}', "Open3D.*native file"),
+        ("a.yaml", "cam0:\n  camera_model: ds\n  intrinsics: [1]\n  resolution: [4, 4]\n", "pinhole-equi"),
+    ],
+)
+def test_formats_that_are_not_read_say_what_to_do(name, text, advice, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(RigFileError, match=advice):
+        Rig.load(tmp_path / name)
