@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,6 +18,8 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
     After an error (a full disk, say) the temporary file is gone and a former `path` is as it was. The temporary name
     ends as `path` does, so that writers that choose the format by suffix choose the same. Missing folders are made.
     The content is on the disk before the name is, so that a file that is there after a crash is whole.
+
+    Raises OSError that names `path`, whatever file the system's own names.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,15 +28,44 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
         yield temporary
         _flush(temporary)
         os.replace(temporary, path)
+    except OSError as error:
+        if error.errno is None or error.filename not in (None, str(temporary)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
+@contextmanager
+def write_together(folder: str | Path, *, last: str) -> Iterator[Path]:
+    """A temporary folder inside `folder` to write files to that belong together, the one named `last` among them.
+
+    They replace those of the same names when the block ends without error: the former last one is removed first, and
+    the new one comes last, so where it is, the others are of the same making. After an error (a full disk, say) all
+    former files are as they were. Missing folders are made. Raises OSError that names the file.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".files-{uuid4().hex}"
+    temporary.mkdir()
+    try:
+        yield temporary
+        (folder / last).unlink(missing_ok=True)
+        for file in sorted(temporary.iterdir(), key=lambda file: file.name == last):
+            os.replace(file, folder / file.name)
+    except OSError as error:
+        if error.errno is None or Path(error.filename or "").parent != temporary:
+            raise
+        raise OSError(error.errno, error.strerror, str(folder / Path(error.filename).name)) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
+
+
 def sweep(folder: Path) -> None:
-    """Remove the temporary files of killed processes from a folder."""
+    """Remove the temporary files and folders of killed processes from a folder."""
     for path in folder.glob(".*"):
         if re.fullmatch(r"\..*-[0-9a-f]{32}(\.\w+)?", path.name):
-            path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def _flush(path: Path) -> None:

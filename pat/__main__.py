@@ -1,5 +1,18 @@
 """`python -m pat` is `pat`: torchrun starts it so."""
 
-from .cli.main import main
+import sys
 
-main()
+
+def main() -> None:
+    """Run `pat`; an interruption while it is still being imported is one line, too."""
+    try:
+        from .cli.main import main as command
+
+        command()
+    except KeyboardInterrupt:
+        print("pat: interrupted", file=sys.stderr)
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

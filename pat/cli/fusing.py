@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Mapping
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -73,7 +75,9 @@ class Fuse:
     propagate: bool = True
     """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
     resume: bool = False
-    """Fuse only frames that are not in --out yet; of a single frame, only unfinished tiles."""
+    """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
+    strict: bool = False
+    """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
     on_error: Literal["stop", "skip"] = "stop"
     """What to do when a frame cannot be fused (a corrupt image, a full disk): stop, or report it and go on."""
     workers: int = 1
@@ -94,9 +98,35 @@ class Fuse:
         rig = self._rig()
         files = options.files_by_name(self.image)
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-        if self.sequence or max(map(len, found.values())) > 1:
-            return self._many(rig, found)
-        self._one(rig, {name: paths[0] for name, paths in found.items()})
+        with self._judged():
+            if self.sequence or max(map(len, found.values())) > 1:
+                self._many(rig, found)
+            else:
+                self._one(rig, {name: paths[0] for name, paths in found.items()})
+
+    @contextmanager
+    def _judged(self) -> Iterator[None]:
+        """Exit status 3 if the rig does not fit the images."""
+        from ..fusion.checks import LowConfidenceWarning, confidence_checked
+
+        categories: list[type[Warning]] = []
+        with confidence_checked(strict=self.strict):
+            show = warnings.showwarning
+
+            def noted(message: Warning | str, category: type[Warning], *further: Any, **options: Any) -> None:
+                categories.append(category)
+                show(message, category, *further, **options)
+
+            warnings.showwarning = noted
+            try:
+                yield
+            except Exception as error:
+                if not isinstance(error.__cause__ or error, LowConfidenceWarning):
+                    raise
+                say(f"pat: {error}; not written (--strict)", style="red")
+                sys.exit(LowConfidenceWarning.exit_status)
+        if LowConfidenceWarning in categories:
+            sys.exit(LowConfidenceWarning.exit_status)
 
     def _rig(self) -> Rig:
         rig = options.load_rig(self.rig, self.depth)
@@ -107,28 +137,33 @@ class Fuse:
         return rig
 
     def _one(self, rig: Rig, files: dict[str, Path]) -> None:
+        from arraygeom.atomic import sweep
+
         from ..fusion.results import save_frame, view_of
         from ..fusion.views import ViewFiles
+        from ..support.locks import folder_lock
 
         images = ViewFiles(rig, files, alpha=rig.require(self.alpha))
         rig = images.developed
         store = self.out / ".tiles"
-        if not self.resume:
+        with folder_lock(self.out):
+            sweep(self.out)
+            if not self.resume:
+                shutil.rmtree(store, ignore_errors=True)
+            frame = fuse_with_progress(
+                self.weights,
+                rig,
+                images,
+                alpha=self.alpha,
+                field=options.field_named(self.field),
+                max_memory=self.max_memory,
+                match_levels=self.normalise_radiometry,
+                response=options.response_of(self.response),
+                store=store,
+            )
+            view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
+            written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
             shutil.rmtree(store, ignore_errors=True)
-        frame = fuse_with_progress(
-            self.weights,
-            rig,
-            images,
-            alpha=self.alpha,
-            field=options.field_named(self.field),
-            max_memory=self.max_memory,
-            match_levels=self.normalise_radiometry,
-            response=options.response_of(self.response),
-            store=store,
-        )
-        view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
-        written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
-        shutil.rmtree(store, ignore_errors=True)
         say(f"written: {', '.join(map(str, written))}")
 
     def _many(self, rig: Rig, files: dict[str, list[Path]]) -> None:
@@ -151,6 +186,7 @@ class Fuse:
             bits=self.bits,
             kind=self.kind,
             alone=not self.propagate,
+            strict=self.strict,
         )
         several = self.workers > 1 or self.scheduler is not None
         report = batch.run(

@@ -1,8 +1,9 @@
 """Many frames, and sequences, from folders to a folder: what `pat fuse` does with more than one image a camera.
 
 Every frame is a task of its own that leaves its image last; `settings.yaml` beside the images says what they were
-made with, and a job is resumed with the same settings only. The colours of a sequence's key frames wait in `.keys`
-until all frames are there.
+made with, and a job is resumed with the same settings only; `inputs.json` says from which images, and frames whose
+images have changed are made again. One command at a time writes to a folder. The colours of a sequence's key frames
+wait in `.keys` until all frames are there.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from typing import Any
 import yaml
 from rich.console import Console
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from arraygeom import (
     Curved,
@@ -37,7 +38,7 @@ from arraygeom import (
     ThroughLenses,
     Widened,
 )
-from arraygeom.atomic import sweep, write_atomically, write_text
+from arraygeom.atomic import sweep, write_text
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
 
@@ -46,12 +47,16 @@ from ..media.raw import developed_rig
 from ..media.video import write_video
 from ..networks.weights import Network, find_weights, load_weights
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
+from ..support.locks import folder_lock
+from ..support.tensor_files import write_tensors
+from .checks import confidence_checked
 from .fuse import fuse
-from .results import ImageFormat, save_frame, view_of
+from .results import Frame, ImageFormat, save_frame, view_of
 from .sequence import ImageFiles, KeyColour, KeyFrame, SequenceFusion
 from .views import ViewFiles
 
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
@@ -86,6 +91,8 @@ class Batch:
     kind: ImageFormat = "png"
     alone: bool = False
     """Of a sequence: fuse each frame by itself, without warping colour; for comparison."""
+    strict: bool = False
+    """A frame of unfit confidence (`LowConfidenceWarning`) fails."""
 
     def __post_init__(self) -> None:
         for name in self.files:
@@ -122,6 +129,14 @@ class Batch:
         }
         return yaml.safe_dump(facts, sort_keys=False)
 
+    @property
+    def inputs(self) -> dict[str, str]:
+        """A digest of the names, sizes and times of the images each frame is made from: all of them in a sequence."""
+        stamps = {name: [_stamp(file) for file in files] for name, files in self.files.items()}
+        if self.sequence:
+            return dict.fromkeys(self.names, _digest(stamps))
+        return {name: _digest({n: found[i] for n, found in stamps.items()}) for i, name in enumerate(self.names)}
+
     def fused_file(self, i: int) -> Path:
         """The file of a fused frame."""
         return self.out / f"{self.names[i]}_fused.{self.kind}"
@@ -137,15 +152,23 @@ class Batch:
     ) -> JobReport:
         """Fuse all frames. With `video`, its frames a second, fused.mp4 is written when all are there.
 
-        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings.
+        Raises JobError if a frame fails and the job is to stop, ValueError to resume with other settings, and for a
+        folder that another command is writing to, or that cannot be written to.
         """
+        with folder_lock(self.out):
+            return self._run(workers, resume, on_error, video, console)
+
+    def _run(
+        self, workers: Workers, resume: bool, on_error: OnError, video: float | None, console: Console | None
+    ) -> JobReport:
         self._begin(resume)
         plan, many = self.out / KEYS / PLAN, range(len(self.names))
         options: dict[str, Any] = {"workers": workers, "resume": resume, "on_error": on_error, "console": console}
         if self.sequence and not self.alone:
             missing = [i for i in many if not (resume and self.fused_file(i).exists())]
             keys = self.fusion.keys_of(missing)
-            run_tasks([Task(self._key_file(k), fuse_key, (plan, k)) for k in keys], title="key frames", **options)
+            first = [Task(self._key_file(k), fuse_key, (plan, k)) for k in keys]
+            run_tasks(first, title="key frames", **options)
         tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
         report = run_tasks(tasks, title="frames", **options)
         if video is not None and (report.made or report.kept):
@@ -156,17 +179,23 @@ class Batch:
         return report
 
     def _begin(self, resume: bool) -> None:
-        """Write down the settings; or, to resume, see that they are those of before."""
+        """Write the settings and what the frames are made from; or, to resume, compare them with those of before.
+
+        Frames whose images are not those of before are removed.
+        """
         text, file = self.settings, self.out / SETTINGS
         if resume and file.is_file() and file.read_text(encoding="utf-8") != text:
             raise ValueError(f"{file}: the frames there were made with other settings: give those, or another folder")
-        if not resume:
+        now, before = self.inputs, _read_inputs(self.out / INPUTS) if resume else {}
+        other = [i for i, name in enumerate(self.names) if before.get(name) != now[name]]
+        if not resume or (self.sequence and other):
             shutil.rmtree(self.out / KEYS, ignore_errors=True)
-            for i in range(len(self.names)):
-                self.fused_file(i).unlink(missing_ok=True)
+        for i in other:
+            self.fused_file(i).unlink(missing_ok=True)
         for folder in (self.out, self.out / KEYS):
             sweep(folder)
         write_text(file, text)
+        write_text(self.out / INPUTS, json.dumps(now, indent=1))
         write_text(self.out / KEYS / PLAN, self.to_json())
 
     def to_json(self) -> str:
@@ -221,15 +250,21 @@ class Batch:
 
     def fuse_key(self, key: KeyFrame) -> None:
         """Write the colour of a key frame."""
-        colour = self.fusion.colour(key)
-        with write_atomically(self._key_file(key)) as temporary:
-            save_file({name: part.contiguous() for name, part in colour._asdict().items()}, temporary)
+        with confidence_checked(strict=self.strict):
+            colour = self.fusion.colour(key)
+        write_tensors(self._key_file(key), colour._asdict())
 
     def fuse_one(self, i: int) -> None:
         """Write a frame."""
+        with confidence_checked(strict=self.strict):
+            frame = self._frame(i)
+        view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
+        save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])
+
+    def _frame(self, i: int) -> Frame:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
-            frame = fuse(
+            return fuse(
                 _network(self.weights),
                 images.developed,
                 images,
@@ -238,11 +273,8 @@ class Batch:
                 max_memory=self.max_memory,
                 match_levels=self.match_levels,
             )
-        else:
-            fusion = self.fusion
-            frame = fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
-        view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-        save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])
+        fusion = self.fusion
+        return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 
 
 def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:
@@ -273,6 +305,27 @@ def fuse_key(plan: Path, key: KeyFrame) -> None:
 def fuse_one(plan: Path, i: int) -> None:
     """The task of a frame."""
     _planned(plan, plan.stat().st_mtime_ns).fuse_one(i)
+
+
+def _stamp(file: Path) -> str:
+    try:
+        facts = file.stat()
+    except OSError:
+        return f"{file.name}: missing"
+    return f"{file.name}: {facts.st_size} bytes of {facts.st_mtime_ns}"
+
+
+def _digest(document: object) -> str:
+    return hashlib.sha256(json.dumps(document).encode()).hexdigest()[:32]
+
+
+def _read_inputs(file: Path) -> dict[str, str]:
+    """What frames were made from; nothing where that is not known."""
+    try:
+        document = json.loads(file.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return document if isinstance(document, dict) else {}
 
 
 @lru_cache(maxsize=2)

@@ -11,6 +11,7 @@ from ..media.images import Images
 from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
+from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .inputs import frame_inputs
 from .response import Given, with_response
 from .results import Frame
@@ -66,10 +67,18 @@ def fuse(
         announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
-        ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap.
+        ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap, bands that
+            the network does not make.
+
+    Warns:
+        LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error, as
+            `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, undo = Views.of(rig, images, alpha=alpha, depth=depth, field=field), []
+    check_bands(network, rig, {name: len(views.images[name]) for name in views.betas})
+    for name in views.betas:
+        warn_of_grey(name, views.images[name])
     for step in steps_for(network, normalise=match_levels):
         views, back = step.do(views)
         undo.append(back)
@@ -81,6 +90,7 @@ def fuse(
     undo.append(back)
     state = network.prepare(inputs.inputs)
     frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
+    warn_of_confidence(network, frame, inputs)
     for back in reversed(undo):
         frame = back(frame)
     return frame

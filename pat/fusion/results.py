@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig
+from arraygeom.atomic import write_together
 
 from ..media.colour import linear_from_srgb
 from ..media.figures import colour_depth
@@ -31,31 +32,31 @@ def save_frame(
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (near is bright).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. The image
-    is written last: where it is, the others are. Each is written atomically. Without any known depth there are
-    no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on, their mean to fused.png.
+    rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. Without any
+    known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on,
+    their mean to fused.png. The image comes last: where it is, the others are of the same frame. After an error all
+    former files are as they were.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""
-    fused, confidence = out / f"{prefix}fused.{kind}", out / f"{prefix}confidence.png"
-    write_image(confidence, frame.confidence[None])
-    written = [confidence]
-    if frame.depth.isfinite().any():
-        depths = [out / f"{prefix}depth.tif", out / f"{prefix}depth.png"]
-        write_image(depths[0], frame.depth[None], bits=32, unknown=True)
-        write_image(depths[1], colour_depth(frame.depth))
-        written += depths
-    if view is not None:
-        view.save(out / "view.yaml")
-        written.append(out / "view.yaml")
-    image = linear_from_srgb(frame.image) if bits == 32 else frame.image
-    if len(image) not in (1, 3):
-        bands = {out / f"{prefix}fused_{i}.{kind}": band[None] for i, band in enumerate(image, 1)}
-        for file, band in bands.items():
-            write_image(file, band, bits=bits)
-        written, image = [*bands, *written], image.mean(0, keepdim=True)
-    write_image(fused, image, bits=bits)
-    return [fused, *written]
+    last = f"{prefix}fused.{kind}"
+    with write_together(out, last=last) as folder:
+        write_image(folder / f"{prefix}confidence.png", frame.confidence[None])
+        if frame.depth.isfinite().any():
+            write_image(folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True)
+            write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth))
+        if view is not None:
+            view.save(folder / "view.yaml")
+        image = linear_from_srgb(frame.image) if bits == 32 else frame.image
+        if len(image) not in (1, 3):
+            for i, band in enumerate(image, 1):
+                write_image(folder / f"{prefix}fused_{i}.{kind}", band[None], bits=bits)
+            image = image.mean(0, keepdim=True)
+        write_image(folder / last, image, bits=bits)
+        names = {file.name for file in folder.iterdir()} - {last}
+    for stale in {f"{prefix}depth.tif", f"{prefix}depth.png"} - names:
+        (out / stale).unlink(missing_ok=True)
+    return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
 
 
 def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:

@@ -25,12 +25,12 @@ from torch import Tensor
 from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields import default_field
 
-from ..media.colour import luminance, to_luma_chroma
+from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
 from .fuse import fuse
 from .optical_flow import flow_between, still, warped
 from .results import Frame
-from .views import read_view
+from .views import grey_alpha, read_view
 
 
 @runtime_checkable
@@ -204,8 +204,7 @@ class SequenceFusion:
 
     def grey(self, i: int) -> Float[Tensor, "1 h w"]:
         """Alpha's frame."""
-        image = self.frames[self.alpha][i]
-        return luminance(image) if image.shape[0] == 3 else image
+        return grey_alpha(self.alpha, self.frames[self.alpha][i])
 
     def alone(self, i: int) -> Frame:
         """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared with."""

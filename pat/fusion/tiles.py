@@ -10,17 +10,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
-from arraygeom.atomic import write_atomically
 from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
 from ..networks.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
 from ..networks.protocol import FusionNetwork, Inputs, State
 from ..support.memory import give_back
+from ..support.tensor_files import write_tensors
 from .inputs import FrameInputs, depth_and_confidence
 from .results import Frame
 
@@ -237,9 +237,7 @@ class TileStore(NamedTuple):
         file = self._file(tile)
         if file.exists():
             return
-        frame = make(tile)
-        with write_atomically(file) as temporary:
-            save_file({name: part.contiguous() for name, part in frame._asdict().items()}, temporary)
+        write_tensors(file, make(tile)._asdict())
 
     def read(self, tile: Tile) -> Frame:
         """A tile that was made."""

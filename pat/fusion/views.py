@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -56,7 +57,7 @@ class Views:
         checked = {name: _checked(rig, images, name) for name in (alpha, *names)}
         fields = field if isinstance(field, Mapping) else dict.fromkeys(names, field)
         rig = rig if depth is None else rig.replace(depth=depth)
-        return cls(rig, {**checked, alpha: grey(checked[alpha])}, alpha, fields)
+        return cls(rig, {**checked, alpha: grey_alpha(alpha, checked[alpha])}, alpha, fields)
 
     @property
     def own(self) -> Float[Tensor, "1 h w"]:
@@ -75,6 +76,13 @@ class Views:
     def replace(self, images: Mapping[str, Tensor], *, rig: Rig | None = None) -> Views:
         """The same with other images of some cameras, and another rig."""
         return dataclasses.replace(self, rig=rig or self.rig, images={**self.images, **images})
+
+
+def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
+    """Alpha's image in grey. Warns if it was in colour."""
+    if len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2])):
+        warnings.warn(f"the image of alpha, '{name}', is in colour: only its luminance is used", stacklevel=2)
+    return grey(image)
 
 
 def _checked(rig: Rig, images: Images, name: str) -> Tensor:

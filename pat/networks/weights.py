@@ -10,12 +10,10 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 
-from arraygeom.atomic import write_atomically
-
 from ..support.schema import from_document
+from ..support.tensor_files import write_tensors
 from .bandwise import BandwisePAT, BandwisePATConfig
 from .guided import GuidedPAT, GuidedPATConfig
 from .paper import PAT, PATConfig
@@ -46,9 +44,7 @@ def save_weights(network: Network, path: str | Path, *, facts: Mapping[str, str]
         "config": json.dumps(dataclasses.asdict(network.config)),
         **(facts or {}),
     }
-    state = {k: v.detach().cpu().contiguous() for k, v in network.state_dict().items()}
-    with write_atomically(path) as temporary:
-        save_file(state, temporary, metadata)
+    write_tensors(Path(path), network.state_dict(), metadata)
 
 
 def load_weights(name: str | Path) -> Network:

@@ -8,7 +8,9 @@ only where tasks run.
 from __future__ import annotations
 
 import os
+import re
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -34,24 +36,39 @@ class Task(NamedTuple):
 
 
 class TaskOutcome(NamedTuple):
-    """The error of a task in one line, or None."""
+    """The error of a task in one line, or None; its warnings, the last of them the error if a filter made it so."""
 
     makes: Path
     error: str | None
+    warnings: tuple[Warning, ...] = ()
 
 
 @dataclass
 class JobReport:
-    """Files made, files that were there already, and the error of each task that failed."""
+    """Files made, files that were there already, the error of each task that failed, and who warned of what."""
 
     made: list[Path] = field(default_factory=list)
     kept: list[Path] = field(default_factory=list)
     failed: dict[Path, str] = field(default_factory=dict)
+    warned: dict[str, list[Path]] = field(default_factory=dict)
+
+    def warn(self, outcome: TaskOutcome) -> None:
+        """Pass on the warnings of a task, one of each kind: texts that differ in numbers alone are of one kind."""
+        for warning in outcome.warnings:
+            kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
+            files = self.warned.setdefault(kind, [])
+            if not files:
+                warnings.warn(f"{outcome.makes.name}: {warning}", type(warning), stacklevel=3)
+            if outcome.makes not in files:
+                files.append(outcome.makes)
 
     def __str__(self) -> str:
         parts = [f"{len(self.made)} made"]
         parts += [f"{len(self.kept)} there already"] if self.kept else []
         parts += [f"{len(self.failed)} failed"] if self.failed else []
+        parts += [f"{len({file for files in self.warned.values() for file in files})} with warnings"] * bool(
+            self.warned
+        )
         return ", ".join(parts)
 
 
@@ -144,10 +161,12 @@ def run_tasks(
     for outcome in followed(run(left, workers), title=title, total=len(tasks), done=len(there), console=console):
         if outcome.error is None:
             report.made.append(outcome.makes)
+            report.warn(outcome)
             continue
         report.failed[outcome.makes] = outcome.error
         if on_error == "stop":
-            raise JobError(f"{outcome.makes.name}: {outcome.error} ({report}; begin again with --resume)")
+            text = f"{outcome.makes.name}: {outcome.error} ({report}; begin again with --resume)"
+            raise JobError(text) from next(iter(outcome.warnings[::-1]), None)
         console.print(f"skipped {outcome.makes.name}: {outcome.error}", style="yellow", markup=False)
     return report
 
@@ -254,11 +273,16 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
         return TaskOutcome(task.makes, None)
     if torch.get_num_threads() != threads:
         torch.set_num_threads(threads)
-    try:
-        task.run(*task.given)
-    except (ValueError, OSError) as error:
-        return TaskOutcome(task.makes, " ".join(str(error).split()))
-    return TaskOutcome(task.makes, None)
+    error, raised = None, []
+    with warnings.catch_warnings(record=True) as caught:
+        try:
+            task.run(*task.given)
+        except (ValueError, OSError) as failure:
+            error = " ".join(str(failure).split())
+        except Warning as failure:
+            error, raised = f"{failure}", [failure]
+    given = [entry.message for entry in caught if isinstance(entry.message, Warning)]
+    return TaskOutcome(task.makes, error, (*given, *raised))
 
 
 def cores() -> int:

@@ -17,12 +17,11 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float
 from safetensors import safe_open
-from safetensors.torch import save_file
 from tifffile import imread
 from torch import Tensor
 
 from arraygeom import Rig
-from arraygeom.atomic import write_atomically, write_text
+from arraygeom.atomic import write_text
 from arraygeom.io.native import write as rig_text
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
@@ -39,6 +38,7 @@ from pat.media.video import write_video
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.support.memory import watch_peak
+from pat.support.tensor_files import write_tensors
 from pat.systems.hdr import merged, usable_range
 
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -174,8 +174,7 @@ def recorded(
     recording = module.record_scene(stage)
     write_recording(recording, rig, out)
     counts = {name: len(images) for name, images in recording.raw.items()}
-    with write_atomically(cache) as temporary:
-        save_file(recording.reference, temporary, {"key": key, "counts": json.dumps(counts)})
+    write_tensors(cache, recording.reference, {"key": key, "counts": json.dumps(counts)})
     return recording, _files(out, counts)
 
 

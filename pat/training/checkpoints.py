@@ -10,16 +10,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
-from arraygeom.atomic import write_atomically
 from pat.networks.weights import misfit
+from pat.support.tensor_files import write_tensors
 
 FORMAT = "pat-checkpoint 1"
 RETAINED = 2
+FACTS = {"step", "best", "minutes", "done", "recipe"}
+"""What a checkpoint says beside its tensors."""
 
 
 class Checkpoint(NamedTuple):
@@ -63,32 +64,42 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
     """
     step = checkpoint.facts["step"]
     path = folder / f"step-{step:08d}.safetensors"
-    tensors = {k: v.detach().cpu().contiguous() for k, v in checkpoint.tensors.items()}
     try:
-        with write_atomically(path) as temporary:
-            save_file(tensors, temporary, {"format": FORMAT, "facts": json.dumps(checkpoint.facts)})
-    except (SafetensorError, OSError) as error:
-        raise OSError(_no_room(folder, step, tensors, error)) from None
+        write_tensors(path, checkpoint.tensors, {"format": FORMAT, "facts": json.dumps(checkpoint.facts)})
+    except OSError as error:
+        raise OSError(_no_room(folder, step, checkpoint.tensors, error)) from None
     for old in _files(folder)[RETAINED:]:
         old.unlink()
     return path
 
 
 def newest_checkpoint(folder: Path) -> Checkpoint | None:
-    """The newest complete checkpoint; None if there is none."""
-    found = (read_checkpoint(path) for path in _files(folder))
-    return next((checkpoint for checkpoint in found if checkpoint), None)
+    """The newest complete checkpoint; None if the folder has none.
+
+    Raises ValueError if it has some and none of them can be read: a run is not to begin again unasked.
+    """
+    files = _files(folder)
+    found = next((checkpoint for path in files if (checkpoint := read_checkpoint(path))), None)
+    if files and found is None:
+        names = ", ".join(path.name for path in files)
+        raise ValueError(
+            f"{folder}: no checkpoint there can be read ({names}), so this run cannot continue: restore one of them "
+            "from a copy, or remove these files to begin again at step 0, or give another --out"
+        )
+    return found
 
 
 def read_checkpoint(path: Path) -> Checkpoint | None:
-    """A checkpoint, or None for an incomplete file."""
+    """A checkpoint, or None for a file that is damaged or is none."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-    except (SafetensorError, OSError):
+        facts = json.loads(metadata.get("facts", "null"))
+    except (SafetensorError, OSError, ValueError):
         return None
-    return Checkpoint(tensors, json.loads(metadata["facts"])) if metadata.get("format") == FORMAT else None
+    whole = metadata.get("format") == FORMAT and isinstance(facts, dict) and facts.keys() >= FACTS
+    return Checkpoint(tensors, facts) if whole else None
 
 
 def _files(folder: Path) -> list[Path]:

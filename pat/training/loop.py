@@ -11,16 +11,16 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils._pytree import tree_map
 
 from arraygeom import ReceptiveField
-from arraygeom.atomic import write_atomically
 from pat.networks.paper import AttentionEngine
 from pat.networks.weights import NETWORKS, Network, load_weights, save_weights
+from pat.support.locks import folder_lock
+from pat.support.tensor_files import write_tensors
 
 from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_checkpoint
 from .config import TrainConfig, config_text, difference, parse_config, save_config
@@ -42,12 +42,13 @@ def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
     `steps` the result is that of an uninterrupted run, bit for bit; with `minutes` the time spent counts.
 
     Raises FloatingPointError if a loss or a gradient is not finite, naming the sample, the batch saved beside
-    the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run.
+    the weights; OSError if a checkpoint cannot be written; ValueError for a folder with another run, or one
+    that another command is writing to.
     """
     former = former_run(config)
     if former and former.facts["done"]:
         return config.out / BEST
-    with process(config.device) as here:
+    with process(config.device) as here, folder_lock(config.out) if here.first else nullcontext():
         run = Run(config, here, field, former)
         try:
             run.work()
@@ -247,8 +248,7 @@ def save_sample(given: Sample, path: Path, *, facts: dict[str, str]) -> None:
     tensors = {"alpha": given.alpha, "ground_truth": given.ground_truth}
     for name in ("betas", "position", "visible"):
         tensors |= {f"{name}/{i}": t for i, t in enumerate(getattr(given, name))}
-    with write_atomically(path) as temporary:
-        save_file({k: v.detach().cpu().contiguous() for k, v in tensors.items()}, temporary, facts)
+    write_tensors(path, tensors, facts)
 
 
 def former_run(config: TrainConfig) -> Checkpoint | None:

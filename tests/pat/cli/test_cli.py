@@ -1,5 +1,6 @@
 """The command line: it does the main job, and what is wrong is one line and exit status 2."""
 
+import contextlib
 import dataclasses
 import functools
 import json
@@ -14,7 +15,7 @@ import pytest
 import torch
 import yaml
 
-from arraygeom import Rig
+from arraygeom import Pose, Rig
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 from pat.data.sample_array import SAMPLE, load_sample
@@ -366,3 +367,65 @@ def test_the_module_can_be_called_as_the_function_that_it_was(capsys):
     with pytest.raises(SystemExit):
         called(["--version"])
     assert "arraygeom-pat" in capsys.readouterr().out
+
+
+def wrong(small) -> None:
+    """The rig with the sign of its baseline changed."""
+    rig = Rig.load(small / "rig.yaml")
+    pose = rig["colour"].cam_from_world
+    rig.with_camera("colour", rig["colour"].replace(cam_from_world=Pose(pose.R, -pose.t))).save(small / "rig.yaml")
+
+
+def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(small, capsys):
+    wrong(small)
+    for extra, written in (([], True), (["--strict"], False)):
+        shutil.rmtree(small / "out", ignore_errors=True)
+        with pytest.raises(SystemExit) as stop:
+            main(arguments(small, extra=extra))
+        assert stop.value.code == 3
+        text = " ".join(capsys.readouterr().err.split())
+        assert re.search(r"pat: .*mean confidence 0\.[01]\d where the views overlap: .*`pat rig doctor`", text)
+        assert (small / "out" / "fused.png").exists() == written
+    assert not (small / "out").exists()
+
+
+def test_bands_that_the_weights_do_not_make_are_refused_with_which_to_take(small, capsys):
+    error = fails(arguments(small, colour=small / "mono.png"), capsys)
+    assert "the betas have 1 band in all ('colour' 1), these weights make 3: its image is grey" in error
+    assert "mono-spectral" in error
+    assert not (small / "out").exists()
+
+
+def test_an_alpha_in_colour_and_a_beta_without_are_said(small, capsys):
+    shutil.copy(small / "colour.png", small / "mono.png")
+    write_image(small / "colour.png", read_image(small / "colour.png").mean(0, keepdim=True).expand(3, -1, -1))
+    with contextlib.suppress(SystemExit):
+        main(arguments(small))
+    text = " ".join(capsys.readouterr().err.split())
+    assert "warning: the image of alpha, 'mono', is in colour: only its luminance is used" in text
+    assert "warning: the image of 'colour' has three equal bands" in text
+
+
+def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
+    monkeypatch.setattr("pat.fusion.fuse.fuse", lambda *_, **__: pytest.fail("fused"))
+    (small / "out").write_text("a file")
+    assert "out: cannot write there (" in fails(arguments(small), capsys)
+    folders = arguments(small, mono=f"{small}/mon*.png", extra=["--out", "/proc/out"])
+    assert "/proc/out: cannot write there (/proc/out: " in fails(folders, capsys)
+    assert (small / "out").read_text() == "a file"
+
+
+def test_an_interruption_while_pat_is_imported_is_one_line():
+    code = """
+import builtins, runpy, sys
+ordinary = builtins.__import__
+def interrupted(name, *args, **kwargs):
+    if name == "tyro":
+        raise KeyboardInterrupt
+    return ordinary(name, *args, **kwargs)
+builtins.__import__ = interrupted
+sys.argv = ["pat", "--help"]
+runpy.run_module("pat", run_name="__main__")
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (130, "pat: interrupted\n")

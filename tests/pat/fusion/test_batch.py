@@ -5,6 +5,7 @@ import json
 import math
 import os
 import pickle
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from arraygeom import Epipolar, EpipolarLine, HomographyDisplacement, Rectified,
 from arraygeom.io.native import write as rig_text
 from pat.cli.main import main
 from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
+from pat.fusion.checks import LowConfidenceWarning
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.networks.guided import GuidedPAT, GuidedPATConfig
@@ -163,6 +165,61 @@ def test_the_light_that_alpha_measured_is_known_of_sequences_too(material, tmp_p
     known = job.fusion.rig["fast"].sensor
     assert (known.response, known.coding) == (LIGHT, "srgb")
     assert known.frame_rate == sensor.frame_rate
+
+
+@pytest.mark.parametrize("sequence", [False, True])
+def test_frames_whose_images_changed_are_made_again(sequence, material, tmp_path):
+    files = {name: list(find_images(material / name)) for name in ("fast", "slow")}
+    shutil.copy(files["fast"][3], tmp_path / files["fast"][3].name)
+    files["fast"][3] = tmp_path / files["fast"][3].name
+    files["slow"] = files["slow"] if sequence else [files["slow"][0]] * 7
+    job = batch(material, tmp_path / "out", sequence=sequence, files=files)
+    job.run()
+    assert len(job.run(resume=True).kept) == 7
+    before = contents(tmp_path / "out")
+    write_image(files["fast"][3], 1 - read_image(files["fast"][3]))
+    report = job.run(resume=True)
+    assert len(report.made) == (7 if sequence else 1)
+    assert contents(tmp_path / "out")["fast_11_fused.png"] != before["fast_11_fused.png"]
+    (tmp_path / "out" / "inputs.json").unlink()
+    assert len(job.run(resume=True).made) == 7
+
+
+def test_one_command_at_a_time_writes_to_a_folder(material, tmp_path, monkeypatch):
+    first, second = batch(material, tmp_path / "out"), batch(material, tmp_path / "out", match_levels=True)
+    fuse_one = Batch.fuse_one
+
+    def meanwhile(self, i):
+        if i == 2:
+            with pytest.raises(ValueError, match="another command is writing there"):
+                second.run()
+        fuse_one(self, i)
+
+    monkeypatch.setattr(Batch, "fuse_one", meanwhile)
+    assert len(first.run().made) == 7
+    assert "match_levels: false" in (tmp_path / "out" / "settings.yaml").read_text()
+
+
+def test_a_colour_file_of_a_raw_camera_is_refused_in_sequences_too(material, tmp_path):
+    job = batch(material, tmp_path, sequence=True)
+    raw = job.rig.with_camera("slow", job.rig["slow"].replace(sensor=replace(job.rig["slow"].sensor, bayer="RGGB")))
+    with pytest.raises(JobError, match=r"slow: .*slow_8.png: is in colour, and the rig says raw RGGB"):
+        replace(job, rig=raw).run()
+
+
+def test_frames_that_hardly_match_are_warned_of_once_and_fail_if_strict(material, tmp_path, monkeypatch):
+    for bound in ("LOW_CONFIDENCE", "UNFIT_CONFIDENCE"):
+        monkeypatch.setattr(f"pat.fusion.checks.{bound}", 1.0)
+    files = {"fast": find_images(material / "fast")[:2], "slow": find_images(material / "slow")[:1] * 2}
+    job = batch(material, tmp_path / "out", files=files)
+    with pytest.warns(LowConfidenceWarning, match=r"^fast_8_fused.png: mean confidence 0\.\d\d") as caught:
+        report = job.run()
+    assert len([w for w in caught if w.category is LowConfidenceWarning]) == 1
+    assert str(report) == "2 made, 2 with warnings"
+    with pytest.raises(JobError, match="mean confidence") as stopped:
+        replace(job, strict=True).run()
+    assert isinstance(stopped.value.__cause__, LowConfidenceWarning)
+    assert not list((tmp_path / "out").glob("*_fused.png"))
 
 
 class Payload:

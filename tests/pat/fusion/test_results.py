@@ -1,5 +1,7 @@
 """Files of a fusion: bands that no image holds together are written one by one."""
 
+import resource
+
 import pytest
 import tifffile
 import torch
@@ -31,6 +33,30 @@ def test_other_bands_are_written_one_by_one_and_their_mean(bands, tmp_path):
     ]
     assert torch.allclose(torch.cat([read_image(p) for p in written[1 : 1 + bands]]), frame.image, atol=1e-4)
     assert torch.allclose(read_image(written[0])[0], frame.image.mean(0), atol=1e-4)
+
+
+def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
+    """The depth fits and the fused image does not, as on a full disk."""
+    former = Frame(torch.full((3, 60, 80), 0.5), torch.ones(60, 80), torch.ones(60, 80))
+    save_frame(former, tmp_path, kind="tif", bits=16)
+    before = {p.name: p.read_bytes() for p in tmp_path.iterdir()}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (25_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match=r"too large: '.*/fused\.tif'$") as caught:
+            save_frame(
+                Frame(torch.rand(3, 60, 80), torch.rand(60, 80), torch.rand(60, 80)), tmp_path, kind="tif", bits=16
+            )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert caught.value.filename == str(tmp_path / "fused.tif")
+    assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_depth_of_a_former_frame_does_not_stay_beside_one_without(tmp_path):
+    save_frame(Frame(torch.rand(3, 6, 8), torch.ones(6, 8), torch.rand(6, 8)), tmp_path)
+    save_frame(frame_of(3), tmp_path)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["confidence.png", "fused.png"]
 
 
 def test_unknown_depth_is_nan_in_the_file_as_in_memory(tmp_path):

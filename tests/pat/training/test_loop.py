@@ -16,6 +16,7 @@ from safetensors import safe_open
 
 from pat.networks.paper import PATConfig
 from pat.networks.weights import load_weights, save_weights
+from pat.support.locks import folder_lock
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
 from pat.training.loop import new_network, shape
@@ -243,3 +244,33 @@ def test_schedules(whole):
     assert shape(whole, 50, 0.5) == pytest.approx(0.5)
     halving = replace(whole, schedule="halving", warmup=0)
     assert [shape(halving, 1, done) for done in (0.3, 0.4, 0.8)] == [1, 0.5, 0.25]
+
+
+def test_a_run_whose_checkpoints_are_all_damaged_does_not_begin_again(folder, whole, monkeypatch):
+    config = replace(whole, out=folder / "damaged")
+    stopped(config, 8, monkeypatch)
+    newer, older = sorted((config.out / "checkpoints").iterdir(), reverse=True)
+    newer.write_bytes(newer.read_bytes()[:1000])
+    assert newest_checkpoint(config.out / "checkpoints").facts["step"] == 3
+    header = int.from_bytes(older.read_bytes()[:8], "little")
+    older.write_bytes(
+        older.read_bytes()[: 8 + header].replace(b'\\"step\\"', b'\\"stop\\"') + older.read_bytes()[8 + header :]
+    )
+    log = (config.out / "log.jsonl").read_bytes()
+    with pytest.raises(
+        ValueError, match=r"no checkpoint there can be read \(step-00000006.*step-00000003.*begin again"
+    ):
+        train(config)
+    assert (config.out / "log.jsonl").read_bytes() == log
+    for file in (newer, older):
+        file.unlink()
+    train(config)
+    assert losses(config.out) == losses(whole.out)
+
+
+def test_one_run_at_a_time_writes_to_a_folder(folder, whole):
+    config = replace(whole, out=folder / "twice")
+    with folder_lock(config.out):
+        with pytest.raises(ValueError, match="twice: another command is writing there"):
+            train(config)
+        assert [p.name for p in config.out.iterdir()] == [".lock"]

@@ -1,0 +1,69 @@
+"""The explorer's server: for this machine's own names only, ports that are checked, a quiet end."""
+
+import re
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+
+import pytest
+
+from pat.cli.main import main
+from pat.data.sample_array import SAMPLE
+
+pytest.importorskip("panel", reason="the extra 'explore' is not installed")
+ROOT = Path(__file__).parents[3]
+IMAGES = [a for n in ("mono", "colour") for a in ("--image", f"{n}={SAMPLE / n}.png")]
+EXPLORE = ["explore", str(SAMPLE / "rig.yaml"), *IMAGES, "--no-browser"]
+
+
+@pytest.fixture
+def server():
+    command = [sys.executable, "-m", "pat", *EXPLORE]
+    process = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    yield process, re.search(r"http://localhost:(\d+)", process.stdout.readline())[1]
+    process.kill()
+    process.communicate()
+
+
+def status(port, path, **headers) -> int:
+    request = urllib.request.Request(f"http://127.0.0.1:{port}{path}", headers=headers)
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            return answer.status
+    except urllib.error.HTTPError as error:
+        return error.code
+
+
+def test_foreign_hosts_are_refused_whatever_their_origin_and_ctrl_c_is_quiet(server):
+    process, port = server
+    upgrade = {"Connection": "Upgrade", "Upgrade": "websocket", "Sec-WebSocket-Version": "13"}
+    upgrade["Sec-WebSocket-Key"] = "AAAAAAAAAAAAAAAAAAAAAA=="
+    for host in (f"localhost:{port}", f"127.0.0.1:{port}"):
+        assert status(port, "/", Host=host) == 200
+    for host in (f"evil.example:{port}", "evil.example", f"localhost.evil.example:{port}", f"xlocalhost:{port}"):
+        for path in ("/", "/autoload.js", "/static/js/bokeh.min.js"):
+            assert status(port, path, Host=host) == 403
+        assert status(port, "/ws", Host=host, Origin=f"http://{host}", **upgrade) == 403
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("port", ["99999", "-1"])
+def test_a_port_that_is_none_is_one_line(port, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([*EXPLORE, "--port", port])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"pat: --port {port}: wanted 1 to 65535, or 0 for a free one\n"
+
+
+def test_a_port_in_use_is_one_line(server, capsys):
+    _, port = server
+    with pytest.raises(SystemExit) as stop:
+        main([*EXPLORE, "--port", port])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"pat: --port {port}: Address already in use: give another, or 0 for a free one\n"
