@@ -93,8 +93,8 @@ def depth_and_confidence(
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
     """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the least confidence.
 
-    A position that a network found beyond the end of its segment counts as that end, so that depth is within the
-    bounds that were searched: a pixel beyond the far end may otherwise stand for any distance.
+    A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel beyond the
+    far end may otherwise stand for any distance.
     `corner` is the (x, y) of the part's first pixel in alpha; `hw` the size of the part without padding.
     """
     h, w = hw
@@ -104,11 +104,14 @@ def depth_and_confidence(
     for beta, (pair, points), position, confidence in zip(part.betas, placements, output.position, output.confidence):
         if pair.link is not None or not pair.calibrated:
             continue
+        track, offset = pinhole_track(pair, points(x)), like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)
-        if beta.field.pixels is not None:
-            where = _within(where, beta.field.pixels)
-        where = where + like.new_tensor(beta.offset)
-        found = depth_from_track(pinhole_track(pair, points(x)), where.reshape(-1, 2))
+        found = depth_from_track(track, (where + offset).reshape(-1, 2))
+        if beta.field.pixels is not None and pair.depth is not None:
+            near, far = (bound.to(found.depth) for bound in pair.depth)
+            bounded = found.valid & (found.depth >= near) & (found.depth <= far)
+            where = torch.where(bounded.reshape(h, w, 1), where, _within(where, beta.field.pixels))
+            found = depth_from_track(track, (where + offset).reshape(-1, 2))
         valid = found.valid.reshape(h, w)
         weight = torch.where(valid & (confidence[0, :h, :w] > UNSEEN), confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)

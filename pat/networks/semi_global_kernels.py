@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pat.attention.kernels import compiled
+from pat.attention.kernels import compiled, separate_cache
 
 NOWHERE = np.uint8(80)
 """Cost of a label that is not on beta: more than any other can have."""
@@ -205,3 +205,7 @@ def _between(total, best, last):
     before, after = total[best - 1], total[best + 1]
     deepest = max(before, after) - total[best]
     return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)
+
+
+for _entry in (census, costs, aggregate, winners):
+    separate_cache(_entry)

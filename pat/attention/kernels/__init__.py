@@ -17,7 +17,7 @@ from pathlib import Path
 
 from .backward import backward
 from .channels import scatter
-from .emit import LANES, compiled
+from .emit import LANES, compiled, separate_cache
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
 
@@ -35,6 +35,7 @@ __all__ = [
     "compiled",
     "forward",
     "scatter",
+    "separate_cache",
 ]
 
 
@@ -44,6 +45,7 @@ def _watch_all_sources() -> None:
     stamp = hashlib.sha256(sources).hexdigest()
     for entry in (forward, backward, scatter):
         entry._cache._cache_file._source_stamp = stamp
+        separate_cache(entry)
 
 
 _watch_all_sources()

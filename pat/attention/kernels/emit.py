@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import inspect
 from typing import Any
+from uuid import uuid4
 
 from llvmlite import ir
 from numba import njit, types
@@ -155,3 +156,13 @@ def instruction(result):
         return intrinsic(prefer_literal="literal" in notes)(typed)
 
     return decorate
+
+
+def separate_cache(entry: Any) -> None:
+    """Let this process name the files of its compiled code in numba's cache by itself.
+
+    numba counts them. Two processes that compile at once, each for other types, can choose the same number: then the
+    index of one names the code of the other, which is loaded, and computes something else.
+    """
+    file = entry._cache._cache_file
+    file._data_name_pattern = file._data_name_pattern.replace(".nbc", f"-{uuid4().hex}.nbc")
