@@ -49,7 +49,7 @@ class FieldOnGrid:
         at, hw = lazily(field, pair), hw or pair.alpha.hw
         device = pair.cameras[0].K.device if pair.calibrated else None
         grid = pixel_grid(hw, dtype=torch.float64, device=device)
-        # Explicit positions of a whole frame may not fit into memory: one point tells which the field gives.
+        # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field gives.
         kind = at(grid[:1, 0] + 0.25)
         if isinstance(kind, Positions):
             return cls(at, kind.xy.shape[-2], None)

@@ -60,7 +60,7 @@ def save_frame(
 
 
 def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
-    """The rig of fused images: alpha's camera alone, its values coded as `save_frame` writes them."""
+    """The rig of fused images: alpha's camera alone, its values encoded as `save_frame` writes them."""
     coding = "linear" if bits == 32 else "srgb"
     response = "rgb" if bands == 3 else rig[alpha].sensor.response
     sensor = dataclasses.replace(developed(rig[alpha].sensor), coding=coding, response=response)

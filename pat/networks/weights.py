@@ -34,7 +34,7 @@ Network = PAT | GuidedPAT | BandwisePAT
 
 
 def save_weights(network: Network, path: str | Path, *, facts: Mapping[str, str] | None = None) -> None:
-    """Write a network's weights and configuration; the file appears whole or not at all.
+    """Write a network's weights and configuration; the file is written atomically.
 
     `facts` (recipe, seed, figures) are kept beside them, as text.
     """
