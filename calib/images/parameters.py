@@ -19,6 +19,8 @@ from ..boards.observability import TYPICAL_COEFFICIENTS
 SIGMA = {"rotation": math.radians(0.5), "translation": 0.01, "focal": 0.01, "centre": 5.0, "distortion": 0.02}
 """Default standard deviations: radians, a share of the longest baseline, a share of the focal length, pixels of the
 principal point, and a share of `TYPICAL_COEFFICIENTS`."""
+UNCERTAIN = ("rotation", "translation", "focal", "centre")
+"""Kinds of parameters that are uncertain even where they are not free."""
 ALIASES = {"principal_point": "centre", "focal_length": "focal"}
 AXES = {"rotation": "xyz", "translation": "xyz", "focal": "xy", "centre": "xy"}
 UNITS = {
@@ -27,6 +29,8 @@ UNITS = {
     "focal": ("px", 1.0),
     "centre": ("px", 1.0),
 }
+FOCAL_CORRELATION = 0.995
+"""Of fx and fy: pixels keep their shape, to a tenth of the focal length's deviation."""
 LENS_SIGMA = 0.2
 """That share for uncalibrated lenses, whose unit is half the longer side of the image."""
 LINK_SIGMA = 0.1
@@ -37,13 +41,22 @@ LINK_SIGMA = 0.1
 class FreeParameter:
     """One parameter vector: "camera.rotation" and so on, or "alpha > beta" for an F.
 
-    sigma: prior standard deviations. unit, factor: the unit for display and the factor that converts to it.
+    sigma: prior standard deviations. correlation: between neighbouring components (fx and fy change together).
+    unit, factor: the unit for display and the factor that converts to it.
     """
 
     name: str
     sigma: Float[Tensor, " k"]
     unit: str
     factor: float
+    correlation: float = 0.0
+
+    @property
+    def root(self) -> Float[Tensor, "k k"]:
+        """A lower triangular root of the prior covariance: the change is root z."""
+        eye = torch.eye(len(self.sigma), dtype=torch.float64)
+        correlation = torch.where(eye > 0, eye, self.correlation)
+        return self.sigma[:, None] * torch.linalg.cholesky(correlation)
 
     def label(self, index: int) -> str:
         """The name of one component."""
@@ -80,10 +93,24 @@ def free_parameters(
     return found + [FreeParameter(name, torch.full((7,), LINK_SIGMA).double(), "F", 1.0) for name in links]
 
 
+def considered_parameters(
+    rig: Rig, names: Sequence[str], free: Sequence[FreeParameter], *, sigma: Mapping[str, float] | None = None
+) -> list[FreeParameter]:
+    """The poses, focal lengths and principal points of these cameras that are not free but uncertain all the same.
+
+    Their uncertainty counts, but they are not changed.
+    """
+    if not any(isinstance(rig[name], Camera) for name in names):
+        return []
+    fixed = {f.name for f in free}
+    found = free_parameters(rig, names, free=UNCERTAIN, sigma=sigma)
+    return [f for f in found if f.name not in fixed and f.unit != "F" and not f.name.endswith(".distortion")]
+
+
 def apply_change(rig: Rig, given: Sequence[FreeParameter], z: Float[Tensor, " n"]) -> Rig:
     """The rig after a change of each component by z standard deviations; differentiable in z."""
     parts = z.split([len(u.sigma) for u in given])
-    values = {u.name: part * u.sigma.to(part) for u, part in zip(given, parts)}
+    values = {u.name: u.root.to(part) @ part for u, part in zip(given, parts)}
     links = {
         names: _perturbed_link(link, values.get(" > ".join(names)), rig, names) for names, link in rig.links.items()
     }
@@ -115,14 +142,14 @@ def _free_parameter(rig: Rig, name: str, like: Tensor, sigma: Mapping[str, float
     size = torch.full((like.shape[-1],), sigma[kind], dtype=torch.float64)
     view = rig[camera]
     if kind == "focal" and isinstance(view, Camera):
-        size = size * view.K[:2, :2].det().abs().sqrt()
+        size = size * view.K[:2, :2].abs().amax(0)
     if kind == "distortion" and isinstance(view, LensView) and view.distortion is not None:
         natural = torch.tensor(TYPICAL_COEFFICIENTS[view.distortion.model][: len(size)], dtype=torch.float64)
         size = natural * (sigma[kind] if isinstance(view, Camera) else LENS_SIGMA)
     if kind == "translation":
         size = size * _longest_baseline(rig)
     unit, factor = UNITS.get(kind, ("", 1.0))
-    return FreeParameter(name, size, unit, factor)
+    return FreeParameter(name, size, unit, factor, FOCAL_CORRELATION if kind == "focal" else 0.0)
 
 
 def _longest_baseline(rig: Rig) -> float:

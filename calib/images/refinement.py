@@ -5,50 +5,63 @@ The free parameters z, in units of their prior standard deviations (of a calibra
     sum_i log(1 + (r_i(z) / s)^2) + sum_k z_k^2
 
 with r the Sampson distances of matched points (Hartley & Zisserman 11.4.3) and s the scale of the points' noise:
-Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). Parameters that the images
-do not determine keep their values. Held-out points decide whether the result is accepted. Its posterior is then the
-prior of a second fit, to the photometric error of the fusion: see `photometric`.
+Gauss-Newton steps on automatic derivatives through `arraygeom`, reweighted (Cauchy's loss). What is not free (other
+parameters of the cameras, and what their lens models leave) is uncertain all the same and takes its share of the
+residuals. Parameters that the images do not determine keep their values, and so do combinations of them that would
+change depth without the images determining it (`depth_change`). Held-out points, the prior and the uncertainty of depth
+decide whether the result is accepted. Its posterior is then the prior of a second fit, to the photometric error of the
+fusion: see `photometric`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from arraygeom import Camera, Rig
 
+from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
+from .least_squares import Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import describe_lenses, with_lenses
-from .matches import ENOUGH, Matches, match_cameras, with_map
-from .parameters import FreeParameter, apply_change, free_parameters
+from .matches import ENOUGH, Matches, fit_fundamental, line_distance, match_cameras, undistort_matches, with_map
+from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
-from .residuals import epipolar_residuals, related
+from .residuals import epipolar_residuals, related, systematic_modes
 
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
 FREE = ("rotation", "centre")
-EXTRA_FREE = ("translation",)
-"""Freed too if held-out points improve: otherwise it is poorly constrained, and depths would drift."""
-LARGEST_POSTERIOR = 0.9
-"""A parameter is fixed if its posterior standard deviation stays above this share of the prior's."""
+EXTRA_FREE = ("focal", "translation")
+"""Freed too if held-out points improve."""
+SYSTEMATIC = 0.3
+"""Prior deviation, pixels at the image's corner, of each smooth displacement that a lens model leaves."""
+LARGEST_CHANGE = 4.0
+"""Prior standard deviations by which a parameter may change: beyond, the rig is not the one that the prior is of."""
+LARGEST_DISTANCE, OF_OWN = 1.0, 3.0
+"""A refined rig is refused whose held-out points lie farther from their lines than this, in pixels (median), and than
+this many times their distance from the lines of an F fitted to them."""
+AT_BEST = 1.1
+"""No more is freed where held-out points are within this factor of their distance from such lines."""
 HELD_OUT = 4
 """One in this many points or frames is held out."""
 CELL = 24
 """Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
 SIGNIFICANT = 2.0
 """Standard errors by which the distances of held-out points must decrease."""
-STEPS = 40
+PARTS = 3
+"""The jackknife leaves out one of so many by so many parts of the image."""
+UNCHANGED = 3e-4
+"""Relative deviation of depth within which a pattern of depth stays."""
 CORRELATED_PIXELS = 10.0
 """Photometric errors of this many neighbouring pixels count as one measurement."""
 ROUNDS = 8
 """Iterations of the photometric minimisation."""
-LEAST_NOISE = 0.03
-"""Lower bound of the noise of matched points, pixels."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +105,9 @@ class Refinement:
 
     rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters that the
     images do not determine. fitted, held_out: statistics before and after of the points used, and of those held out.
-    photometric: the photometric error, if it was minimised.
+    depth: what happens to depth, for calibrated cameras. objections: why the result should not be accepted. kept: the
+    parameters of combinations that would change depth without being determined. photometric: the photometric error, if
+    it was minimised.
     """
 
     rig: Rig
@@ -101,19 +116,27 @@ class Refinement:
     unobservable: tuple[str, ...]
     fitted: tuple[LineStatistics, LineStatistics]
     held_out: tuple[LineStatistics, LineStatistics]
+    depth: DepthChange | None = None
+    objections: tuple[str, ...] = ()
+    kept: tuple[str, ...] = ()
     photometric: PhotometricResult | None = None
 
     def as_text(self) -> str:
-        """The changes and the distances of held-out points, as text."""
+        """The changes, the distances of held-out points and what happens to depth, as text."""
         given, refined = self.held_out
         lines = [f"held-out points ({given.points}) lie {given} from their lines before, {refined} after"]
-        if self.accepted:
-            lines += [f"changed: {change}" for change in self.changes]
-            lines += [sentence] if (sentence := describe_lenses(self.rig)) else []
-        else:
-            lines.append("not accepted: held-out points are no nearer to their lines; the rig is unchanged")
+        lines += [] if self.depth is None else [str(self.depth)]
+        verdict = "accepted all the same" if self.accepted else "not accepted"
+        lines += [f"{verdict}: {objection}" for objection in self.objections]
+        lines += [f"changed: {change}" for change in self.changes]
+        lines += [sentence] if self.accepted and (sentence := describe_lenses(self.rig)) else []
+        if not self.accepted:
+            lines.append("the rig is unchanged")
         if self.unobservable:
             lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")
+        if self.kept:
+            kept = ", ".join(self.kept)
+            lines.append(f"kept, as they would change depth without the images determining it: combinations of {kept}")
         if self.photometric is not None:
             before, after, accepted = self.photometric
             verdict = "accepted" if accepted else "not accepted"
@@ -128,31 +151,38 @@ def refine(
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
     attend: Attend | None = None,
+    force: bool = False,
 ) -> Refinement:
     """Refine a rig by points matched in frames, each with an image of every camera.
 
     The first camera that has images keeps its pose. `free` and `sigma` are those of `parameters.free_parameters`; F of
     links is always free, and views known by F alone are given lenses if held-out points improve. With two frames or
     more, whole frames are held out, else parts of the image. With `attend` the photometric error of the fusion is then
-    minimised, with the posterior of the points as its prior. Raises ValueError, one line: a camera that the rig lacks,
+    minimised, with the posterior of the points as its prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig lacks,
     an image of another size than the rig states, equal images, too few points.
     """
     for frame in frames:
         _check(rig, frame)
     fit, solution = fitted(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
-    refined = fit.report(solution)
-    if attend is None or not refined.accepted:
+    refined = fit.report(solution, force=force)
+    if attend is None or not refined.accepted or not solution.directions.shape[1]:
         return refined
     polished, errors = polish(fit, solution, frames, attend)
-    return replace(fit.report(polished) if errors.accepted else refined, photometric=errors)
+    improved = fit.report(polished, force=force)
+    return replace(improved if errors.accepted and improved.accepted else refined, photometric=errors)
 
 
 def refine_matches(
-    rig: Rig, frames: Sequence[Pairs], *, free: Iterable[str] = FREE, sigma: Mapping[str, float] | None = None
+    rig: Rig,
+    frames: Sequence[Pairs],
+    *,
+    free: Iterable[str] = FREE,
+    sigma: Mapping[str, float] | None = None,
+    force: bool = False,
 ) -> Refinement:
     """`refine` from matched points, without the photometric error."""
     fit, solution = fitted(rig, frames, free=free, sigma=sigma)
-    return fit.report(solution)
+    return fit.report(solution, force=force)
 
 
 def fitted(
@@ -160,7 +190,7 @@ def fitted(
 ) -> tuple[RefinementProblem, Solution]:
     """The fit and its solution, with additional free parameters if held-out points improve.
 
-    Those are translations, if `free` is the default, and lenses of views known by F.
+    Those are focal lengths and translations, if `free` is the default, and lenses of views known by F.
     """
     free = tuple(free)
     candidates = [(rig, free)]
@@ -168,22 +198,34 @@ def fitted(
         candidates.append((rig, (*FREE, *EXTRA_FREE)))
     if (with_lens := with_lenses(rig, rig.names)) is not rig:
         candidates.append((with_lens, free))
-    fits = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
-    best, *others = [(fit, fit.solve()) for fit in fits]
-    for other in others:
+    problems = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
+    best = problems[0], problems[0].solve()
+    for problem in problems[1:]:
+        if _at_its_best(*best):
+            break
+        other = problem, problem.solve()
         distances = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (best, other)]
         best = other if nearer(*distances) else best
     return best
 
 
+def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
+    """Whether held-out points of calibrated cameras are as near to their lines as to those of an F fitted to them."""
+    if fit.rig.links:
+        return False
+    rig = fit.after(solution.z)
+    return float(line_distances(rig, fit.held_out).abs().median()) < AT_BEST * _own_distance(rig, fit.held_out)
+
+
 @dataclass(frozen=True)
 class RefinementProblem:
-    """A rig, its free parameters, and the points used and held out."""
+    """A rig, its free parameters, those that are uncertain though not free, and the points used and held out."""
 
     rig: Rig
     parameters: tuple[FreeParameter, ...]
     used: Pairs
     held_out: Pairs
+    considered: tuple[FreeParameter, ...] = ()
 
     @classmethod
     def of(
@@ -195,28 +237,197 @@ class RefinementProblem:
         parameters = free_parameters(rig, names, free=free, sigma=sigma)
         if not parameters:
             raise ValueError("nothing is free: the first camera keeps its pose; free more with --free, such as centre")
-        return cls(rig, tuple(parameters), used, held_out)
+        considered = considered_parameters(rig, names, parameters, sigma=sigma)
+        return cls(rig, tuple(parameters), used, held_out, tuple(considered))
 
     def after(self, z: Float[Tensor, " n"]) -> Rig:
-        """The rig after a change of z, in standard deviations."""
-        return apply_change(self.rig, self.parameters, z)
+        """The rig after a change of z, in standard deviations; of the considered parameters too if z has them."""
+        given = (*self.parameters, *self.considered)[: len(self.parameters) if len(z) == self.count else None]
+        return apply_change(self.rig, given, z)
+
+    @property
+    def count(self) -> int:
+        """The number of free parameters."""
+        return sum(len(u.sigma) for u in self.parameters)
+
+    @property
+    def uncertain(self) -> int:
+        """The number of free and considered parameters of cameras."""
+        return self.count + sum(len(u.sigma) for u in self.considered)
 
     def solve(self) -> Solution:
-        """The posterior given the used points."""
-        return solve(lambda z: sampson(self.after(z), self.used), sum(len(u.sigma) for u in self.parameters))
+        """The posterior given the used points, without changes of depth that they do not determine.
 
-    def report(self, solution: Solution) -> Refinement:
-        """The changes by a solution, and whether the held-out points support it."""
+        If depth still changes by more than they determine it, without any change of depth that can be avoided.
+        """
+        systematic = _systematic(self.rig, self.used)
+
+        def residuals(z: Tensor) -> Tensor:
+            return sampson(self.after(z[: self.uncertain]), self.used) + systematic @ z[self.uncertain :]
+
+        considered = self.uncertain - self.count + systematic.shape[1]
+        unrestricted = solve(residuals, self.count, considered)
+        found = self._determined(unrestricted, residuals)
+        if (depth := self._depth_change(self.after(found.z), found)) is not None and depth.doubtful:
+            found = self._determined(unrestricted, residuals, keep_depth=True)
+        return found
+
+    def depth_derivatives(self) -> Float[Tensor, "m k"] | None:
+        """Derivatives of the logarithm of the used points' depth by free and considered parameters.
+
+        None for uncalibrated rigs and for too few points whose depth is observable.
+        """
+        values = log_depths(self.after, [self.rig], self.used)
+        return None if values is None else jacobian(values, torch.zeros(self.uncertain, dtype=torch.float64))[1]
+
+    def _determined(self, solution: Solution, residuals: Residuals, *, keep_depth: bool = False) -> Solution:
+        """The solution without the modes of depth that the points do not determine.
+
+        Repeated with the modes at the solution found, as those of the given rig hold only near it.
+        """
+        if not bool(solution.active.any()):
+            return solution
+        changes = left_out(residuals, solution, _parts(self.rig, self.used), PARTS**2)
+        found = solution._replace(z=torch.zeros_like(solution.z))
+        for _ in range(2):
+            values = log_depths(self.after, [self.rig, self.after(found.z)], self.used)
+            if values is None:
+                return solution
+            G = jacobian(values, found.z)[1][:, solution.active]
+            covariance = solution.covariance[solution.active][:, solution.active]
+            modes = depth_modes(G, solution.z[solution.active], covariance, changes[:, solution.active])
+            kept = modes.deviation < NEGLIGIBLE if keep_depth else modes.kept
+            patterns = torch.nn.functional.normalize(G @ modes.root[:, ~kept], dim=0)
+            found = self._without_patterns(solution, patterns, residuals, values)
+            directions = torch.zeros(self.count, int(kept.sum()), dtype=torch.float64)
+            directions[solution.active] = modes.root[:, kept]
+            found = found._replace(directions=directions, gained=modes.gained(kept), known=modes.total)
+        return found
+
+    def _without_patterns(
+        self, solution: Solution, patterns: Float[Tensor, "m p"], residuals: Residuals, log_depth: Residuals
+    ) -> Solution:
+        """The most probable parameters that leave these patterns of depth as they were."""
+        before = log_depth(torch.zeros_like(solution.z)).detach()
+        tight = noise_scale(residuals(solution.full).detach()) / (UNCHANGED * len(before) ** 0.5)
+
+        def constrained(full: Tensor) -> Tensor:
+            return torch.cat([residuals(full), tight * (patterns.T @ (log_depth(full[: self.count]) - before))])
+
+        free = torch.ones(len(solution.full), dtype=torch.bool)
+        free[: self.count] = solution.active
+        start = torch.zeros_like(solution.full)
+        full = most_probable(constrained, start, torch.eye(len(free), dtype=start.dtype)[:, free])
+        return solution._replace(z=full[: self.count])
+
+    def report(self, solution: Solution, *, force: bool = False) -> Refinement:
+        """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty support it."""
         refined = self.after(solution.z)
         distances = [
             (line_distances(self.rig, pairs), line_distances(refined, pairs)) for pairs in (self.used, self.held_out)
         ]
         fitted, held_out = ((line_statistics(before), line_statistics(after)) for before, after in distances)
-        accepted = bool(solution.active.any()) and nearer(*distances[1])
-        changes = tuple(_changes(self.parameters, solution)) if accepted else ()
-        unobservable = tuple(_unobservable(self.parameters, solution.active))
-        rig = _with_maps(refined, self.used) if accepted else self.rig
-        return Refinement(rig, accepted, changes, unobservable, fitted, held_out)
+        depth = self._depth_change(refined, solution)
+        moved = bool(solution.z.any())
+        objections = [] if moved and nearer(*distances[1]) else [NO_NEARER]
+        objections += _contradictions(self.parameters, solution.z)
+        objections += _remaining(refined, self.held_out, held_out[1]) if moved else []
+        objections += _uncertain_depth(depth)
+        accepted = moved and (force or not objections)
+        return Refinement(
+            rig=_with_maps(refined, self.used) if accepted else self.rig,
+            accepted=accepted,
+            changes=tuple(_changes(self.parameters, solution)) if accepted else (),
+            unobservable=tuple(_unobservable(self.parameters, solution.active)),
+            fitted=fitted,
+            held_out=held_out,
+            depth=depth,
+            objections=tuple(objections),
+            kept=tuple(_kept(self.parameters, solution)),
+        )
+
+    def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
+        """None for uncalibrated rigs and for too few points whose depth is observable."""
+        if (G := self.depth_derivatives()) is None:
+            return None
+        before = rms_deviation(G)
+        after = max(before**2 - solution.gained, 0.0) ** 0.5
+        return DepthChange(relative_change(self.rig, refined, self.used), before, after, solution.known)
+
+
+NO_NEARER = "held-out points are no nearer to their lines"
+
+
+def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]:
+    """An objection for each parameter vector that changes by more than its prior allows."""
+    found = []
+    for u, part in zip(parameters, z.split([len(u.sigma) for u in parameters])):
+        change = u.root @ part
+        worst = int((change / u.sigma).abs().argmax())
+        ratio = float((change / u.sigma)[worst].abs())
+        if ratio > LARGEST_CHANGE and u.unit != "F":
+            size, sigma = (float(v[worst]) * u.factor for v in (change, u.sigma))
+            found.append(
+                f"{u.label(worst)} would change by {size:+.3g} {u.unit}, {ratio:.0f} standard deviations of "
+                f"{sigma:.3g}: is something else wrong (`pat rig doctor`)? If so large a change is plausible, say so "
+                "with --sigma"
+            )
+    return found
+
+
+def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str]:
+    """An objection if the refined rig still fits far worse than any F would."""
+    if after.median > max(LARGEST_DISTANCE, OF_OWN * _own_distance(refined, held_out)):
+        return [f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat rig doctor`"]
+    return []
+
+
+def _own_distance(rig: Rig, pairs: Pairs) -> float:
+    """The median distance, in undistorted pixels, of points from the lines of an F fitted to them."""
+    found = []
+    for names, matches in pairs.items():
+        undistorted = undistort_matches(rig.pair(*names), matches)
+        try:
+            found.append(line_distance(undistorted, fit_fundamental(undistorted)))
+        except ValueError:
+            continue
+    return float(torch.cat(found).median()) if found else 0.0
+
+
+def _uncertain_depth(depth: DepthChange | None) -> list[str]:
+    """Objections to what happens to depth."""
+    if depth is None:
+        return []
+    found = ["depth would be less certain than before"] if depth.after > depth.before else []
+    if depth.doubtful:
+        found.append(f"depth would change by {depth.change:.1%} but these points determine it to {depth.known:.1%} only")
+    elif depth.change > LARGE_CHANGE:
+        found.append(f"depth would change by {depth.change:.0%}: a rig so far off is better calibrated anew")
+    return found
+
+
+def _parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
+    """Which of `PARTS` x `PARTS` parts of alpha's image each point is in."""
+    found = []
+    for names, matches in pairs.items():
+        h, w = rig[names[0]].hw
+        cell = (matches.alpha * PARTS / matches.alpha.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
+        found.append(cell[:, 0] + PARTS * cell[:, 1])
+    return torch.cat(found)
+
+
+def _systematic(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
+    """Derivatives of all distances by what the calibrated cameras' lens models leave, in prior deviations."""
+    names = [name for name in rig.names if isinstance(rig[name], Camera) and any(name in pair for pair in pairs)]
+    columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}
+    parts = []
+    for pair, matches in pairs.items():
+        part = torch.zeros(len(matches.alpha), 4 * len(names), dtype=torch.float64)
+        if rig.pair(*pair).link is None and all(name in columns for name in pair):
+            for name, modes in zip(pair, systematic_modes(rig.pair(*pair), matches)):
+                part[:, columns[name]] = SYSTEMATIC * modes
+        parts.append(part)
+    return torch.cat(parts)
 
 
 def polish(
@@ -230,13 +441,13 @@ def polish(
     rig = with_depths(fit.after(solution.z), fit.used)
     base = replace(fit, rig=fit.rig.replace(depth=rig.depth))
     views = [PhotometricFrame.of(frame) for frame in frames]
-    root = torch.linalg.cholesky(solution.covariance)[:, solution.active]
+    root = solution.directions
 
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
         parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
         return torch.cat([error[valid & (_held_out_pixels(error) == held_out)] for error, valid in parts])
 
-    noise = _noise(errors(solution.z, held_out=False).detach())
+    noise = noise_scale(errors(solution.z, held_out=False).detach())
     y = torch.zeros(root.shape[1], dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([y], max_iter=ROUNDS, line_search_fn="strong_wolfe", tolerance_change=1e-4)
 
@@ -258,84 +469,6 @@ def _held_out_pixels(error: Tensor) -> Tensor:
     """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
     rows, columns = (torch.arange(n) // 4 for n in error.shape)
     return (columns + 2 * rows[:, None]) % HELD_OUT == 0
-
-
-class Solution(NamedTuple):
-    """The parameters z, which of them were observable, and their covariance, in units of the prior's deviations."""
-
-    z: Float[Tensor, " n"]
-    active: Bool[Tensor, " n"]
-    covariance: Float[Tensor, "n n"]
-
-
-def solve(residuals: Callable[[Tensor], Tensor], count: int) -> Solution:
-    """The most probable z under a normal prior of variance 1, with unobservable parameters fixed.
-
-    Parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others solved for again.
-    """
-    active = torch.ones(count, dtype=torch.bool)
-    while True:
-        z = _most_probable(residuals, active)
-        information, _ = _normal_equations(residuals, z, active)
-        covariance = torch.linalg.inv(information)
-        observable = covariance.diagonal().sqrt() <= LARGEST_POSTERIOR
-        if bool((observable == active).all()):
-            return Solution(z, active, covariance)
-        active = active & observable
-
-
-def _most_probable(residuals: Callable[[Tensor], Tensor], active: Tensor) -> Tensor:
-    z = torch.zeros(len(active), dtype=torch.float64)
-    for _ in range(STEPS):
-        scale = _noise(residuals(z).detach())
-        information, slope = _normal_equations(residuals, z, active)
-        step = torch.linalg.solve(information, slope)
-        z, moved = _shorten(residuals, z, step, scale)
-        if moved < 1e-4:
-            break
-    return z
-
-
-def _shorten(residuals: Callable[[Tensor], Tensor], z: Tensor, step: Tensor, scale: float) -> tuple[Tensor, float]:
-    """A step along `step` that lowers the cost, halved until it does; and its largest entry."""
-    before = _cost(residuals(z).detach(), z, scale)
-    for _ in range(8):
-        if _cost(residuals(z + step).detach(), z + step, scale) <= before:
-            return z + step, float(step.abs().max())
-        step = step / 2
-    return z, 0.0
-
-
-def _cost(r: Tensor, z: Tensor, scale: float) -> float:
-    return float((r / scale).square().log1p().sum() + z.square().sum())
-
-
-def _noise(r: Tensor) -> float:
-    """The scale of the residuals: 1.48 times their median size, which is the deviation of normal ones."""
-    return max(1.4826 * float(r.abs().median()), LEAST_NOISE)
-
-
-def _normal_equations(residuals: Callable[[Tensor], Tensor], z: Tensor, active: Tensor) -> tuple[Tensor, Tensor]:
-    """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss; inactive parameters have only their prior."""
-    r, J = jacobian(residuals, z)
-    J = torch.where(active, J, 0.0)
-    scale = _noise(r)
-    weight = 1 / (scale**2 + r.square())
-    eye = torch.eye(len(z), dtype=z.dtype)
-    return J.T @ (weight[:, None] * J) + eye, -(J.T @ (weight * r) + torch.where(active, z, 0.0))
-
-
-def jacobian(f: Callable[[Tensor], Tensor], z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
-    """f(z) and its derivatives, for many values of few parameters.
-
-    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian.
-    """
-    z = z.detach().requires_grad_()
-    values = f(z)
-    u = torch.zeros_like(values, requires_grad=True)
-    (slope,) = torch.autograd.grad(values, z, u, create_graph=True)
-    (columns,) = torch.autograd.grad(slope, u, torch.eye(len(z)).to(slope), is_grads_batched=True)
-    return values.detach(), columns.T
 
 
 def sampson(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
@@ -407,11 +540,28 @@ def _check(rig: Rig, frame: Frame) -> None:
 
 def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[ParameterChange]:
     sizes = [len(u.sigma) for u in parameters]
-    deviations = solution.covariance.diagonal().sqrt().split(sizes)
-    for u, z, deviation, active in zip(parameters, solution.z.split(sizes), deviations, solution.active.split(sizes)):
+    at = 0
+    for u, z, active in zip(parameters, solution.z.split(sizes), solution.active.split(sizes)):
+        mine = slice(at, at := at + len(z))
         if bool(active.any()):
-            scale = u.sigma * u.factor
-            yield ParameterChange(u.name, tuple((z * scale).tolist()), tuple((deviation * scale).tolist()), u.unit)
+            deviation = (u.root @ solution.covariance[mine, mine] @ u.root.T).diagonal().sqrt()
+            amount = u.root @ z
+            yield ParameterChange(u.name, tuple((amount * u.factor).tolist()), tuple((deviation * u.factor).tolist()), u.unit)
+
+
+def _labels(parameters: Sequence[FreeParameter]) -> list[str]:
+    return [u.label(i) for u in parameters for i in range(len(u.sigma))]
+
+
+def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:
+    """The parameter with the largest part in each combination that keeps its value."""
+    active = solution.active
+    covariance = solution.covariance[active][:, active]
+    moved = torch.linalg.lstsq(torch.linalg.cholesky(covariance), solution.directions[active]).solution
+    complement = torch.linalg.svd(moved).U[:, moved.shape[1] :]
+    labels = [label for label, free in zip(_labels(parameters), active.tolist()) if free]
+    parts = (torch.linalg.cholesky(covariance) @ complement).abs()
+    return dict.fromkeys(labels[int(i)] for i in parts.argmax(0)) if parts.numel() else ()
 
 
 def _unobservable(parameters: Sequence[FreeParameter], active: Tensor) -> Iterable[str]:

@@ -6,6 +6,7 @@ A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -57,6 +58,42 @@ def residuals_and_depths(pair: Pair, matches: Matches) -> tuple[EpipolarResidual
     residuals, (a, b) = _residuals(pair, matches)
     calibrated = pair.calibrated and pair.link is None
     return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid) if calibrated else None
+
+
+def match_depths(pair: Pair, matches: Matches) -> MatchDepths | None:
+    """Depths where the rays are closest to each other, differentiable in the rig; None for uncalibrated pairs."""
+    if not pair.calibrated or pair.link is not None:
+        return None
+    (a, b), _, valid = _rays(pair, *_for_each(pair, matches))
+    return _depths(pair, a, b, valid)
+
+
+def systematic_modes(pair: Pair, matches: Matches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+    """Derivatives of the Sampson distances by smooth displacements of alpha's points, and of beta's.
+
+    The displacements are what a lens model leaves, each 1 pixel at the image's corner: radial, of third and fifth
+    order, and decentred along x and along y.
+    """
+    alpha, beta = (x.detach().requires_grad_() for x in matches)
+    with torch.enable_grad():
+        (a, b), F, _ = _rays(pair, alpha, beta)
+        slopes = torch.autograd.grad(((b @ F) * a).sum(), (alpha, beta))
+    norm = torch.cat(slopes, -1).norm(dim=-1).clamp(min=1e-150)
+    found = [
+        torch.einsum("ni,nim->nm", slope / norm[:, None], _displacements(view, x)).nan_to_num()
+        for slope, view, x in zip(slopes, (pair.alpha, pair.beta), matches)
+    ]
+    return found[0], found[1]
+
+
+def _displacements(view: View, points: Tensor) -> Tensor:
+    """(n, 2, 4)"""
+    h, w = view.hw
+    p = (points - points.new_tensor([(w - 1) / 2, (h - 1) / 2])) / (0.5 * math.hypot(h, w))
+    x, y = p.unbind(-1)
+    r2 = (p * p).sum(-1, keepdim=True)
+    decentred = [torch.stack(v, -1) / 3 for v in ((3 * x * x + y * y, 2 * x * y), (2 * x * y, x * x + 3 * y * y))]
+    return torch.stack([r2 * p, r2 * r2 * p, *decentred], -1)
 
 
 def _residuals(pair: Pair, matches: Matches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:

@@ -184,7 +184,8 @@ class Doctor:
 class Refine:
     """Refine a rig by ordinary images of its cameras: matched points first, then the fusion's own error.
 
-    Held-out points decide: no rig is written unless they come nearer to their epipolar lines.
+    No rig is written unless held-out points come nearer to their epipolar lines, the changes agree with their standard
+    deviations, and depth does not become less certain. What happens to depth is printed and written into the file.
     Example: pat rig refine rig.yaml --image mono=a.png --image colour=b.png --out better.yaml
     """
 
@@ -195,13 +196,17 @@ class Refine:
     """Rig file to write."""
     free: tuple[str, ...] = ("rotation", "centre")
     """Free parameters: rotation, translation, focal, centre (principal_point), distortion; or CAMERA.rotation. By
-    default, translation too if that brings held-out points nearer."""
+    default, focal and translation too if that brings held-out points nearer."""
     sigma: Annotated[tuple[str, ...], arg(metavar="KIND=NUMBER")] = ()
     """Standard deviation of a parameter before refinement: degrees, pixels; relative for translation and focal."""
     photometric: bool = True
     """Also minimise the fusion's own error, after that of the points."""
+    force: bool = False
+    """Write the refined rig in spite of objections."""
 
     def run(self) -> None:
+        from arraygeom.atomic import write_text
+        from arraygeom.io.native import write
         from calib.images.refinement import refine
 
         from ..attention import attend_with_statistics
@@ -214,11 +219,13 @@ class Refine:
             free=[kind for text in self.free for kind in text.split(",")],
             sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
             attend=attend_with_statistics if self.photometric else None,
+            force=self.force,
         )
         print(found.as_text())
         if not found.accepted:
-            return say("no rig written")
-        found.rig.save(self.out)
+            return say("no rig written" + (": --force writes it all the same" if found.objections else ""))
+        notes = "".join(f"# {line}\n" for line in ["pat rig refine:", *found.as_text().splitlines()])
+        write_text(self.out, write(found.rig) + notes)
         say(f"written: {self.out}")
 
 

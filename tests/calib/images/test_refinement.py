@@ -20,10 +20,12 @@ from calib.images.refinement import (
     sampson,
     solve,
 )
+from calib.images.remedies import swap
 from calib.images.residuals import epipolar_residuals
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import write_image
+from tests.benchmarks.bench_drift import error as depth_error
 from tests.calib.scenes import (
     HW,
     rectified_images,
@@ -34,6 +36,7 @@ from tests.calib.scenes import (
     unlike_pair,
     vector,
 )
+from tests.calib.simulated import simulated_matches, simulated_rig
 
 
 def worse(rig: Rig, *, seed=0) -> Rig:
@@ -54,13 +57,65 @@ def test_a_perturbed_rig_returns(lens):
     rig = unlike_pair(lens=lens)
     bad, exact = worse(rig), seen_points(rig, noise=0.0, seed=1)
     assert median_off(bad, exact) > 1
-    found = refine_matches(bad, [seen_points(rig)])
+    found = refine_matches(bad, [seen_points(rig)], force=True)
     assert found.accepted
     assert found.held_out[1].median < 0.25 < found.held_out[0].median
     assert median_off(found.rig, exact) < 0.1
     assert found.rig["first"].R is bad["first"].R
     assert "second.rotation" in found.as_text()
     assert "degrees" in found.as_text()
+
+
+def small_drift() -> tuple[Rig, Rig]:
+    """A pair of narrow field, its second camera rotated by 0.1 degrees about its vertical axis and its horizontal."""
+    rig = simulated_rig("narrow", 2, np.random.default_rng(5))
+    return rig, rig.perturbed({"c1.rotation": vector(0.0012, 0.0012, 0)})
+
+
+def test_depth_that_points_do_not_determine_stays():
+    """The rotation about the vertical hardly moves a line: what is determined returns, depth stays as it was."""
+    rig, bad = small_drift()
+    points = simulated_matches(rig, "narrow", np.random.default_rng(6))
+    found = refine_matches(bad, [points])
+    assert found.accepted
+    assert found.held_out[1].median < 0.5 * found.held_out[0].median
+    assert found.depth.change < 0.02
+    before, after = (depth_error(r, rig, points) for r in (bad, found.rig))
+    assert after < before + 0.01
+    assert "depth changes by" in found.as_text()
+    assert found.kept
+
+
+@pytest.mark.parametrize("field", ["narrow", "wide"])
+def test_a_wrong_focal_length_does_not_ruin_depth(field):
+    rig = simulated_rig(field, 2, np.random.default_rng(7))
+    points = simulated_matches(rig, field, np.random.default_rng(8))
+    bad = rig.perturbed({"c1.focal": 0.02 * rig["c1"].K[:2, :2].diagonal()})
+    found = refine_matches(bad, [points])
+    assert found.accepted
+    before, after = (depth_error(r, rig, points) for r in (bad, found.rig))
+    assert after < before
+    assert found.held_out[1].median < 0.25
+
+
+def test_swapped_cameras_are_not_accepted():
+    rig = simulated_rig("narrow", 2, np.random.default_rng(9))
+    points = simulated_matches(rig, "narrow", np.random.default_rng(10))
+    found = refine_matches(swap(rig, "c0", "c1"), [points])
+    assert not found.accepted
+    assert found.objections
+    assert "not accepted" in found.as_text()
+    assert refine_matches(swap(rig, "c0", "c1"), [points], force=True).accepted
+
+
+def test_a_prior_binds():
+    """A change of many prior deviations is refused, with the parameter's name and what to do."""
+    rig = simulated_rig("wide", 2, np.random.default_rng(11))
+    bad = rig.perturbed({"c1.rotation": vector(0.03, 0, 0)})
+    points = simulated_matches(rig, "wide", np.random.default_rng(12))
+    found = refine_matches(bad, [points], sigma={"rotation": math.radians(0.1), "centre": 1.0})
+    assert not found.accepted
+    assert any("standard deviations" in text and "--sigma" in text for text in found.objections)
 
 
 def test_wrong_points_do_not_matter():
@@ -257,6 +312,7 @@ def test_command_line(tmp_path, capsys):
     command = ["rig", "refine", str(tmp_path / "rig.yaml"), *files, "--free", "rotation"]
     main([*command, "--no-photometric", "--out", str(tmp_path / "better.yaml")])
     assert "changed: right.rotation" in capsys.readouterr().out
+    assert "# depth changes by" in (tmp_path / "better.yaml").read_text()
     better = Rig.load(tmp_path / "better.yaml")
     assert isinstance(better["right"], Camera)
     assert better["right"].hw == HW

@@ -1,0 +1,136 @@
+"""The most probable parameters given residuals and a normal prior: Gauss-Newton, reweighted for Cauchy's loss.
+
+Parameters are in units of their prior standard deviations, so that the prior's covariance is 1. The first ones are
+free; the rest are considered: uncertain, so that they explain what they may, but they never change the rig.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+LARGEST_POSTERIOR = 0.9
+"""A parameter is fixed if its posterior standard deviation stays above this share of the prior's."""
+STEPS = 40
+CONVERGED = 1e-3
+"""Iteration ends at a step of this many prior deviations."""
+LEAST_NOISE = 0.03
+"""Lower bound of the noise of matched points, pixels."""
+
+Residuals = Callable[[Tensor], Tensor]
+
+
+class Solution(NamedTuple):
+    """The free parameters z, which of them were observable, and their covariance, in units of the prior's deviations.
+
+    directions: (n, m), z is a sum of these columns; along the others the images do not determine it. full,
+    full_covariance: the most probable values of free and considered parameters without that restriction, and their
+    covariance. gained: the variance of depth that the changes lose, relative to depth squared. known: the deviation of
+    depth that is left if the full solution is right.
+    """
+
+    z: Float[Tensor, " n"]
+    active: Bool[Tensor, " n"]
+    covariance: Float[Tensor, "n n"]
+    directions: Float[Tensor, "n m"]
+    full: Float[Tensor, " k"]
+    full_covariance: Float[Tensor, "k k"]
+    gained: float = 0.0
+    known: float = 0.0
+
+
+def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
+    """The most probable z under a normal prior of variance 1, with unobservable parameters fixed.
+
+    Free parameters whose standard deviation stays above `LARGEST_POSTERIOR` are reset to 0 and the others solved for
+    again. `residuals` takes `count` free parameters and then the `considered` ones.
+    """
+    total = count + considered
+    active = torch.ones(total, dtype=torch.bool)
+    z = torch.zeros(total, dtype=torch.float64)
+    while True:
+        basis = torch.eye(total, dtype=torch.float64)[:, active]
+        z = most_probable(residuals, z * active, basis)
+        information, _ = _normal_equations(residuals, z)
+        eye = torch.eye(total, dtype=torch.float64)
+        kept = active[:, None] & active
+        covariance = torch.linalg.inv(torch.where(kept, information, eye))
+        observable = covariance.diagonal().sqrt() <= LARGEST_POSTERIOR
+        observable[count:] = True
+        if bool((observable == active).all()):
+            root = torch.linalg.cholesky(covariance[:count, :count])[:, active[:count]]
+            return Solution(z[:count], active[:count], covariance[:count, :count], root, z, covariance)
+        active = active & observable
+
+
+def left_out(
+    residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"], count: int
+) -> Float[Tensor, "g n"]:
+    """The changes of the free parameters, to first order, when the residuals of one group (0 to g - 1) are left out."""
+    r, J = jacobian(residuals, solution.full)
+    J = J[:, torch.cat([solution.active, torch.ones(J.shape[1] - len(solution.active), dtype=torch.bool)])]
+    weight = 1 / (noise_scale(r) ** 2 + r.square())
+    information = J.T @ (weight[:, None] * J) + torch.eye(J.shape[1], dtype=J.dtype)
+    changes = torch.zeros(count, len(solution.z), dtype=J.dtype)
+    for group in range(count):
+        mine = groups == group
+        part = J[mine].T @ (weight[mine, None] * J[mine])
+        step = torch.linalg.solve(information - part, J[mine].T @ (weight[mine] * r[mine]))
+        changes[group, solution.active] = step[: int(solution.active.sum())]
+    return changes
+
+
+def most_probable(residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"]) -> Float[Tensor, " k"]:
+    """The most probable parameters z + basis y, from z on."""
+    for _ in range(STEPS):
+        scale = noise_scale(residuals(z).detach())
+        information, slope = _normal_equations(residuals, z)
+        step = basis @ torch.linalg.solve(basis.T @ information @ basis, basis.T @ slope)
+        z, moved = _shorten(residuals, z, step, scale)
+        if moved < CONVERGED:
+            break
+    return z
+
+
+def _shorten(residuals: Residuals, z: Tensor, step: Tensor, scale: float) -> tuple[Tensor, float]:
+    """A step along `step` that lowers the cost, halved until it does; and its largest entry."""
+    before = _cost(residuals(z).detach(), z, scale)
+    for _ in range(8):
+        if _cost(residuals(z + step).detach(), z + step, scale) <= before:
+            return z + step, float(step.abs().max())
+        step = step / 2
+    return z, 0.0
+
+
+def _cost(r: Tensor, z: Tensor, scale: float) -> float:
+    return float((r / scale).square().log1p().sum() + z.square().sum())
+
+
+def noise_scale(r: Tensor) -> float:
+    """The scale of the residuals: 1.48 times their median size, which is the deviation of normal ones."""
+    return max(1.4826 * float(r.abs().median()), LEAST_NOISE)
+
+
+def _normal_equations(residuals: Residuals, z: Tensor) -> tuple[Tensor, Tensor]:
+    """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss."""
+    r, J = jacobian(residuals, z)
+    weight = 1 / (noise_scale(r) ** 2 + r.square())
+    eye = torch.eye(len(z), dtype=z.dtype)
+    return J.T @ (weight[:, None] * J) + eye, -(J.T @ (weight * r) + z)
+
+
+def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
+    """f(z) and its derivatives, for many values of few parameters.
+
+    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian.
+    """
+    z = z.detach().requires_grad_()
+    values = f(z)
+    u = torch.zeros_like(values, requires_grad=True)
+    (slope,) = torch.autograd.grad(values, z, u, create_graph=True)
+    (columns,) = torch.autograd.grad(slope, u, torch.eye(len(z)).to(slope), is_grads_batched=True)
+    return values.detach(), columns.T

@@ -1,0 +1,128 @@
+"""What `pat rig refine` does to depth when a rig has drifted: simulated rigs, and real pairs with published rigs.
+
+    python -m tests.benchmarks.bench_drift --draws 3 --out tests/benchmarks/RESULTS_drift.md
+
+Depth is the median relative error of the matched points' depth, against that of the true (simulated) or published
+(real) rig, of the drifted rig and of the refined one. *1 px* is the depth that one pixel of disparity is worth, relative
+(median): published rigs are 0.5 to 1.2 px off their images, so that their depth is good to about as much. *said* is the
+change of depth that refine prints. *+* before the distance from the lines: the result was accepted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from itertools import chain
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from arraygeom import Rig
+from arraygeom.atomic import write_text
+from calib.images.depth_change import observed_depths
+from calib.images.matches import match_cameras
+from calib.images.refinement import refine_matches
+from calib.images.remedies import swap
+from pat.evaluation.tables import markdown_header, markdown_row
+from tests.calib.real import RealPair, bumblebee, syntim
+from tests.calib.simulated import simulated_matches, simulated_rig
+
+REAL = ("Serfaty", "BatInria", "Color", "Poly", "Money", "SmRub", "BalMouss", "TableSTV")
+DRIFTS = ("nothing", "focal +2 %", "rotation .1", "rotation .3", "rotation 1", "centre 5 px", "centre 15 px", "swapped")
+
+
+def drifted(rig: Rig, kind: str, g: np.random.Generator) -> Rig:
+    """The rig with its second camera (all focal drifts there too) drifted in a random direction."""
+    name = rig.names[1]
+    if kind == "nothing":
+        return rig
+    if kind == "swapped":
+        return swap(rig, *rig.names[:2])
+    if kind.startswith("focal"):
+        return rig.perturbed({f"{name}.focal": 0.02 * rig[name].K[:2, :2].diagonal()})
+    what, size = kind.split()[:2]
+    direction = g.normal(size=3 if what == "rotation" else 2)
+    size = math.radians(float(size)) if what == "rotation" else float(size)
+    return rig.perturbed({f"{name}.{what}": torch.from_numpy(direction / np.linalg.norm(direction) * size)})
+
+
+def error(rig: Rig, truth: Rig, matches: dict) -> float:
+    """The median relative error of depth; 1 where a point has none under the rig."""
+    true = observed_depths(truth, matches)
+    off = (observed_depths(rig, matches) / true - 1).abs().nan_to_num(1.0)
+    return float(off[~true.isnan()].median())
+
+
+def row(label: str, rig: Rig, bad: Rig, matches: dict, kind: str) -> tuple[str, float, float]:
+    found = refine_matches(bad, [matches])
+    before, after = (error(r, rig, matches) for r in (bad, found.rig))
+    given, refined = (s.median for s in found.held_out)
+    distances = f"{given:.2f}", f"{'+' if found.accepted else ''}{refined:.2f}"
+    said = "" if found.depth is None else f"{found.depth.change:.1%}"
+    stated = "" if found.depth is None else f"{found.depth.before:.0%} > {found.depth.after:.0%}"
+    why = "; ".join(text.split(":")[0] for text in found.objections)
+    cells = (label, kind, *distances, f"{before:.2%}", f"{after:.2%}", said, stated, why)
+    return markdown_row(list(cells)), before, after
+
+
+HEAD = ["rig", "drift", "px before", "px after", "depth before", "depth after", "said", "stated", "objections"]
+
+
+def simulated(draws: int) -> Iterator[str]:
+    yield markdown_header(HEAD)
+    worst = 0.0
+    for field in ("wide", "narrow"):
+        for count in (2, 4):
+            for kind in DRIFTS:
+                for draw in range(1 if kind in ("nothing", "swapped") else draws):
+                    g = np.random.default_rng([draw, count, DRIFTS.index(kind)])
+                    rig = simulated_rig(field, count, g)
+                    matches = simulated_matches(rig, field, g)
+                    line, before, after = row(f"{field}, {count} cameras", rig, drifted(rig, kind, g), matches, kind)
+                    worst = max(worst, after - before)
+                    yield line
+    yield f"\nLargest increase of depth's error: {worst:.2%}"
+
+
+def real(data: Path, draws: int) -> Iterator[str]:
+    yield markdown_header(HEAD)
+    pairs = chain(syntim(data, REAL), bumblebee(data, ("chair01", "stones01")))
+    for pair in pairs:
+        yield from _real_pair(pair, draws)
+
+
+def _real_pair(pair: RealPair, draws: int) -> Iterator[str]:
+    rig = Rig({name: pair.rig[name] for name in pair.images})
+    matches = match_cameras(pair.images)
+    shifted = rig.perturbed({f"{rig.names[1]}.centre": torch.tensor([1.0, 0.0], dtype=torch.float64)})
+    label = f"{pair.name}, 1 px {error(shifted, rig, matches):.1%}"
+    for kind in DRIFTS:
+        for draw in range(1 if kind in ("nothing", "swapped") or kind.startswith("focal") else draws):
+            g = np.random.default_rng([draw, DRIFTS.index(kind)])
+            yield row(label, rig, drifted(rig, kind, g), matches, kind)[0]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--draws", type=int, default=2)
+    parser.add_argument("--only", nargs="*", choices=["simulated", "real"], default=["simulated", "real"])
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    cv2.setRNGSeed(0)
+    torch.set_num_threads(1)
+    tables = {"simulated": lambda: simulated(options.draws), "real": lambda: real(options.data, options.draws)}
+    lines = []
+    for table in [tables[name]() for name in options.only]:
+        for line in chain(table, [""]):
+            print(line, flush=True)
+            lines.append(line)
+    if options.out:
+        write_text(options.out, "# Depth of drifted rigs after refinement\n\n" + "\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

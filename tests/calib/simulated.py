@@ -1,0 +1,78 @@
+"""Simulated rigs of wide and narrow field and the points matched in their images, with noise and wrong matches."""
+
+from __future__ import annotations
+
+import math
+from itertools import combinations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
+from calib.images.matches import Matches
+
+HW = (480, 640)
+FOCAL = {"wide": 420.0, "narrow": 1900.0}
+DISTANCE = {"wide": (1.0, 4.0), "narrow": (4.0, 9.0)}
+"""Metres to the nearest and the farthest points."""
+NOISE, WRONG = 0.15, 0.08
+"""Pixels, and the share of wrong matches among those that an F with a tolerance of some pixels lets pass."""
+
+
+def simulated_rig(field: str, count: int, g: np.random.Generator, *, lens: bool = False) -> Rig:
+    """A row of unlike cameras some 0.25 m apart that look at the middle of the scene, each roughly."""
+    near, far = DISTANCE[field]
+    target = np.array([0.0, 0.0, (near + far) / 2])
+    cameras = {}
+    for i in range(count):
+        centre = np.array([0.25 * i, *g.normal(0, 0.03, 2)])
+        focal = FOCAL[field] * g.uniform(0.9, 1.1)
+        middle = (np.array(HW[::-1]) - 1) / 2 + g.normal(0, 8, 2)
+        corner = math.hypot(*HW) / 2 / focal
+        k1 = -g.uniform(0.06, 0.12) / corner**2
+        distortion = Distortion("brown-conrady", torch.tensor([k1, 0.3 * k1**2, 0, 0])) if lens else None
+        R = rotation_from_vector(torch.from_numpy(g.normal(0, 0.02, 3))) @ _towards(target - centre)
+        pose = Pose.from_centre(R, torch.from_numpy(centre))
+        cameras[f"c{i}"] = Camera(
+            K=intrinsics((focal, focal * 1.002), HW, tuple(middle)),
+            cam_from_world=pose,
+            hw=HW,
+            distortion=None if distortion is None else distortion.to(torch.float64),
+        )
+    return Rig(cameras, depth=(0.9 * near, 1.1 * far))
+
+
+def _towards(direction: np.ndarray) -> Tensor:
+    z = direction / np.linalg.norm(direction)
+    x = np.cross([0.0, 1.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    return torch.from_numpy(np.stack([x, np.cross(z, x), z]))
+
+
+def simulated_matches(
+    rig: Rig, field: str, g: np.random.Generator, *, count: int = 250, noise: float = NOISE, wrong: float = WRONG
+) -> dict[tuple[str, str], Matches]:
+    """Matched points of every two neighbouring cameras of a true rig; wrong ones lie some pixels across the lines."""
+    names = rig.names
+    found = {}
+    for a, b in combinations(names, 2):
+        if names.index(b) - names.index(a) == 1:
+            found[a, b] = _pair_matches(rig, (a, b), field, g, count=count, noise=noise, wrong=wrong)
+    return found
+
+
+def _pair_matches(
+    rig: Rig, names: tuple[str, str], field: str, g: np.random.Generator, *, count: int, noise: float, wrong: float
+) -> Matches:
+    alpha, beta = (rig[name] for name in names)
+    h, w = alpha.hw
+    near, far = DISTANCE[field]
+    x = torch.from_numpy(g.uniform(0, 1, (6 * count, 2)) * [w - 1, h - 1])
+    depth = torch.from_numpy(1 / g.uniform(1 / far, 1 / near, len(x)))
+    y, _, valid = beta.project(alpha.unproject(x, depth))
+    seen = valid & beta.contains(y) & x.isfinite().all(-1)
+    x, y = x[seen][:count], y[seen][:count]
+    is_wrong = torch.from_numpy(g.uniform(size=len(x)) < wrong)
+    off = torch.from_numpy(np.where(is_wrong[:, None], g.uniform(-5, 5, (len(x), 2)), g.normal(0, noise, (len(x), 2))))
+    return Matches(x + torch.from_numpy(g.normal(0, noise, (len(x), 2))), y + off)
