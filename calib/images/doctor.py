@@ -19,6 +19,7 @@ from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 
 from .matches import Matches, match_cameras
+from .plausibility import least_surprise
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
@@ -30,6 +31,8 @@ HEALTHY_MISFIT = 0.2
 """A rig with a smaller misfit than this, in pixels, is healthy."""
 TRIMMED = 0.85
 """The share of the points, those nearest to their lines, that statistics use."""
+OF_TRIMMED = 0.52
+"""The mean square of these of normal points of variance 1."""
 EQUAL = (1.4, 0.03)
 """Explanations are indistinguishable whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 WRONG_SIDE_PENALTY = 100.0
@@ -37,6 +40,12 @@ WRONG_SIDE_PENALTY = 100.0
 LARGEST_REMAINDER = 0.33
 """A mistake is named if its remedy leaves no more than this share of the misfit: many wrong remedies improve a drifted
 rig somewhat."""
+MARGIN = 12.0
+"""A mistake is named if -2 log evidence is smaller by this than that of a drift."""
+EXPLAINED = (0.9, 0.06)
+"""A mistake explains the points if no more than so many pixels, or that share of the misfit, are left."""
+LEAST_NOISE = 0.05
+"""Lower bound of the points' noise, pixels."""
 FEW = 10
 """Least number of points for a share."""
 BARREL, PINCUSHION = -0.6, 0.4
@@ -54,6 +63,7 @@ class FitStatistics(NamedTuple):
     inside: share of those in front that lie in the rig's depth range; NaN without one.
     handed: share of the triangles of neighbouring points whose orientation changes between the images, or not, as the
     rig implies: mirrored images change it.
+    depth: median depth in metres of the points in front; NaN if too few.
     """
 
     off: float
@@ -61,6 +71,7 @@ class FitStatistics(NamedTuple):
     front: float
     inside: float
     handed: float
+    depth: float = math.nan
 
     @property
     def penalised_misfit(self) -> float:
@@ -74,6 +85,8 @@ class FitStatistics(NamedTuple):
             parts.append(f"{self.front:.0%} in front")
         if not math.isnan(self.inside):
             parts.append(f"{self.inside:.0%} within the depth range")
+        if not math.isnan(self.depth):
+            parts.append(f"median depth {self.depth:.3g} m")
         if self.handed < 0.5:
             parts.append("one image mirrored relative to the other")
         return ", ".join(parts)
@@ -83,7 +96,8 @@ class FitStatistics(NamedTuple):
 class Diagnosis:
     """The result of a diagnosis.
 
-    named: the mistake, or `NOTHING`. equal: other kinds of mistake that explain the images as well.
+    named: the mistake, or `NOTHING`: no mistake explains the images clearly better than a drift of the cameras does.
+    equal: other kinds of mistake that explain the images as well.
     before, after: statistics of the given rig and of the repaired one. tried: all explanations, best first.
     matches: number of points used. healthy: the given rig fits the images.
     """
@@ -105,10 +119,11 @@ class Diagnosis:
             return f"likely mistake: {self.named.words}{others}"
         if self.healthy:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
+        shifts = "; or: ".join(remedy.words for remedy in self.equal)
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
-            "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair it"
-        )
+            "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair what can be observed"
+        ) + (f". As plausible as a drift, but not more: {shifts}" if shifts else "")
 
     def as_text(self) -> str:
         """The verdict, and the statistics before and after, as text."""
@@ -154,7 +169,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     """`diagnose` from matched points of images of these sizes."""
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
-    figures = _evaluate(rig, tried, pairs)
+    figures, inliers, noise = _evaluate(rig, tried, pairs)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].penalised_misfit)
     least = EQUAL[0] * figures[order[0]].penalised_misfit + EQUAL[1]
@@ -162,12 +177,33 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     healthy = fits and figures[0].penalised_misfit < HEALTHY_MISFIT
     if healthy or (fits and figures[best].penalised_misfit > LARGEST_REMAINDER * figures[0].penalised_misfit):
         best = 0
-    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].penalised_misfit <= least and best}
+    candidate = best
+    if best and fits and not _clearly_better(rig, tried[best], (figures[0], figures[best]), pairs, inliers, noise):
+        best = 0
+    equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].penalised_misfit <= least and candidate}
+    equal.pop("nothing", None)
     equal.pop(tried[best].kind, None)
     table = tuple((tried[i], figures[i]) for i in order)
     count = sum(len(matches.alpha) for matches in pairs.values())
     repaired = tried[best].repair(rig)
     return Diagnosis(tried[best], tuple(equal.values()), figures[0], figures[best], table, count, healthy, repaired)
+
+
+def _clearly_better(
+    rig: Rig,
+    remedy: Remedy,
+    figures: tuple[FitStatistics, FitStatistics],
+    pairs: Pairs,
+    inliers: Tensor,
+    noise: float,
+) -> bool:
+    """Whether a mistake explains the points clearly better than a drift of the given rig does."""
+    given, repaired = (
+        least_surprise(r, pairs, inliers, noise, mirrored=f.handed < 0.5)
+        for r, f in zip((rig, remedy.repair(rig)), figures)
+    )
+    before, after = (f.penalised_misfit for f in figures)
+    return after <= max(EXPLAINED[0], EXPLAINED[1] * before) and repaired + MARGIN < given
 
 
 def _thinned(matches: Matches) -> Matches:
@@ -176,13 +212,16 @@ def _thinned(matches: Matches) -> Matches:
     return Matches(matches.alpha[::step], matches.beta[::step])
 
 
-def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[FitStatistics]:
-    """The statistics of every explanation, from the same points: the inliers of the best of them."""
+def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[FitStatistics], Tensor, float]:
+    """The statistics of every explanation, from the same points: the inliers of the best of them.
+
+    Those inliers, and the standard deviation of their distances too.
+    """
     rigs = [remedy.repair(rig) for remedy in tried]
     observed = _observe(rigs, pairs)
     inliers, floor = _inliers(rig, tried, observed.off, pairs)
     preserved = [handedness(matches) for matches in pairs.values()]
-    return [
+    figures = [
         _figures(
             *(part[i] for part in observed),
             inliers=inliers,
@@ -192,6 +231,7 @@ def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> list[FitStatis
         )
         for i, repaired in enumerate(rigs)
     ]
+    return figures, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
 
 
 def handedness(matches: Matches) -> float:
@@ -300,7 +340,9 @@ def _figures(
     misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
     observable = ~depth.isnan()
     share = float(front[observable].double().mean()) if int(observable.sum()) >= FEW else math.nan
-    return FitStatistics(float(off.abs().median()), misfit, share, _inside(bounds, depth[observable & front]), handed)
+    seen = depth[observable & front]
+    median = float(seen.median()) if len(seen) >= FEW else math.nan
+    return FitStatistics(float(off.abs().median()), misfit, share, _inside(bounds, seen), handed, median)
 
 
 def _inside(bounds: Depths | None, depth: Tensor) -> float:

@@ -16,7 +16,7 @@ from torch import Tensor
 LARGEST_POSTERIOR = 0.9
 """A parameter is fixed if its posterior standard deviation stays above this share of the prior's."""
 STEPS = 40
-CONVERGED = 1e-3
+CONVERGED = 5e-3
 """Iteration ends at a step of this many prior deviations."""
 LEAST_NOISE = 0.03
 """Lower bound of the noise of matched points, pixels."""
@@ -55,7 +55,7 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     while True:
         basis = torch.eye(total, dtype=torch.float64)[:, active]
         z = most_probable(residuals, z * active, basis)
-        information, _ = _normal_equations(residuals, z)
+        information, _ = _normal_equations(*jacobian(residuals, z), z)
         eye = torch.eye(total, dtype=torch.float64)
         kept = active[:, None] & active
         covariance = torch.linalg.inv(torch.where(kept, information, eye))
@@ -84,21 +84,24 @@ def left_out(
     return changes
 
 
-def most_probable(residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"]) -> Float[Tensor, " k"]:
+def most_probable(
+    residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"], *, steps: int = STEPS
+) -> Float[Tensor, " k"]:
     """The most probable parameters z + basis y, from z on."""
-    for _ in range(STEPS):
-        scale = noise_scale(residuals(z).detach())
-        information, slope = _normal_equations(residuals, z)
+    for _ in range(steps):
+        r, J = jacobian(residuals, z)
+        information, slope = _normal_equations(r, J, z)
         step = basis @ torch.linalg.solve(basis.T @ information @ basis, basis.T @ slope)
-        z, moved = _shorten(residuals, z, step, scale)
+        z, moved = _shorten(residuals, z, step, r)
         if moved < CONVERGED:
             break
     return z
 
 
-def _shorten(residuals: Residuals, z: Tensor, step: Tensor, scale: float) -> tuple[Tensor, float]:
-    """A step along `step` that lowers the cost, halved until it does; and its largest entry."""
-    before = _cost(residuals(z).detach(), z, scale)
+def _shorten(residuals: Residuals, z: Tensor, step: Tensor, r: Tensor) -> tuple[Tensor, float]:
+    """A step along `step` from residuals r that lowers the cost, halved until it does; and its largest entry."""
+    scale = noise_scale(r)
+    before = _cost(r, z, scale)
     for _ in range(8):
         if _cost(residuals(z + step).detach(), z + step, scale) <= before:
             return z + step, float(step.abs().max())
@@ -115,9 +118,8 @@ def noise_scale(r: Tensor) -> float:
     return max(1.4826 * float(r.abs().median()), LEAST_NOISE)
 
 
-def _normal_equations(residuals: Residuals, z: Tensor) -> tuple[Tensor, Tensor]:
+def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
     """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss."""
-    r, J = jacobian(residuals, z)
     weight = 1 / (noise_scale(r) ** 2 + r.square())
     eye = torch.eye(len(z), dtype=z.dtype)
     return J.T @ (weight[:, None] * J) + eye, -(J.T @ (weight * r) + z)

@@ -56,7 +56,7 @@ SIGNIFICANT = 2.0
 """Standard errors by which the distances of held-out points must decrease."""
 PARTS = 3
 """The jackknife leaves out one of so many by so many parts of the image."""
-UNCHANGED = 3e-4
+UNCHANGED = 1e-3
 """Relative deviation of depth within which a pattern of depth stays."""
 CORRELATED_PIXELS = 10.0
 """Photometric errors of this many neighbouring pixels count as one measurement."""
@@ -260,7 +260,7 @@ class RefinementProblem:
 
         If depth still changes by more than they determine it, without any change of depth that can be avoided.
         """
-        systematic = _systematic(self.rig, self.used)
+        systematic = systematic_columns(self.rig, self.used)
 
         def residuals(z: Tensor) -> Tensor:
             return sampson(self.after(z[: self.uncertain]), self.used) + systematic @ z[self.uncertain :]
@@ -317,7 +317,7 @@ class RefinementProblem:
         free = torch.ones(len(solution.full), dtype=torch.bool)
         free[: self.count] = solution.active
         start = torch.zeros_like(solution.full)
-        full = most_probable(constrained, start, torch.eye(len(free), dtype=start.dtype)[:, free])
+        full = most_probable(constrained, start, torch.eye(len(free), dtype=start.dtype)[:, free], steps=12)
         return solution._replace(z=full[: self.count])
 
     def report(self, solution: Solution, *, force: bool = False) -> Refinement:
@@ -416,7 +416,7 @@ def _parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
     return torch.cat(found)
 
 
-def _systematic(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
+def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Derivatives of all distances by what the calibrated cameras' lens models leave, in prior deviations."""
     names = [name for name in rig.names if isinstance(rig[name], Camera) and any(name in pair for pair in pairs)]
     columns = {name: slice(4 * i, 4 * i + 4) for i, name in enumerate(names)}

@@ -19,7 +19,7 @@ from arraygeom import Camera, Distortion, Pose, Rig, View, resize_matrix
 from arraygeom.pixels import HW, rot90_matrix, shift_matrix
 
 KINDS = (
-    *("nothing", "resized", "rotated or mirrored", "cameras swapped", "pose inverted", "R transposed"),
+    *("nothing", "resized", "rotated or mirrored", "cameras swapped", "pose inverted", "R transposed", "sign of t"),
     *("x and y exchanged", "units", "distortion", "half-pixel shift", "one-pixel shift"),
 )
 RESIZED = (0.5, 2.0, 0.25, 4.0, 1 / 3, 3.0, 2 / 3, 1.5, 0.75, 4 / 3)
@@ -155,6 +155,7 @@ def _swapped(rig: Rig, names: list[str], sizes: Mapping[str, HW]) -> Iterator[Re
 def _poses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
     changes: dict[tuple[str, str], Callable[[Pose], Pose]] = {
         ("pose inverted", "pose of {} inverted (world from camera)"): Pose.inverse,
+        ("sign of t", "translation of {} with the wrong sign"): lambda pose: Pose(pose.R, -pose.t),
         ("R transposed", "R of {} transposed"): lambda pose: Pose(pose.R.transpose(-1, -2), pose.t),
     }
     for (kind, words), change in changes.items():

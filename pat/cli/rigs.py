@@ -159,11 +159,12 @@ class Doctor:
     image: Images
     """An image of each of two or more cameras."""
     out: MaybeOut = None
-    """Rig file to write if a mistake is found: the repaired rig. Also: --fix."""
+    """Rig file to write if a mistake is found: the repaired rig. Also: --fix. A former file is kept as NAME.old."""
     json: bool = False
     """Print JSON instead of text."""
 
     def run(self) -> None:
+        from arraygeom.atomic import write_text
         from calib.images.doctor import diagnose
 
         rig = load_rig(self.rig)
@@ -176,8 +177,13 @@ class Doctor:
             return
         if found.named.kind == "nothing":
             return say("no rig written: no mistake was found")
+        kept = ""
+        if self.out.exists():
+            former = self.out.with_name(f"{self.out.name}.old")
+            write_text(former, self.out.read_text(encoding="utf-8"))
+            kept = f"; the former file: {former}"
         found.repaired.save(self.out)
-        say(f"written: {self.out} ({found.named.words}: undone)")
+        say(f"written: {self.out} ({found.named.words}: undone{kept})")
 
 
 @dataclass
