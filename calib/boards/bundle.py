@@ -357,6 +357,29 @@ def normal_equations(problem: BundleProblem, free: Free, sigma: Mapping[str, flo
     return NormalEquations(H, W, B, g, h)
 
 
+def jackknife(problem: BundleProblem, free: Free, sigma: Mapping[str, float]) -> Float[np.ndarray, "c c"]:
+    """The covariance of the free camera parameters by leaving out each block (frame) in turn, to first order.
+
+    It contains what blocks have in common beyond their points' noise: a bent board, blur, wrong exposure times.
+    """
+    equations = normal_equations(problem, free, sigma)
+    b, c = equations.W.shape[:2]
+    H, g, at = np.zeros((b, c, c)), np.zeros((b, c)), 0
+    for name in problem.cameras:
+        mine = slice(at, at := at + int(free[name].sum()))
+        r, by_camera, _ = _linearised(problem, name, sigma[name])
+        by_camera, block = by_camera[..., free[name]], problem.seen[name].block
+        np.add.at(H[:, mine, mine], block, np.einsum("nip,niq->npq", by_camera, by_camera))
+        np.add.at(g[:, mine], block, np.einsum("nip,ni->np", by_camera, r))
+    Y = equations.W @ np.linalg.inv(equations.B + 1e-12 * np.eye(equations.B.shape[-1]))
+    H -= Y @ equations.W.swapaxes(-1, -2)
+    g -= np.einsum("bcd,bd->bc", Y, equations.h)
+    total = equations.information()
+    changes = np.stack([np.linalg.lstsq(total - part, slope, rcond=1e-14)[0] for part, slope in zip(H, g)])
+    changes -= changes.mean(0)
+    return (b - 1) / b * changes.T @ changes
+
+
 def _linearised(problem: BundleProblem, name: str, sigma: float) -> tuple[Array, Array, Array]:
     """One camera's residuals (n, 2), and its pixels' derivatives by its parameters and by the blocks', weighted."""
     camera, seen = problem.cameras[name], problem.seen[name]

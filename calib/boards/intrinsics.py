@@ -19,6 +19,12 @@ from .target import Board
 
 Lens = Literal["brown-conrady", "kannala-brandt", "none"]
 FEWEST_IMAGES = 3
+FEWEST_POINTS = 6
+"""Points of an image below which none is left out."""
+OUTLIER = 6.0
+"""Points beyond this many standard deviations (of a coordinate) are left out."""
+MEDIAN_TO_DEVIATION = 1 / 1.17741
+"""The standard deviation of a coordinate is this share of the median distance."""
 FEWEST_TILT = 8.0
 """Boards whose normals differ by less than this many degrees count as parallel."""
 
@@ -52,6 +58,50 @@ def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens =
             f"{name}: the board is found in {len(views.seen)} of its images and {FEWEST_IMAGES} is the least: "
             "take ten or more, at several distances and tilts"
         )
+    plausible = BoardViews(views.hw, {key: near_homography(d, board) for key, d in views.seen.items()})
+    camera, poses = _solved(name, plausible, board, lens)
+    for _ in range(2):
+        plausible = without_outliers(views, camera, poses, board)
+        camera, poses = _solved(name, plausible, board, lens)
+    check_tilts(name, poses)
+    rms = {key: _rms(camera, pose, plausible.seen[key], board) for key, pose in poses.items()}
+    return InitialCamera(camera, poses, rms)
+
+
+def near_homography(found: Detection, board: Board) -> Detection:
+    """The points that a homography of the board fits (least median of squares), apart from the lens's distortion."""
+    if len(found.ids) < FEWEST_POINTS:
+        return found
+    plane = board.points[found.ids, :2]
+    H, _ = cv2.findHomography(plane, found.x, cv2.LMEDS)
+    if H is None:
+        return found
+    off = np.linalg.norm(cv2.perspectiveTransform(plane[:, None], H)[:, 0] - found.x, axis=-1)
+    return _only(found, off < max(1.0, 4 * MEDIAN_TO_DEVIATION * float(np.median(off))))
+
+
+def without_outliers(
+    views: BoardViews, camera: Camera, poses: Mapping[FrameKey, Pose], board: Board, *, sigma: float | None = None
+) -> BoardViews:
+    """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
+
+    `sigma` is along x or y, pixels; by default estimated from the median of all distances. Images without a pose, or
+    with fewer than `FEWEST_POINTS` points left, keep all of theirs.
+    """
+    off = {key: _distances(camera, poses[key], d, board) for key, d in views.seen.items() if key in poses}
+    sigma = sigma or max(MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), 0.02)
+    kept = {key: _only(views.seen[key], r < OUTLIER * sigma) for key, r in off.items()}
+    return BoardViews(
+        views.hw,
+        {key: kept[key] if key in kept and len(kept[key].ids) >= FEWEST_POINTS else d for key, d in views.seen.items()},
+    )
+
+
+def _only(found: Detection, mask: np.ndarray) -> Detection:
+    return Detection(found.ids[mask], found.x[mask])
+
+
+def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
     fisheye = lens == "kannala-brandt"
     try:
         K, coefficients, rotations, translations = _fisheye(views, board) if fisheye else _pinhole(views, board, lens)
@@ -61,10 +111,7 @@ def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens =
         ) from None
     distortion = None if lens == "none" else Distortion(lens, torch.tensor(coefficients))
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
-    poses = {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
-    check_tilts(name, poses)
-    rms = {key: _rms(camera, pose, views.seen[key], board) for key, pose in poses.items()}
-    return InitialCamera(camera, poses, rms)
+    return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
 
 
 def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
@@ -112,9 +159,13 @@ def _fisheye(views: BoardViews, board: Board) -> Solved:
     return K, c.reshape(-1), list(rotations), list(translations)
 
 
+def _distances(camera: Camera, pose: Pose, found: Detection, board: Board) -> np.ndarray:
+    projected = camera.project_local(pose.apply(torch.from_numpy(board.points[found.ids]))).x.numpy()
+    return np.linalg.norm(projected - found.x, axis=-1)
+
+
 def _rms(camera: Camera, pose: Pose, found: Detection, board: Board) -> float:
-    projected = camera.project(pose.apply(torch.from_numpy(board.points[found.ids]))).x.numpy()
-    return float(np.sqrt(((projected - found.x) ** 2).sum(-1).mean()))
+    return float(np.sqrt((_distances(camera, pose, found, board) ** 2).mean()))
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

@@ -21,10 +21,11 @@ from .bundle import (
     Observations,
     adjust,
     intrinsic_values,
+    jackknife,
     noise,
     parameter_names,
 )
-from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts
+from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts, without_outliers
 from .observability import gate, typical_prior
 from .photos import FrameKey
 from .poses import CalibratedViews, initial_rig
@@ -35,6 +36,11 @@ FEWEST_TO_HOLD_OUT = 8
 """Frames are held out from this many on that two cameras share."""
 INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
+FEWEST_TO_JACKKNIFE = 6
+CONSIDERABLE = 1.3
+"""Standard deviations are raised if the jackknife's are larger by this."""
+ROUNDS = 3
+"""Times that parameters and outliers may return."""
 HOLD_OUT_EVERY = 5
 """One frame in this many is held out."""
 
@@ -46,6 +52,7 @@ class Calibration:
     fit: result of the bundle adjustment; its blocks are `frames` in order.
     single: each camera's reprojection error (RMS, px) when it is calibrated by itself.
     views: the detections used, numbered consistently in all cameras. held_out: epipolar errors of held-out frames, px.
+    raised: the factor by which the covariance's standard deviations were raised to those of a jackknife over frames.
     """
 
     rig: Rig
@@ -57,6 +64,7 @@ class Calibration:
     epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
     held_out: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
     notes: tuple[str, ...] = field(default=())
+    raised: float = 1.0
 
     @property
     def rms(self) -> float:
@@ -86,6 +94,7 @@ def calibrate(
     )
     cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
     together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), single)
+    together, factor = _scaled_covariance(together)
     rig = Rig(together.fit.problem.cameras)
     return Calibration(
         rig=rig,
@@ -96,7 +105,8 @@ def calibrate(
         single={name: a.fit.problem.rms() for name, a in single.items()},
         epipolar=epipolar_errors(rig, initial.views),
         held_out=_held_out(cameras, initial.world_from_board, initial.views, board, together),
-        notes=(*_images_left_out(views, single, initial.left_out), *together.notes),
+        notes=(*_images_left_out(views, single, initial.left_out), *together.notes, *_noted(factor)),
+        raised=factor,
     )
 
 
@@ -130,11 +140,41 @@ def calibrate_single(
     kept = _without_outliers(views, start)
     if len(kept.seen) < len(views.seen):
         start = calibrate_camera(name, kept, board, lens=lens)
-    problem = _problem({name: start.camera}, start.cam_from_board, {name: kept}, board)
-    fit, _, notes = _fitted(problem, final=final)
-    found = SingleCalibration(fit, kept, tuple(start.cam_from_board), tuple(notes))
+    camera, poses = start.camera, start.cam_from_board
+    used = without_outliers(kept, camera, poses, board)
+    for _ in range(ROUNDS):
+        fit, _, notes = _fitted(_problem({name: camera}, poses, {name: used}, board), final=final)
+        camera, poses = fit.problem.cameras[name], fit.problem.board_poses(poses)
+        before, used = used, without_outliers(kept, camera, poses, board, sigma=fit.sigma[name])
+        if _count_points(used) == _count_points(before):
+            break
+    found = SingleCalibration(fit, before, tuple(poses), tuple(notes))
     check_tilts(name, found.cam_from_board)
     return found
+
+
+def _scaled_covariance(together: _JointFit) -> tuple[_JointFit, float]:
+    """The fit with its covariance raised to that of the jackknife over frames, if considerably larger; and the factor.
+
+    The factor is that of the standard deviations, in the mean over all directions.
+    """
+    fit = together.fit
+    if fit.covariance is None or not len(fit.covariance) or len(fit.problem.structure) < FEWEST_TO_JACKKNIFE:
+        return together, 1.0
+    found = jackknife(fit.problem, together.fitted(), fit.sigma)
+    factor = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found)) / len(found)))
+    if factor < CONSIDERABLE:
+        return together, 1.0
+    return together._replace(fit=fit._replace(covariance=factor**2 * fit.covariance)), factor
+
+
+def _noted(factor: float) -> list[str]:
+    if factor == 1.0:
+        return []
+    return [
+        f"frames disagree more than the points' noise explains: standard deviations are raised by {factor:.1f}, to "
+        "those of a jackknife over frames (is the board flat and printed true to size, and were the images sharp?)"
+    ]
 
 
 class _JointFit(NamedTuple):
@@ -144,6 +184,14 @@ class _JointFit(NamedTuple):
     free: dict[str, np.ndarray]
     notes: list[str]
     equal_noise: bool = False
+
+    def fitted(self) -> dict[str, np.ndarray]:
+        """The masks of the parameters that `fit` has covariances of."""
+        named = set(self.fit.names)
+        return {
+            name: np.array([f"{name}.{entry}" in named for entry in parameter_names(camera)])
+            for name, camera in self.fit.problem.cameras.items()
+        }
 
     def refit(self, problem: BundleProblem) -> BundleResult:
         """The same adjustment of other frames."""
@@ -211,6 +259,10 @@ def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
     return xa, xb
 
 
+def _count_points(views: BoardViews) -> int:
+    return sum(len(d.ids) for d in views.seen.values())
+
+
 def _without_outliers(views: BoardViews, start: InitialCamera) -> BoardViews:
     """The views without images whose reprojection error is far above the others'."""
     limit = max(2.0, 10 * float(np.median(list(start.rms.values()))))
@@ -234,16 +286,24 @@ def _observations(views: BoardViews, index: Mapping[FrameKey, int], board: Board
 
 
 def _fitted(problem: BundleProblem, *, final: bool = True) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
-    """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is."""
-    sigma = noise(problem, 0)
+    """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
+
+    Parameters fixed before the fit, when the noise was overestimated, may return after it.
+    """
     full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(problem.cameras.items())}
-    problem, free, notes = gate(problem, full, sigma, final=False)
+    problem, free, notes = gate(problem, full, noise(problem, 0), final=False)
     fit = adjust(problem, free)
+    for _ in range(ROUNDS):
+        returned, more, changed = gate(fit.problem, full, fit.sigma, final=False)
+        if all((more[name] == free[name]).all() for name in free):
+            break
+        problem, free, notes = returned, more, changed
+        fit = adjust(problem, free)
     while True:
-        problem, free, more = gate(fit.problem, free, fit.sigma, final=final)
-        if not more:
+        problem, free, dropped = gate(fit.problem, free, fit.sigma, final=final)
+        if not dropped:
             return fit, free, notes
-        notes, fit = notes + more, adjust(problem, free)
+        notes, fit = notes + dropped, adjust(problem, free)
 
 
 def _free(camera: Camera, posed: bool, *, lens: int) -> np.ndarray:
@@ -282,9 +342,20 @@ def _images_left_out(
     for name, v in views.items():
         if rejected := [str(key) for key in v.seen if key not in single[name].views.seen]:
             notes.append(f"{name}: left out {', '.join(rejected)}: the detected board does not fit the camera")
+        notes += _points_left_out(name, v, single[name].views)
         if inconsistent := [str(key) for other, key in left_out if other == name]:
             notes.append(f"{name}: left out {', '.join(inconsistent)}: they contradict the other cameras' images")
     return notes
+
+
+def _points_left_out(name: str, detected: BoardViews, used: BoardViews) -> list[str]:
+    """A note on points that were left out as outliers, most of an image first."""
+    counts = {key: len(d.ids) - len(used.seen[key].ids) for key, d in detected.seen.items() if key in used.seen}
+    if not any(counts.values()):
+        return []
+    worst = sorted((key for key in counts if counts[key]), key=lambda key: -counts[key])
+    listed = ", ".join(f"{counts[key]} of {key}" for key in worst[:5]) + (", ..." if len(worst) > 5 else "")
+    return [f"{name}: {sum(counts.values())} of {_count_points(detected)} points left out as outliers ({listed})"]
 
 
 def _inconsistent_cameras(fit: BundleResult, single: Mapping[str, SingleCalibration]) -> str:

@@ -1,0 +1,76 @@
+"""Board calibration with wrong corners: errors in stated standard deviations over many draws of simulated corners.
+
+    python -m tests.benchmarks.bench_robust --draws 20
+
+Two cameras, 14 frames, corners good to 0.1 px; a share of them lies up to 40 px elsewhere. *chi-square* is that of all
+estimated parameters per degree of freedom (median over the draws), 1 if the stated covariance is right.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+import torch
+
+from arraygeom import Rig
+from calib.boards.detect import Detection
+from calib.boards.intrinsics import BoardViews
+from calib.boards.rig import Calibration, calibrate
+from pat.evaluation.tables import markdown_header, markdown_row
+from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
+
+NOISE = 0.1
+
+
+def spoiled(views: dict[str, BoardViews], share: float, g: np.random.Generator) -> dict[str, BoardViews]:
+    """The views with a share of their corners displaced by 5 to 40 pixels."""
+    found = {}
+    for name, v in views.items():
+        seen = {}
+        for key, d in v.seen.items():
+            wrong = g.uniform(size=len(d.ids)) < share
+            angle, length = g.uniform(0, 2 * np.pi, len(d.ids)), g.uniform(5, 40, len(d.ids))
+            off = np.stack([np.cos(angle), np.sin(angle)], -1) * length[:, None]
+            seen[key] = Detection(d.ids, d.x + np.where(wrong[:, None], off, 0.0))
+        found[name] = BoardViews(v.hw, seen)
+    return found
+
+
+def drawn(share: float, draw: int) -> tuple[Rig, Calibration]:
+    """A rig and its calibration from one draw."""
+    g = np.random.default_rng([draw, int(100 * share)])
+    cameras = four_cameras().cameras
+    rig = Rig({name: cameras[name] for name in ("mono", "colour")})
+    views = see(rig, board_poses(14, seed=draw), noise=NOISE, seed=draw + 1)
+    return rig, calibrate(spoiled(views, share, g), BOARD)
+
+
+def rows(draws: int) -> Iterator[str]:
+    yield markdown_header(["wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px"])
+    for share in (0.0, 0.05, 0.2):
+        worst, squares, rms = [], [], []
+        for draw in range(draws):
+            rig, found = drawn(share, draw)
+            error, covariance = errors_of(found.fit, rig), found.fit.covariance
+            worst.append(np.abs(error / np.sqrt(covariance.diagonal())).max())
+            squares.append(error @ np.linalg.solve(covariance, error) / len(error))
+            rms.append(found.rms)
+        cells = f"{max(worst):.1f}", sum(w > 5 for w in worst), f"{np.median(squares):.2f}", f"{max(rms):.3f}"
+        yield markdown_row([f"{share:.0%}", draws, *cells])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--draws", type=int, default=20)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setRNGSeed(0)
+    for row in rows(options.draws):
+        print(row, flush=True)
+
+
+if __name__ == "__main__":
+    main()
