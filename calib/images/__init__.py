@@ -1,18 +1,20 @@
 """Rigs and ordinary images: diagnosis, refinement, and uncalibrated rigs, by points matched between cameras.
 
 `matches`, `patch_matching` (matched points) -> `residuals` -> `remedies`, `doctor` (the usual mistakes) and
-`parameters`, `lenses`, `photometric`, `refinement` (a better rig) -> `from_images` (a rig from images alone).
+`parameters`, `least_squares`, `depth_change`, `lenses`, `photometric`, `refinement` (a better rig) -> `from_images` (a
+rig from images alone) and `misfit` (whether a rig fits images at all).
 """
 
 from .. import _lazy
 
-__all__ = ["diagnose", "match_cameras", "refine", "rig_from_images"]
+__all__ = ["diagnose", "match_cameras", "misfit_warning", "refine", "rig_from_images"]
 
 __getattr__ = _lazy(
     __name__,
     {
         "diagnose": "doctor",
         "match_cameras": "matches",
+        "misfit_warning": "misfit",
         "refine": "refinement",
         "rig_from_images": "from_images",
     },

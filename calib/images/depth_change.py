@@ -82,9 +82,7 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     return torch.cat(parts)
 
 
-def log_depths(
-    after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs
-) -> Callable[[Tensor], Tensor] | None:
+def log_depths(after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs) -> Callable[[Tensor], Tensor] | None:
     """The logarithm of depth as a function of the parameters, of points observable in all these rigs.
 
     None for too few.
@@ -152,9 +150,7 @@ def depth_modes(
     pattern = G @ root
     norm = pattern.norm(dim=0)
     prior = (G.T @ (pattern / norm.clamp(min=1e-300))).norm(dim=0)
-    a, jackknife = (
-        torch.linalg.solve_triangular(lower, part.T, upper=False).T @ V for part in (z[None], left_out)
-    )
+    a, jackknife = (torch.linalg.solve_triangular(lower, part.T, upper=False).T @ V for part in (z[None], left_out))
     share = (len(left_out) - 1) / max(len(left_out), 1)
     raised = (share * jackknife.square().sum(0)).sqrt().clamp(min=1)
     size = len(G) ** 0.5

@@ -67,9 +67,7 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
         active = active & observable
 
 
-def left_out(
-    residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"], count: int
-) -> Float[Tensor, "g n"]:
+def left_out(residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"], count: int) -> Float[Tensor, "g n"]:
     """The changes of the free parameters, to first order, when the residuals of one group (0 to g - 1) are left out."""
     r, J = jacobian(residuals, solution.full)
     J = J[:, torch.cat([solution.active, torch.ones(J.shape[1] - len(solution.active), dtype=torch.bool)])]

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -27,10 +26,11 @@ from arraygeom import Camera, Rig
 
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
 from .least_squares import Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
-from .lenses import describe_lenses, with_lenses
+from .lenses import with_lenses
 from .matches import ENOUGH, Matches, fit_fundamental, line_distance, match_cameras, undistort_matches, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
+from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
 from .residuals import epipolar_residuals, related, systematic_modes
 
 Pairs = Mapping[tuple[str, str], Matches]
@@ -64,86 +64,6 @@ ROUNDS = 8
 """Iterations of the photometric minimisation."""
 
 
-@dataclass(frozen=True)
-class ParameterChange:
-    """The change of a parameter vector and its posterior standard deviation, in the unit for display."""
-
-    name: str
-    amount: tuple[float, ...]
-    deviation: tuple[float, ...]
-    unit: str
-
-    def __str__(self) -> str:
-        if self.unit == "F":
-            return f"F of {self.name}"
-        amounts = ", ".join(f"{a:+.3g} +- {d:.2g}" for a, d in zip(self.amount, self.deviation))
-        return f"{self.name} {amounts} {self.unit}".rstrip()
-
-
-class LineStatistics(NamedTuple):
-    """Distances of points from their lines, pixels: number, median, and root mean square of the nearest 85%."""
-
-    points: int
-    median: float
-    rms: float
-
-    def __str__(self) -> str:
-        return f"{self.median:.2f} px"
-
-
-class PhotometricResult(NamedTuple):
-    """The photometric error on held-out pixels before and after its minimisation, and whether that was accepted."""
-
-    before: float
-    after: float
-    accepted: bool
-
-
-@dataclass(frozen=True)
-class Refinement:
-    """The result of a refinement.
-
-    rig: the refined one if `accepted`, else the given one. changes: its differences. unobservable: parameters that the
-    images do not determine. fitted, held_out: statistics before and after of the points used, and of those held out.
-    depth: what happens to depth, for calibrated cameras. objections: why the result should not be accepted. kept: the
-    parameters of combinations that would change depth without being determined. photometric: the photometric error, if
-    it was minimised.
-    """
-
-    rig: Rig
-    accepted: bool
-    changes: tuple[ParameterChange, ...]
-    unobservable: tuple[str, ...]
-    fitted: tuple[LineStatistics, LineStatistics]
-    held_out: tuple[LineStatistics, LineStatistics]
-    depth: DepthChange | None = None
-    objections: tuple[str, ...] = ()
-    kept: tuple[str, ...] = ()
-    photometric: PhotometricResult | None = None
-
-    def as_text(self) -> str:
-        """The changes, the distances of held-out points and what happens to depth, as text."""
-        given, refined = self.held_out
-        lines = [f"held-out points ({given.points}) lie {given} from their lines before, {refined} after"]
-        lines += [] if self.depth is None else [str(self.depth)]
-        verdict = "accepted all the same" if self.accepted else "not accepted"
-        lines += [f"{verdict}: {objection}" for objection in self.objections]
-        lines += [f"changed: {change}" for change in self.changes]
-        lines += [sentence] if self.accepted and (sentence := describe_lenses(self.rig)) else []
-        if not self.accepted:
-            lines.append("the rig is unchanged")
-        if self.unobservable:
-            lines.append(f"fixed, as these images do not determine them: {', '.join(self.unobservable)}")
-        if self.kept:
-            kept = ", ".join(self.kept)
-            lines.append(f"kept, as they would change depth without the images determining it: combinations of {kept}")
-        if self.photometric is not None:
-            before, after, accepted = self.photometric
-            verdict = "accepted" if accepted else "not accepted"
-            lines.append(f"photometric error on held-out pixels: {before:.4f} before, {after:.4f} after: {verdict}")
-        return "\n".join(lines)
-
-
 def refine(
     rig: Rig,
     frames: Sequence[Frame],
@@ -158,8 +78,9 @@ def refine(
     The first camera that has images keeps its pose. `free` and `sigma` are those of `parameters.free_parameters`; F of
     links is always free, and views known by F alone are given lenses if held-out points improve. With two frames or
     more, whole frames are held out, else parts of the image. With `attend` the photometric error of the fusion is then
-    minimised, with the posterior of the points as its prior. `force` accepts a result in spite of objections. Raises ValueError, one line: a camera that the rig lacks,
-    an image of another size than the rig states, equal images, too few points.
+    minimised, with the posterior of the points as its prior. `force` accepts a result in spite of objections.
+    Raises ValueError, one line: a camera that the rig lacks, an image of another size than the rig states, equal
+    images, too few points.
     """
     for frame in frames:
         _check(rig, frame)
@@ -214,7 +135,7 @@ def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
     if fit.rig.links:
         return False
     rig = fit.after(solution.z)
-    return float(line_distances(rig, fit.held_out).abs().median()) < AT_BEST * _own_distance(rig, fit.held_out)
+    return float(line_distances(rig, fit.held_out).abs().median()) < AT_BEST * own_distance(rig, fit.held_out)
 
 
 @dataclass(frozen=True)
@@ -377,13 +298,15 @@ def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]
 
 def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str]:
     """An objection if the refined rig still fits far worse than any F would."""
-    if after.median > max(LARGEST_DISTANCE, OF_OWN * _own_distance(refined, held_out)):
-        return [f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat rig doctor`"]
+    if after.median > max(LARGEST_DISTANCE, OF_OWN * own_distance(refined, held_out)):
+        return [
+            f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat rig doctor`"
+        ]
     return []
 
 
-def _own_distance(rig: Rig, pairs: Pairs) -> float:
-    """The median distance, in undistorted pixels, of points from the lines of an F fitted to them."""
+def own_distance(rig: Rig, pairs: Pairs) -> float:
+    """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to them."""
     found = []
     for names, matches in pairs.items():
         undistorted = undistort_matches(rig.pair(*names), matches)
@@ -400,7 +323,9 @@ def _uncertain_depth(depth: DepthChange | None) -> list[str]:
         return []
     found = ["depth would be less certain than before"] if depth.after > depth.before else []
     if depth.doubtful:
-        found.append(f"depth would change by {depth.change:.1%} but these points determine it to {depth.known:.1%} only")
+        found.append(
+            f"depth would change by {depth.change:.1%} but these points determine it to {depth.known:.1%} only"
+        )
     elif depth.change > LARGE_CHANGE:
         found.append(f"depth would change by {depth.change:.0%}: a rig so far off is better calibrated anew")
     return found
@@ -546,7 +471,9 @@ def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterabl
         if bool(active.any()):
             deviation = (u.root @ solution.covariance[mine, mine] @ u.root.T).diagonal().sqrt()
             amount = u.root @ z
-            yield ParameterChange(u.name, tuple((amount * u.factor).tolist()), tuple((deviation * u.factor).tolist()), u.unit)
+            yield ParameterChange(
+                u.name, tuple((amount * u.factor).tolist()), tuple((deviation * u.factor).tolist()), u.unit
+            )
 
 
 def _labels(parameters: Sequence[FreeParameter]) -> list[str]:

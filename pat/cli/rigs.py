@@ -17,6 +17,8 @@ from .options import FIRST, LAST, Depth, Images, MaybeOut, Numbers, Out, RigFile
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from arraygeom import Rig
+
 
 @dataclass
 class Show:
@@ -39,6 +41,7 @@ class Show:
         rig = load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
+        warn_of_misfit(rig, images)
         written = []
         if any(isinstance(camera, Camera) for camera in rig.cameras.values()):
             written.append(save_figure(draw_rig(rig, alpha=alpha), self.out / "rig.png"))
@@ -46,6 +49,14 @@ class Show:
             fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
             written.append(save_figure(fields, self.out / "fields.png"))
         say(f"written: {', '.join(map(str, written))}")
+
+
+def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
+    """Say so on standard error if a rig fits its images badly."""
+    from calib.images.misfit import misfit_warning
+
+    if (warning := misfit_warning(rig, images)) is not None:
+        say(f"pat: {warning}", style="yellow")
 
 
 def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
@@ -79,7 +90,9 @@ class Explore:
         except ModuleNotFoundError as error:
             raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
         rig = load_rig(self.rig)
-        serve(rig, options.read_images(rig, self.image), alpha=self.alpha, port=self.port, browser=self.browser)
+        images = options.read_images(rig, self.image)
+        warn_of_misfit(rig, images)
+        serve(rig, images, alpha=self.alpha, port=self.port, browser=self.browser)
 
 
 @dataclass

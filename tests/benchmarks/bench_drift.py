@@ -3,7 +3,7 @@
     python -m tests.benchmarks.bench_drift --draws 3 --out tests/benchmarks/RESULTS_drift.md
 
 Depth is the median relative error of the matched points' depth, against that of the true (simulated) or published
-(real) rig, of the drifted rig and of the refined one. *1 px* is the depth that one pixel of disparity is worth, relative
+(real) rig, of the drifted rig and of the refined one. *1 px* is the relative depth that one pixel of disparity is worth
 (median): published rigs are 0.5 to 1.2 px off their images, so that their depth is good to about as much. *said* is the
 change of depth that refine prints. *+* before the distance from the lines: the result was accepted.
 """

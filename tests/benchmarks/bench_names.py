@@ -107,7 +107,7 @@ class Case(NamedTuple):
 
 
 def judged(mistake: Mistake, case: Case, bad: Rig) -> tuple[str, Diagnosis]:
-    """The outcome: right, drifted, as good (another name that the doctor says is as good), wrong, worse, false alarm."""
+    """The outcome: right, drifted, as good (the doctor says so of the true name), wrong, worse, false alarm."""
     sizes = {name: camera.hw for name, camera in case.rig.cameras.items()}
     found = diagnose_matches(bad, sizes, case.matches)
     name = found.named.kind

@@ -148,9 +148,7 @@ def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
     for draw in range(1, draws + 1):
         fit = RefinementProblem.of(worse(sample.rig, g), FREE, frames=[points])
         near = uninformed(fit)._replace(z=0.8 * fit.solve().z)
-        found, _ = polish(
-            fit, near._replace(directions=0.1 * near.directions), [sample.images], attend_with_statistics
-        )
+        found, _ = polish(fit, near._replace(directions=0.1 * near.directions), [sample.images], attend_with_statistics)
         off = [median(line_distances(fit.after(z), {names: true})) for z in (near.z, found.z)]
         yield markdown_row([f"draw {draw}", f"{off[0]:.2f} px", f"{off[1]:.2f} px"])
 

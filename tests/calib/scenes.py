@@ -5,8 +5,8 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.images.matches import Matches
 from calib.images.least_squares import Solution
+from calib.images.matches import Matches
 from calib.images.refinement import RefinementProblem
 
 HW = (240, 320)

@@ -1,0 +1,39 @@
+"""A rig that fits its images badly says so, wherever it is used."""
+
+import re
+
+import torch
+
+from calib.images.misfit import misfit_warning
+from pat.cli.main import main
+from pat.media.images import write_image
+from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
+
+
+def test_a_rig_that_fits_says_nothing():
+    assert misfit_warning(rectified_pair(), rectified_images()) is None
+
+
+def test_a_drifted_rig_is_named():
+    bad = rectified_pair().perturbed({"right.rotation": vector(0.02, 0, 0)})
+    found = misfit_warning(bad, rectified_images())
+    assert found is not None
+    assert 5.5 < float(re.search(r"lie ([\d.]+) px", found)[1]) < 6.6
+    assert "pat rig doctor" in found
+
+
+def test_nothing_is_said_where_nothing_can_be():
+    rig, images = rectified_pair(), rectified_images()
+    assert misfit_warning(rig, {"left": images["left"]}) is None
+    assert misfit_warning(rig, images | {"right": texture(seed=5)}) is None
+    assert misfit_warning(rig, images | {"right": torch.zeros(1, 10, 10)}) is None
+
+
+def test_show_warns(tmp_path, capsys):
+    bad, images = rectified_pair().perturbed({"right.rotation": vector(0.02, 0, 0)}), rectified_images()
+    for name, image in images.items():
+        write_image(tmp_path / f"{name}.png", image)
+    bad.save(tmp_path / "rig.yaml")
+    files = [f"--image={name}={tmp_path / name}.png" for name in images]
+    main(["show", str(tmp_path / "rig.yaml"), *files, "--out", str(tmp_path)])
+    assert "fits these images badly" in " ".join(capsys.readouterr().err.split())
