@@ -15,7 +15,8 @@ from calib.boards.poses import symmetry_poses
 from calib.boards.report import report_html, rig_covariance
 from calib.boards.rig import calibrate, calibrate_single
 from calib.boards.target import parse_board
-from tests.calib.board_scenes import BOARD, board_poses, camera, four_cameras, see, tensor
+from tests.benchmarks.bench_robust import drawn
+from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see, tensor
 
 CHESS = parse_board("chessboard:8x6:60mm")
 """The corners of `BOARD`, without their names."""
@@ -233,3 +234,35 @@ def test_coverage_names_what_is_missing():
         "boards at one depth only",
         "boards tilted by 0 degrees at most",
     ]
+
+
+@pytest.mark.parametrize("share", [0.05, 0.2])
+def test_wrong_corners_do_not_matter(share):
+    """Left out and counted from the first step: all parameters within five stated deviations."""
+    rig, found = drawn(share, 3)
+    assert set(found.fit.names) == set(drawn(0.0, 3)[1].fit.names)
+    assert np.abs(errors_of(found.fit, rig) / np.sqrt(found.fit.covariance.diagonal())).max() < 5
+    assert found.rms < 0.2
+    assert any("points left out as outliers" in note for note in found.notes)
+
+
+def test_a_board_that_bends_raises_the_deviations():
+    """Each frame's board is bent anew: the jackknife over frames says so, the points' noise does not."""
+    rig = pair_rig()
+    g = np.random.default_rng(0)
+    boards = board_poses(12, spread=0.2)
+    views = {name: BoardViews(rig[name].hw, {}) for name in rig.names}
+    for frame in range(12):
+        middle = BOARD.points - BOARD.points.mean(0)
+        bent = BOARD.points.copy()
+        bent[:, 2] += g.normal(0, 2e-3) * (middle[:, 0] / np.abs(middle[:, 0]).max()) ** 2
+        X = Pose(boards.R[frame], boards.t[frame]).apply(torch.from_numpy(bent))
+        for name, c in rig.cameras.items():
+            x = c.project(X).x.numpy()
+            inside = c.contains(torch.from_numpy(x)).numpy()
+            if inside.sum() >= 12:
+                noise = g.normal(0, 0.05, (int(inside.sum()), 2))
+                views[name].seen[frame] = Detection(np.flatnonzero(inside), x[inside] + noise)
+    bent = calibrate(views, BOARD)
+    assert bent.raised > 1.3
+    assert any("is the board flat" in note for note in bent.notes)
