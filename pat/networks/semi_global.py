@@ -101,11 +101,11 @@ class Normalisation(NamedTuple):
 
     def softened(self, alpha: Tensor) -> Tensor:
         """Alpha (or a part of it), no sharper than beta."""
-        return _blurred(alpha, self.blurs[0])
+        return blurred(alpha, self.blurs[0])
 
     def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Both (or parts of them), the sharper one blurred."""
-        own, other = (_blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
+        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
         return own, other
 
 
@@ -267,11 +267,13 @@ def equalising_blurs(
 
 def _least_blur(image: Tensor, contrast: float) -> float:
     """The least of `BLURS` after which there is no more contrast than that."""
-    enough = (b for b in (0.0, *BLURS) if float(_contrast(_blurred(image[None], [b])[0])) <= 1.05 * contrast)
+    enough = (b for b in (0.0, *BLURS) if float(_contrast(blurred(image[None], [b])[0])) <= 1.05 * contrast)
     return next(enough, BLURS[-1])
 
 
-def _blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+    """Each blurred with its standard deviation in pixels; 0: as it is."""
+
     def one(image: Tensor, blur: float) -> Tensor:
         return torch.from_numpy(cv2.GaussianBlur(_numpy(image), (0, 0), blur)).to(image) if blur else image
 
