@@ -8,7 +8,7 @@ put right before the frame is fused.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
+from arraygeom.epipolar import Track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image, sample
@@ -56,7 +57,7 @@ class Corrections:
     def applied(self, inputs: Inputs, hw: HW) -> Inputs:
         """The inputs put right; `hw` is alpha's size without padding."""
         if not self.response.is_rec601:
-            betas = tuple(replace(beta, image=self.response.of_beta(beta.image)) for beta in inputs.betas)
+            betas = tuple(replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
             inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=betas)
         moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
         return replace(
@@ -82,12 +83,12 @@ class Corrections:
 def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
-    Only for networks whose confidence is a trained probability; a response is fitted for one RGB beta. Raises
-    ValueError for a stated response that is not three weights, none negative, or where there is not one RGB beta.
+    Only for networks whose confidence is a trained probability; a response is fitted for RGB betas. Raises
+    ValueError for a stated response that is not three weights, none negative, or where there is no RGB beta.
     """
     found = Corrections(_given(response, frame.inputs))
     judges = isinstance(network, GuidedPAT | BandwisePAT)
-    fits = response == "fit" and judges and _one_rgb_beta(frame.inputs)
+    fits = response == "fit" and judges and any(map(_is_rgb, frame.inputs.betas))
     align = align and judges and all(beta.field.pixels is not None for beta in frame.inputs.betas)
     if not fits and not align:
         return found
@@ -109,13 +110,13 @@ def _given(response: Given, inputs: Inputs) -> Response:
         return response
     if isinstance(response, str):
         return Response.rec601()
-    if not _one_rgb_beta(inputs):
-        raise ValueError("a response is of one RGB beta: leave it out for several betas, or for bands of another kind")
+    if not any(map(_is_rgb, inputs.betas)):
+        raise ValueError("a response is of RGB betas: leave it out for bands of another kind")
     return stated_response(response)
 
 
-def _one_rgb_beta(inputs: Inputs) -> bool:
-    return [beta.image.shape[1] for beta in inputs.betas] == [3]
+def _is_rgb(beta: Beta) -> bool:
+    return beta.image.shape[1] == 3
 
 
 def _reduced_frame(frame: FrameInputs) -> FrameInputs:
@@ -129,7 +130,11 @@ def _reduced_frame(frame: FrameInputs) -> FrameInputs:
     hw = (frame.hw[0] // factor, frame.hw[1] // factor)
     alpha = padded(avg_pool2d(inputs.alpha, factor), inputs.multiple)
     betas = tuple(
-        Beta(padded(avg_pool2d(beta.image, factor), inputs.multiple), _reduced_field(beta.field, alpha, factor))
+        Beta(
+            padded(avg_pool2d(beta.image, factor), inputs.multiple),
+            _reduced_field(beta.field, alpha, factor),
+            track=beta.track and _reduced_track(beta.track, factor),
+        )
         for beta in inputs.betas
     )
     return frame._replace(inputs=replace(inputs, alpha=alpha, betas=betas), hw=hw)
@@ -142,6 +147,15 @@ def _reduced_field(field: FieldOnGrid, alpha: Tensor, factor: int) -> FieldOnGri
         return reduced(found, factor)
 
     return FieldOnGrid.evaluated(at, (alpha.shape[-2], alpha.shape[-1]), field.samples // factor + 2)
+
+
+def _reduced_track(track: Callable[[Tensor], Track], factor: int) -> Callable[[Tensor], Track]:
+    offset = 0.5 / factor - 0.5
+
+    def in_pixels(v: Tensor) -> Tensor:
+        return torch.cat([v[..., :2] / factor + offset * v[..., 2:], v[..., 2:]], -1)
+
+    return lambda x: Track(*map(in_pixels, track((x + 0.5) * factor - 0.5)))
 
 
 class _Matches(NamedTuple):
@@ -196,11 +210,11 @@ def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
-    (found,) = matches
     h, w = frame.hw
     own = blurred(frame.inputs.alpha[:, :, :h, :w], [BLUR])[0, 0]
-    counts = found.weight > 0
-    return fit(found.before[:, counts], own[counts])
+    colour = [(m.before, m.weight > 0) for m in matches if len(m.before) == 3]
+    points = [bands[:, counts] for bands, counts in colour]
+    return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]))
 
 
 def _misaligned(found: _Matches) -> Misalignment:
