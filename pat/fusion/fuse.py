@@ -13,7 +13,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, find_corrections
-from .inputs import FrameInputs, frame_inputs
+from .inputs import FrameInputs, background_filled, frame_inputs
 from .response import Given
 from .results import Frame
 from .steps import steps_for
@@ -96,6 +96,7 @@ def fuse(
     state = network.prepare(inputs.inputs)
     frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
     warn_of_confidence(network, frame, inputs)
+    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
     for back in (found.undone, *undo):
         frame = back(frame)
     return frame
