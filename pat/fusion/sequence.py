@@ -298,8 +298,8 @@ class SequenceFusion:
     def _corrections(self) -> Corrections:
         """What is put right in every frame: found once, near the middle, so that nothing flickers.
 
-        At the key frame nearest to the middle whose images can be read: what cannot is reported when it is fused. Not how
-        betas are aligned if they did not record at alpha's time: then motion moves points off their segments.
+        At the key frame nearest to the middle whose images can be read: what cannot is reported when it is fused. Betas
+        that did not record at alpha's time are not aligned: motion too moves points off their segments.
         """
         keys = self.timeline.key_frames()
         for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
