@@ -9,7 +9,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from kornia.color import rgb_to_grayscale
 from numpy.typing import NDArray
 from torch import Tensor
@@ -70,14 +70,19 @@ class SiftFeatures(NamedTuple):
 
 def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
     """SIFT features of an image's luminance, its contrast equalised."""
-    grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
-    even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    even = contrast_equalised(image)
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
     points = np.array([p.pt for p in found], np.float64).reshape(-1, 2)
     sizes, angles = (np.array([getattr(p, name) for p in found], np.float64) for name in ("size", "angle"))
     described = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
     return SiftFeatures(points, sizes, np.radians(angles), described, even)
+
+
+def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
+    """An image's luminance, its contrast equalised (CLAHE)."""
+    grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
+    return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
 
 
 def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:
@@ -118,6 +123,9 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
     features = {name: detect_features(image) for name, image in images.items()}
+    for name, found in features.items():
+        if len(found.points) < ENOUGH:
+            raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
     found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():

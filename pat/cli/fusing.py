@@ -11,8 +11,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+from tyro.conf import Positional, arg
+
 from . import options
-from .options import Depth, FieldName, Images, Memory, Numbers, Out, RigFile, Weights, optional, say
+from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -26,30 +28,35 @@ if TYPE_CHECKING:
 class Fuse:
     """Fuse the images of an array into one image at alpha's view: a frame, many frames, or a sequence.
 
-    Example: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
+    Without a rig: pat fuse mono.png colour.png
+    With one: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused one by one:
+    Without a rig it is found from the images, and written to rig.yaml beside the result. Cameras are then called as
+    their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused one by one:
     the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised (frame_rate
     and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {
+        "--rig": FIRST,
         "--carry": "--propagate",
         "--no-carry": "--no-propagate",
         "--match-levels": "--normalise-radiometry",
         "--no-match-levels": "--no-normalise-radiometry",
     }
 
-    rig: RigFile
-    alpha: Annotated[str, options.arg(metavar="NAME")]
-    """The camera whose view is wanted."""
-    image: Images
-    """An image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
+    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
+    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each camera."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera whose view is wanted; without a rig by default the largest grey image."""
+    image: Images = ()
+    """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Out = Path("out")
-    """Folder for fused.png, confidence.png, depth.tif, depth.png and view.yaml (the rig of the fused view)."""
-    weights: Weights = "mono-colour"
+    """Folder for fused.png, confidence.png, depth.tif, depth.png, index.html (a page that shows them) and view.yaml
+    (the rig of the fused view)."""
+    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
     """Receptive field in the other cameras; auto takes what the rig allows."""
     max_memory: Memory = None
@@ -58,6 +65,9 @@ class Fuse:
     """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
     response: Annotated[str | None, options.optional("R,G,B|fit")] = None
     """How a mono alpha weighs red, green and blue, if not as Rec. 601 luma; fit: from matches, with gain and gamma."""
+    exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
+    """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
+    alpha has it. By default auto without a rig, and keep with one."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -88,21 +98,61 @@ class Fuse:
     """Threads in each process: by default 1 with several, else all cores."""
 
     def run(self) -> None:
-        from ..fusion.batch import find_images
         from ..support.memory import parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
+        with self._judged():
+            self._with_rig() if self._rig_given() else self._without_rig()
+
+    def _rig_given(self) -> bool:
+        """Whether the first argument is a rig. Raises ValueError for arguments that do not go together."""
+        if self.image and len(self.given) == 1:
+            return True
+        if len(self.given) == 1 and is_rig_file(self.given[0]):
+            raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
+        if self.image or len(self.given) < 2:
+            raise ValueError(
+                "give two images or more, such as `pat fuse mono.png colour.png`; or a rig with "
+                "`--alpha NAME --image NAME=FILE --image NAME=FILE`"
+            )
+        return False
+
+    def _with_rig(self) -> None:
+        from ..fusion.batch import find_images
+        from ..fusion.views import ViewFiles
+
         rig = self._rig()
+        if self.alpha is None:
+            raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
         files = options.files_by_name(self.image)
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-        with self._judged():
-            if self.sequence or max(map(len, found.values())) > 1:
-                self._many(rig, found)
-            else:
-                self._one(rig, {name: paths[0] for name, paths in found.items()})
+        if self.sequence or max(map(len, found.values())) > 1:
+            return self._many(rig, found, self.alpha)
+        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
+        self._one(views.developed, views, self.alpha)
+
+    def _without_rig(self) -> None:
+        from .from_images import array_of, camera_names, files_of
+
+        only_with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
+        if named := [option for option, value in only_with_rig.items() if value]:
+            raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
+        files = {name: files_of(path) for name, path in camera_names(self.given).items()}
+        first = {name: paths[0] for name, paths in files.items()}
+        array = array_of(first, alpha=self.alpha, weights=self.weights, say=say)
+        self.weights = array.weights
+        self.normalise_radiometry |= array.match_levels
+        self.response = self.response or array.response
+        self.exposure = self.exposure or "auto"
+        if max(map(len, files.values())) > 1:
+            self.response = None
+            self._many(array.rig, {name: files[name] for name in array.rig.names}, array.alpha)
+            array.rig.save(self.out / "rig.yaml")
+            return say(f"written: {self.out / 'rig.yaml'}")
+        self._one(array.rig, array.images, array.alpha, found=array.notes)
 
     @contextmanager
     def _judged(self) -> Iterator[None]:
@@ -129,44 +179,55 @@ class Fuse:
             sys.exit(LowConfidenceWarning.exit_status)
 
     def _rig(self) -> Rig:
-        rig = options.load_rig(self.rig, self.depth)
+        rig = options.load_rig(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
         return rig
 
-    def _one(self, rig: Rig, files: dict[str, Path]) -> None:
+    def _one(
+        self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None
+    ) -> None:
+        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
         from arraygeom.atomic import sweep
 
         from ..fusion.results import save_frame, view_of
-        from ..fusion.views import ViewFiles
         from ..support.locks import folder_lock
 
-        images = ViewFiles(rig, files, alpha=rig.require(self.alpha))
-        rig = images.developed
         store = self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
             frame = fuse_with_progress(
-                self.weights,
+                self.weights or "mono-colour",
                 rig,
                 images,
-                alpha=self.alpha,
+                alpha=alpha,
                 field=options.field_named(self.field),
                 max_memory=self.max_memory,
                 match_levels=self.normalise_radiometry,
                 response=options.response_of(self.response),
                 store=store,
             )
-            view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
+            frame = self._exposed(frame)
+            view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
+            found_rig = rig if found is not None else None
+            written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig)
             shutil.rmtree(store, ignore_errors=True)
         say(f"written: {', '.join(map(str, written))}")
 
-    def _many(self, rig: Rig, files: dict[str, list[Path]]) -> None:
+    def _exposed(self, frame: Frame) -> Frame:
+        from ..media.exposure import exposed, exposure_gain
+
+        gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
+        if gain != 1:
+            say(f"exposure: light times {gain:.2f}, as the image is {'dark' if gain > 1 else 'overexposed'} "
+                "(--exposure keep leaves it)")  # fmt: skip
+        return frame._replace(image=exposed(frame.image, gain))
+
+    def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
@@ -175,9 +236,9 @@ class Fuse:
         batch = Batch(
             rig,
             files,
-            rig.require(self.alpha),
+            rig.require(alpha),
             self.out,
-            weights=self.weights,
+            weights=self.weights or "mono-colour",
             sequence=self.sequence,
             speed=self.speed,
             field=options.field_named(self.field),
@@ -232,6 +293,12 @@ class Demo:
         print(table, end="")
         write_text(self.out / "demo.md", f"```\n{table}```\n")
         say(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
+
+
+def is_rig_file(path: Path) -> bool:
+    """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
+    named = any(c in path.name for c in "*?[") or path.suffix.lower() in options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
+    return not named and not path.is_dir()
 
 
 def fuse_with_progress(weights: str, rig: Rig, images: Mapping[str, Tensor], **further: Any) -> Frame:

@@ -24,6 +24,9 @@ T = TypeVar("T")
 SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
 WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
+IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
+VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
+
 FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved"]
 FIELD_NAMES = get_args(FieldName)[1:]
 
@@ -52,7 +55,8 @@ MaybeOut = Annotated[Path | None, arg(metavar="PATH", aliases=["-o"], help_behav
 MaybePath = Annotated[Path | None, optional("PATH")]
 Depth = Annotated[tuple[float, float] | None, optional("NEAR FAR")]
 Memory = Annotated[str | None, optional("SIZE")]
-Weights = Annotated[str, arg(metavar="NAME|FILE", help=f"Weights: {', '.join(WEIGHT_NAMES)}, or a file.")]
+WEIGHTS_HELP = f"Weights: {', '.join(WEIGHT_NAMES)}, or a file."
+Weights = Annotated[str, arg(metavar="NAME|FILE", help=WEIGHTS_HELP)]
 
 FIRST, LAST = "first", "last"
 
