@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import combinations
 from typing import NamedTuple
 
@@ -246,12 +247,14 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
 
 
 def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
-    """F by MAGSAC++ (Barath et al. 2020) to 1 px. Raises ValueError if none fits."""
+    """F by MAGSAC++ (Barath et al. 2020) to 1 px, or else by RANSAC. Raises ValueError if none fits."""
     x, y = (points.numpy() for points in matches)
-    try:
-        found, _ = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 1.0, 0.999, 10_000)
-    except cv2.error:
-        found = None
+    found = None
+    for method in (cv2.USAC_MAGSAC, cv2.FM_RANSAC):
+        with suppress(cv2.error):
+            found, _ = cv2.findFundamentalMat(x, y, method, 1.0, 0.999, 10_000)
+        if found is not None and found.shape == (3, 3):
+            break
     if found is None or found.shape != (3, 3):
         raise ValueError("no fundamental matrix fits the points seen in both images")
     return torch.from_numpy(found)

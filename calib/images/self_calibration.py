@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, triangulate
+from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
 from arraygeom.pixels import map_homogeneous
 
 from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_lines
@@ -25,7 +25,7 @@ from .refinement import line_distances, refine_matches
 
 FOCAL_SHARE = 1.2
 """The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
-SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.1}
+SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
 CENTRE_SHARE = 0.02
 """Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the principal
 point, as a share of the longer side."""
@@ -35,6 +35,10 @@ AS_GOOD = 1.5
 SLACK = 0.1
 """A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines, and `SLACK` pixels, as from
 those of F alone."""
+ALIKE = 1.25
+ALIKE_SLACK = 0.03
+"""Poses whose points are so much farther from their lines than those of the best, in pixels too, are alike: points do
+not distinguish a rotation from a translation where they are few or far. The smallest rotation is taken."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
 MARGIN = 0.6
@@ -72,17 +76,20 @@ def self_calibrated(
     alpha, beta = views
     K = {name: intrinsics(length, views[name].hw) for name, length in _focal_lengths(views, link, focal).items()}
     near = near_lines(matches, link.F, within=NEAR_LINE)
-    trials = [Rig({alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)})
-              for pose in _poses(near, link.F, K[alpha], K[beta])]  # fmt: skip
-    refined = [_unit_baseline(_refined(rig, matches)) for rig in trials]
-    if not refined:
+    best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
+    upright = _upright(link)
+    trials = []
+    for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
+        cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
+        rig = _unit_baseline(_refined(Rig(cameras), matches))
+        distance, bounds = _distance(rig, near), depth_bounds(rig, near, margin=SPARSE_MARGIN)
+        if bounds is not None and distance <= best:
+            trials.append(RefinedPair(rig.replace(depth=bounds), len(near.alpha), distance))
+    if not trials:
         return None
-    rig = min(refined, key=lambda rig: _distance(rig, near))
-    distance = _distance(rig, near)
-    if distance > AS_GOOD * float(line_distance(near, link.F).median()) + SLACK:
-        return None
-    bounds = depth_bounds(rig, near, margin=SPARSE_MARGIN)
-    return None if bounds is None else RefinedPair(rig.replace(depth=bounds), len(near.alpha), distance)
+    least = min(trial.distance for trial in trials)
+    fitting = [trial for trial in trials if trial.distance <= ALIKE * least + ALIKE_SLACK]
+    return min(fitting, key=lambda trial: _angle(_pair(trial.rig).beta_from_alpha.R, upright))
 
 
 def refined_by_depth(
@@ -190,6 +197,27 @@ def _poses(matches: Matches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]
             _, R, t, _ = cv2.recoverPose(E, x, y, np.eye(3))
             found.append(Pose(torch.from_numpy(R), torch.from_numpy(t[:, 0])))
     return found
+
+
+def _upright(link: Link) -> Float[Tensor, "3 3"]:
+    """The rotation about the axis, in steps of 90 degrees, by which beta's image is rotated against alpha's."""
+    H = torch.eye(3) if link.H is None else link.H
+    steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
+    return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
+
+
+def _lateral_poses(matches: Matches, R: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
+    """Poses of parallel axes, beta to either side along the direction in which most points differ."""
+    x = map_homogeneous(R @ torch.linalg.inv(K), matches.alpha)[..., :2]
+    flow = map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2] - x
+    _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
+    t = torch.cat([axes[0], axes.new_zeros(1)])
+    return [Pose(R, t), Pose(R, -t)]
+
+
+def _angle(R: Tensor, other: Tensor) -> float:
+    """The angle between two rotations, radians."""
+    return math.acos(min(max((float((R.T @ other).trace()) - 1) / 2, -1.0), 1.0))
 
 
 def _camera(view: View, K: Tensor, pose: Pose) -> Camera:

@@ -35,7 +35,7 @@ COARSE = 640
 """And to this many of alpha for the first, coarse fusion."""
 EVEN = 0.004
 """The standard deviation below which an image is of one colour: a count of 8 bits."""
-SAME_LEVELS = (0.85, 1.18)
+SAME_MEAN, SAME_CONTRAST = (0.85, 1.18), (0.7, 1.4)
 """Ratios of the means and of the standard deviations of beta's luminance and alpha's that need no normalisation."""
 WAVELENGTHS = {"red": 620, "green": 540, "blue": 460}
 LONGEST_VISIBLE = 760
@@ -274,7 +274,7 @@ def _radiometry(images: Images, alpha: str, note: Say) -> tuple[bool, str | None
         return False, None
     other = luminance_of(beta)
     ratios = [float(other.mean() / own.mean()), float(other.std() / own.std())]
-    if all(SAME_LEVELS[0] <= ratio <= SAME_LEVELS[1] for ratio in ratios):
+    if all(low <= ratio <= high for ratio, (low, high) in zip(ratios, (SAME_MEAN, SAME_CONTRAST))):
         return False, None
     note(
         f"radiometry: {betas[0]} has {ratios[0]:.2f} of {alpha}'s mean and {ratios[1]:.2f} of its contrast: "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
 
     from arraygeom import Rig
 
+    from ..fusion.report import Facts
     from ..fusion.results import Frame
 
 
@@ -86,6 +88,8 @@ class Fuse:
     """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
     resume: bool = False
     """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
+    report: bool = True
+    """Of a single frame, also write index.html: a page that shows images, confidence, depth and rig."""
     strict: bool = False
     """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
     on_error: Literal["stop", "skip"] = "stop"
@@ -104,7 +108,8 @@ class Fuse:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
-        with self._judged():
+        self._notes: list[str] = []
+        with self._judged() as self._warnings:
             self._with_rig() if self._rig_given() else self._without_rig()
 
     def _rig_given(self) -> bool:
@@ -155,21 +160,23 @@ class Fuse:
         self._one(array.rig, array.images, array.alpha, found=array.notes)
 
     @contextmanager
-    def _judged(self) -> Iterator[None]:
-        """Exit status 3 if the rig does not fit the images."""
+    def _judged(self) -> Iterator[list[str]]:
+        """Exit status 3 if the rig does not fit the images. Gives the list of the warnings' texts."""
         from ..fusion.checks import LowConfidenceWarning, confidence_checked
 
         categories: list[type[Warning]] = []
+        texts: list[str] = []
         with confidence_checked(strict=self.strict):
             show = warnings.showwarning
 
             def noted(message: Warning | str, category: type[Warning], *further: Any, **options: Any) -> None:
                 categories.append(category)
+                texts.append(str(message))
                 show(message, category, *further, **options)
 
             warnings.showwarning = noted
             try:
-                yield
+                yield texts
             except Exception as error:
                 if not isinstance(error.__cause__ or error, LowConfidenceWarning):
                     raise
@@ -192,10 +199,11 @@ class Fuse:
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
         from arraygeom.atomic import sweep
 
+        from ..fusion.report import write_report
         from ..fusion.results import save_frame, view_of
         from ..support.locks import folder_lock
 
-        store = self.out / ".tiles"
+        begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
             if not self.resume:
@@ -216,15 +224,34 @@ class Fuse:
             found_rig = rig if found is not None else None
             written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig)
             shutil.rmtree(store, ignore_errors=True)
+            page = self.out / "index.html"
+            page.unlink(missing_ok=True)
+            if self.report:
+                facts = self._facts(found, time.monotonic() - begin)
+                written.append(write_report(page, frame, images, rig, alpha, facts))
         say(f"written: {', '.join(map(str, written))}")
+
+    def _facts(self, found: tuple[str, ...] | None, seconds: float) -> Facts:
+        """What the page says."""
+        from ..fusion.report import Facts
+        from ..support.memory import peak_memory
+
+        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *(found or ())]
+        unit = "m" if found is None else "baselines"
+        return Facts(notes, self._warnings, seconds, peak_memory(), unit)
+
+    def _note(self, line: str) -> None:
+        """Say a line, and keep it for the page."""
+        say(line)
+        self._notes.append(line)
 
     def _exposed(self, frame: Frame) -> Frame:
         from ..media.exposure import exposed, exposure_gain
 
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
-            say(f"exposure: light times {gain:.2f}, as the image is {'dark' if gain > 1 else 'overexposed'} "
-                "(--exposure keep leaves it)")  # fmt: skip
+            what = "dark" if gain > 1 else "overexposed"
+            self._note(f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)")
         return frame._replace(image=exposed(frame.image, gain))
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
