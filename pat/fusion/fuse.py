@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+import torch
+
 from arraygeom import ReceptiveField, Rig
 
 from ..media.images import Images
@@ -37,6 +39,7 @@ def fuse(
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
+    differentiable: bool = False,
 ) -> Frame:
     """Fuse one frame at the view of camera `alpha`.
 
@@ -64,16 +67,22 @@ def fuse(
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
+        differentiable: give a frame with gradients to the numbers of the rig, the images and the network's weights (which
+            `requires_grad_(True)` frees). What semi-global matching finds, the position along each segment among it,
+            is a constant: gradients go through the segments and attention around that position. Else the frame is
+            detached, whatever requires gradients.
         announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap, bands that
-            the network does not make.
+            the network does not make, `differentiable` with `max_memory` or `store`.
 
     Warns:
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error, as
             `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
+    if differentiable and not (max_memory is None and store is None):
+        raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
     limit = None if max_memory is None else parse_bytes(max_memory)
     views, undo = Views.of(rig, images, alpha=alpha, depth=depth, field=field), []
     check_bands(network, rig, {name: len(views.images[name]) for name in views.betas})
@@ -89,8 +98,9 @@ def fuse(
     inputs, back = with_response(inputs, response)
     undo.append(back)
     state = network.prepare(inputs.inputs)
-    frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
+    with torch.set_grad_enabled(differentiable):
+        frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
     warn_of_confidence(network, frame, inputs)
     for back in reversed(undo):
         frame = back(frame)
-    return frame
+    return frame if differentiable else Frame(*(part.detach() for part in frame))
