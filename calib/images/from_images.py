@@ -62,7 +62,9 @@ def rig_from_images(
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
-    found = UncalibratedRig(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, match_cameras(images))
+    found = UncalibratedRig(
+        Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, match_cameras(images)
+    )
     links, matched = {}, found.matches
     for names, matches in matched.items():
         F, distance, by_focal = _fundamental(matches, *(K.get(name) for name in names))

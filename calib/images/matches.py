@@ -124,8 +124,8 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
     features = {name: detect_features(image) for name, image in images.items()}
-    for name, found in features.items():
-        if len(found.points) < ENOUGH:
+    for name, own in features.items():
+        if len(own.points) < ENOUGH:
             raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
     found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}

@@ -26,15 +26,15 @@ from .refinement import line_distances, refine_matches
 FOCAL_SHARE = 1.2
 """The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
 SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
-CENTRE_SHARE = 0.02
+CENTRE_SHARE = 0.05
 """Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the principal
 point, as a share of the longer side."""
 NEAR_LINE = 2.0
 """Points this near to their lines, in pixels, are used."""
 AS_GOOD = 1.5
 SLACK = 0.1
-"""A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines, and `SLACK` pixels, as from
-those of F alone."""
+"""A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of F alone,
+and `SLACK` pixels more."""
 ALIKE = 1.25
 ALIKE_SLACK = 0.03
 """Poses whose points are so much farther from their lines than those of the best, in pixels too, are alike: points do
@@ -177,7 +177,7 @@ def depth_bounds(rig: Rig, matches: Matches, *, margin: float) -> tuple[float, f
 def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, float]) -> dict[str, float]:
     """Focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or assumed."""
     alpha, beta = views
-    ratio = 1.0 if link.H is None else float((torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs()))
+    ratio = 1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
     assumed = focal[beta] / ratio if beta in focal else FOCAL_SHARE * max(views[alpha].hw)
     own = focal.get(alpha, assumed)
     return {alpha: own, beta: focal.get(beta, own * ratio)}

@@ -26,7 +26,8 @@ from ..fusion.fuse import fuse
 from ..fusion.results import Frame
 from ..media.colour import luminance_of
 from ..media.exif import focal_length
-from ..media.images import read_image
+from ..media.images import read_image, write_image
+from ..media.video import read_video
 from ..networks.weights import Network, load_weights
 
 MATCHED = 1600
@@ -104,6 +105,21 @@ def files_of(path: Path) -> list[Path]:
     if not path.is_dir() and not path.exists() and not any(c in path.name for c in "*?["):
         raise FileNotFoundError(f"{path}: no such image: check the path")
     return find_images(path)
+
+
+def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
+    """The frames of videos as image files in a folder, and the frames a second, by camera."""
+    files: dict[str, list[Path]] = {}
+    rates: dict[str, float] = {}
+    for name, path in videos.items():
+        frames, rates[name] = read_video(path)
+        files[name] = []
+        for i, image in enumerate(frames):
+            files[name].append(folder / name / f"{i:06d}.png")
+            write_image(files[name][-1], image)
+        if not files[name]:
+            raise ValueError(f"{path}: a video without frames")
+    return files, rates
 
 
 def found_rig(
@@ -281,4 +297,3 @@ def _radiometry(images: Images, alpha: str, note: Say) -> tuple[bool, str | None
         "gain, gamma and response are fitted to matches"
     )
     return False, "fit"
-

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Positional, arg
@@ -34,9 +35,9 @@ class Fuse:
     With one: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
     Without a rig it is found from the images, and written to rig.yaml beside the result. Cameras are then called as
-    their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused one by one:
-    the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised (frame_rate
-    and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
+    their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused
+    one by one: the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised
+    (frame_rate and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {
@@ -100,6 +101,8 @@ class Fuse:
     """Address of a Dask scheduler whose workers fuse the frames, such as tcp://host:8786."""
     threads: Annotated[int | None, optional("INT")] = None
     """Threads in each process: by default 1 with several, else all cores."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
         from ..support.memory import parse_bytes
@@ -113,11 +116,15 @@ class Fuse:
             self._with_rig() if self._rig_given() else self._without_rig()
 
     def _rig_given(self) -> bool:
-        """Whether the first argument is a rig. Raises ValueError for arguments that do not go together."""
-        if self.image and len(self.given) == 1:
+        """Whether the first argument is a rig. Raises ValueError for arguments that do not go together.
+
+        Images that follow a rig are of the cameras that their names say.
+        """
+        if self.given and (self.image or is_rig_file(self.given[0])):
+            self.image = (*self.image, *(f"{path.stem}={path}" for path in self.given[1:]))
+            if not self.image:
+                raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
             return True
-        if len(self.given) == 1 and is_rig_file(self.given[0]):
-            raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
         if self.image or len(self.given) < 2:
             raise ValueError(
                 "give two images or more, such as `pat fuse mono.png colour.png`; or a rig with "
@@ -140,24 +147,46 @@ class Fuse:
         self._one(views.developed, views, self.alpha)
 
     def _without_rig(self) -> None:
-        from .from_images import array_of, camera_names, files_of
+        from .from_images import camera_names, files_of, frames_of_videos
 
         only_with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
         if named := [option for option, value in only_with_rig.items() if value]:
             raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
-        files = {name: files_of(path) for name, path in camera_names(self.given).items()}
+        cameras = camera_names(self.given)
+        videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
+        if videos and len(videos) < len(cameras):
+            others = [path for path in cameras.values() if path not in videos]
+            raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone")
+        if not videos:
+            return self._without_rig_from({name: files_of(path) for name, path in cameras.items()}, {})
+        with TemporaryDirectory() as folder:
+            self._without_rig_from(*frames_of_videos(cameras, Path(folder)))
+
+    def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
+        """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
+        from .from_images import array_of
+
         first = {name: paths[0] for name, paths in files.items()}
-        array = array_of(first, alpha=self.alpha, weights=self.weights, say=say)
+        options.say_when_compiling()
+        with options.working("finding the rig"):
+            array = array_of(first, alpha=self.alpha, weights=self.weights, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
         self.response = self.response or array.response
         self.exposure = self.exposure or "auto"
-        if max(map(len, files.values())) > 1:
-            self.response = None
-            self._many(array.rig, {name: files[name] for name in array.rig.names}, array.alpha)
-            array.rig.save(self.out / "rig.yaml")
-            return say(f"written: {self.out / 'rig.yaml'}")
-        self._one(array.rig, array.images, array.alpha, found=array.notes)
+        if max(map(len, files.values())) == 1:
+            return self._one(array.rig, array.images, array.alpha, found=array.notes)
+        rig = array.rig
+        for name, rate in rates.items():
+            if name in rig.names:
+                rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
+        self.sequence, self.video = self.sequence or bool(rates), rates.get(array.alpha, self.video)
+        if self.response == "fit":
+            self.response, self.normalise_radiometry = None, True
+            self._note("radiometry: of many frames, betas are brought to alpha's mean and contrast instead")
+        self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
+        rig.save(self.out / "rig.yaml")
+        say(f"written: {self.out / 'rig.yaml'}")
 
     @contextmanager
     def _judged(self) -> Iterator[list[str]]:
@@ -193,9 +222,7 @@ class Fuse:
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
         return rig
 
-    def _one(
-        self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None
-    ) -> None:
+    def _one(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None) -> None:
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
         from arraygeom.atomic import sweep
 
@@ -218,6 +245,7 @@ class Fuse:
                 match_levels=self.normalise_radiometry,
                 response=options.response_of(self.response),
                 store=store,
+                device=self.device,
             )
             frame = self._exposed(frame)
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
@@ -328,10 +356,32 @@ def is_rig_file(path: Path) -> bool:
     return not named and not path.is_dir()
 
 
-def fuse_with_progress(weights: str, rig: Rig, images: Mapping[str, Tensor], **further: Any) -> Frame:
-    """`fuse` with weights by name, the plan and a bar on the terminal."""
+def fuse_with_progress(
+    weights: str, rig: Rig, images: Mapping[str, Tensor], *, device: str = "cpu", **further: Any
+) -> Frame:
+    """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
     from ..fusion.fuse import fuse
+    from ..fusion.results import Frame
     from ..networks.weights import load_weights
 
+    where = device_of(device)
+    network = load_weights(weights).to(where)
+    if where != "cpu":
+        rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
+    options.say_when_compiling()
     bar: Any = options.progress("fusing")
-    return fuse(load_weights(weights), rig, images, progress=bar, announce=lambda p: say(f"plan: {p}"), **further)
+    frame = fuse(network, rig, images, progress=bar, announce=lambda p: say(f"plan: {p}"), **further)
+    return Frame(*(part.cpu() for part in frame))
+
+
+def device_of(name: str) -> str:
+    """ "cpu" or "cuda". Raises ValueError for a GPU that is not there."""
+    if name == "cpu":
+        return name
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if name == "cuda":
+        raise ValueError("--device cuda: no CUDA device is available: leave it out, or install torch for CUDA")
+    return "cpu"

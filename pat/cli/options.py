@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
@@ -178,6 +179,35 @@ def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
     from rich.progress import track
 
     return lambda items, total: track(items, title, total=total, console=console())
+
+
+@contextmanager
+def working(title: str) -> Iterator[None]:
+    """A block during which the terminal shows a title and the seconds that have passed."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=console(), transient=True) as bar:
+        bar.add_task(title, total=None)
+        yield
+
+
+def say_when_compiling() -> None:
+    """Say once, in one line, that numba compiles kernels, before it does: that takes up to a minute."""
+    from numba.core import event
+
+    class Compiling(event.Listener):
+        said = False
+
+        def on_start(self, event: object) -> None:
+            if not self.said:
+                self.said = True
+                say("compiling kernels for this machine, once")
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    event.register("numba:compile", Compiling())
 
 
 def print_json(document: Any) -> None:

@@ -167,7 +167,8 @@ class Doctor:
         from calib.images.doctor import diagnose
 
         rig = load_rig(self.rig)
-        found = diagnose(rig, options.read_images(rig, self.image))
+        with options.working("matching features and trying mistakes"):
+            found = diagnose(rig, options.read_images(rig, self.image))
         if self.json:
             options.print_json(json.loads(found.as_json()))
         else:
@@ -208,13 +209,15 @@ class Refine:
 
         rig = load_rig(self.rig)
         deviations = options.numbers_by_name(self.sigma, "--sigma")
-        found = refine(
-            rig,
-            options.read_frames(rig, self.image),
-            free=[kind for text in self.free for kind in text.split(",")],
-            sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
-            attend=attend_with_statistics if self.photometric else None,
-        )
+        options.say_when_compiling()
+        with options.working("matching features and refining"):
+            found = refine(
+                rig,
+                options.read_frames(rig, self.image),
+                free=[kind for text in self.free for kind in text.split(",")],
+                sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
+                attend=attend_with_statistics if self.photometric else None,
+            )
         print(found.as_text())
         if not found.accepted:
             return say("no rig written")
@@ -242,7 +245,8 @@ class RigFromImages:
         from ..media.images import read_image
 
         images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
-        found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
+        with options.working("matching features and fitting lines"):
+            found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
         print(found.as_text())
         found.rig.save(self.out)
         say(f"written: {self.out}")

@@ -67,10 +67,10 @@ def fuse(
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
-        differentiable: give a frame with gradients to the numbers of the rig, the images and the network's weights (which
-            `requires_grad_(True)` frees). What semi-global matching finds, the position along each segment among it,
-            is a constant: gradients go through the segments and attention around that position. Else the frame is
-            detached, whatever requires gradients.
+        differentiable: keep gradients with respect to the numbers of the rig, the images and the network's weights
+            (which `requires_grad_(True)` frees). What semi-global matching finds, such as the position along each
+            segment, is a constant: gradients go through the segments and attention around that position. Else the
+            frame is detached, whatever requires gradients.
         announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:

@@ -57,9 +57,7 @@ def write_report(
     return path
 
 
-def report_page(
-    frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
-) -> str:
+def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts) -> str:
     """The page as text."""
     shown = {f"alpha: {alpha}": images[alpha]}
     shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
@@ -73,14 +71,16 @@ def report_page(
         "TITLE": html.escape(f"{' + '.join(name for name in rig.names if name in images)}, fused"),
         "RATIO": f"{w} / {h}",
         "LAYERS": "\n".join(_layer(name, _data_url(_reduced(_shown(image)))) for name, image in shown.items()),
-        "OVERLAYS": "\n".join(f'<img class="overlay" id="{n}" alt="{n}" src="{url}" hidden>' for n, url in overlays.items()),
+        "OVERLAYS": "\n".join(
+            f'<img class="overlay" id="{name}" alt="{name}" src="{url}" hidden>' for name, url in overlays.items()
+        ),
         "SWITCHES": "\n".join(_switch(name) for name in overlays),
         "FACTS": "\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
         "NOTES": _listed("What was found", facts.notes),
         "WARNINGS": _listed("Warnings", facts.warnings, kind="warnings"),
         "RIG": rig_drawing(rig, alpha),
         "LEGEND": _depth_legend(known, facts.unit),
-    }  # fmt: skip
+    }
     page = PAGE.read_text(encoding="utf-8")
     for name, text in parts.items():
         page = page.replace(f"{{{{{name}}}}}", text)
@@ -138,7 +138,9 @@ def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
     if not len(known):
         return ""
     near, far = _range(known)
-    return f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown is black</p>'
+    return (
+        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown is black</p>'
+    )
 
 
 def _shown(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:

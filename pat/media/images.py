@@ -32,6 +32,9 @@ MOST_PIXELS = 2**28
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
 
+_HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
+
+
 @runtime_checkable
 class Images(Protocol):
     """Images (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`)."""
@@ -65,8 +68,9 @@ def read_image(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> Float[Tensor, "c h w"]:
-    """The image in a PNG, TIFF, JPEG, PNM, BMP or WebP file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
+    HEIC, which needs the extra `heic`, has 8 bits here.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
     must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
@@ -83,6 +87,8 @@ def read_image(
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = path.read_bytes()
+    if content[4:12] in _HEIF:
+        content = _png_of_heif(path, label)
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
@@ -126,6 +132,21 @@ def write_image(
     content = _encode(path, np.ascontiguousarray(planes[order].transpose(1, 2, 0)), bits)
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
+
+
+def _png_of_heif(path: Path, label: str) -> bytes:
+    """The image of a HEIC or HEIF file, upright, as a PNG file."""
+    try:
+        import pillow_heif
+    except ImportError:
+        raise ValueError(
+            f"{label}: reading HEIC needs the package pillow-heif: pip install 'arraygeom-pat[heic]', or save it as PNG"
+        ) from None
+    try:
+        image = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=True))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{label}: not a HEIC image that can be read ({error}): save it as PNG") from None
+    return cv2.imencode(".png", image[..., [2, 1, 0]])[1].tobytes()
 
 
 def _applied(header: ImageHeader, orientation: str, label: str) -> int:
