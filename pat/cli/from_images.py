@@ -24,7 +24,6 @@ from ..fusion.batch import find_images
 from ..fusion.checks import equal_bands
 from ..fusion.fuse import fuse
 from ..fusion.results import Frame
-from ..media.colour import luminance_of
 from ..media.exif import focal_length
 from ..media.images import read_image, write_image
 from ..media.video import read_video
@@ -36,8 +35,6 @@ COARSE = 640
 """And to this many of alpha for the first, coarse fusion."""
 EVEN = 0.004
 """The standard deviation below which an image is of one colour: a count of 8 bits."""
-SAME_MEAN, SAME_CONTRAST = (0.85, 1.18), (0.7, 1.4)
-"""Ratios of the means and of the standard deviations of beta's luminance and alpha's that need no normalisation."""
 WAVELENGTHS = {"red": 620, "green": 540, "blue": 460}
 LONGEST_VISIBLE = 760
 """Nanometres; bands beyond are not taken for a colour."""
@@ -58,7 +55,6 @@ class ImageArray:
     alpha: str
     weights: str
     match_levels: bool
-    response: str | None
     notes: tuple[str, ...]
 
 
@@ -78,17 +74,19 @@ def array_of(
 
     images = {name: _read(name, path) for name, path in files.items()}
     alpha = _chosen_alpha(images, alpha, note)
-    names = _fused_betas(images, alpha, note)
-    bands = sum(len(images[name]) for name in names)
-    weights = weights or ("mono-colour" if bands == 3 else "mono-spectral")
+    names = _ordered_betas(images, alpha, note)
+    bands = [len(images[name]) for name in names]
+    weights = weights or ("mono-colour" if 3 in (*bands, sum(bands)) else "mono-spectral")
     images = {name: images[name] for name in (alpha, *names)}
     focal = {name: length for name in images if (length := focal_length(files[name]))}
     for name, length in focal.items():
         note(f"{name}: focal length {length:.0f} pixels, by EXIF")
     rig, names = found_rig(images, alpha, focal, load_weights(weights), note)
     images = {name: images[name] for name in names}
-    levels, response = _radiometry(images, alpha, note)
-    return ImageArray(rig, images, alpha, weights, levels, response, tuple(notes))
+    several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
+    if several:
+        note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
+    return ImageArray(rig, images, alpha, weights, several, tuple(notes))
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
@@ -187,7 +185,8 @@ def _refined(pair: RefinedPair, images: Images, network: Network) -> tuple[Refin
     rig = _resized(pair.rig, small)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        frame = fuse(_for_bands(network, len(small[beta])), rig, small, alpha=alpha)
+        network = _for_bands(network, len(small[beta]))
+        frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
     refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
     if refined.rig is rig:
         return pair, frame
@@ -250,14 +249,11 @@ def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
     return chosen
 
 
-def _fused_betas(images: Images, alpha: str, note: Say) -> list[str]:
-    """The betas that are fused: the first in colour, or else all bands, those of a colour from red to blue."""
+def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
+    """The betas in the order of their bands: as given where one is in colour, else from red to blue."""
     betas = [name for name in images if name != alpha]
-    colour = [name for name in betas if len(images[name]) == 3]
-    if colour:
-        if left := [name for name in betas if name != colour[0]]:
-            note(f"colour comes from {colour[0]}; left out: {', '.join(left)}")
-        return colour[:1]
+    if any(len(images[name]) == 3 for name in betas):
+        return betas
     waves = {name: _wavelength(name) for name in betas}
     known = all(waves.values())
     if known:
@@ -276,24 +272,3 @@ def _wavelength(name: str) -> float:
         return float(found[1]) if float(found[1]) <= LONGEST_VISIBLE else 0.0
     words = re.split(r"[^a-z]+", name.lower())
     return next((float(w) for colour, w in WAVELENGTHS.items() if colour in words), 0.0)
-
-
-def _radiometry(images: Images, alpha: str, note: Say) -> tuple[bool, str | None]:
-    """Whether betas are brought to alpha's levels, and whether alpha's response to beta's colours is fitted."""
-    own = luminance_of(images[alpha])
-    betas = [name for name in images if name != alpha]
-    if len(betas) > 1:
-        note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
-        return True, None
-    beta = images[betas[0]]
-    if len(beta) != 3:
-        return False, None
-    other = luminance_of(beta)
-    ratios = [float(other.mean() / own.mean()), float(other.std() / own.std())]
-    if all(low <= ratio <= high for ratio, (low, high) in zip(ratios, (SAME_MEAN, SAME_CONTRAST))):
-        return False, None
-    note(
-        f"radiometry: {betas[0]} has {ratios[0]:.2f} of {alpha}'s mean and {ratios[1]:.2f} of its contrast: "
-        "gain, gamma and response are fitted to matches"
-    )
-    return False, "fit"

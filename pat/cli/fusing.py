@@ -66,8 +66,10 @@ class Fuse:
     """Memory limit of the whole process, such as 4GiB; larger frames are fused in tiles."""
     normalise_radiometry: bool = False
     """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
-    response: Annotated[str | None, options.optional("R,G,B|fit")] = None
-    """How a mono alpha weighs red, green and blue, if not as Rec. 601 luma; fit: from matches, with gain and gamma."""
+    response: Annotated[str, options.arg(metavar="fit|rec601|R,G,B")] = "fit"
+    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
+    align: bool = True
+    """Find how far the other cameras lie off their search segments, and put that right."""
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
     alpha has it. By default auto without a rig, and keep with one."""
@@ -111,6 +113,7 @@ class Fuse:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
+        options.response_of(self.response)
         self._notes: list[str] = []
         with self._judged() as self._warnings:
             self._with_rig() if self._rig_given() else self._without_rig()
@@ -172,7 +175,6 @@ class Fuse:
             array = array_of(first, alpha=self.alpha, weights=self.weights, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
-        self.response = self.response or array.response
         self.exposure = self.exposure or "auto"
         if max(map(len, files.values())) == 1:
             return self._one(array.rig, array.images, array.alpha, found=array.notes)
@@ -181,9 +183,6 @@ class Fuse:
             if name in rig.names:
                 rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         self.sequence, self.video = self.sequence or bool(rates), rates.get(array.alpha, self.video)
-        if self.response == "fit":
-            self.response, self.normalise_radiometry = None, True
-            self._note("radiometry: of many frames, betas are brought to alpha's mean and contrast instead")
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / "rig.yaml")
         say(f"written: {self.out / 'rig.yaml'}")
@@ -244,6 +243,8 @@ class Fuse:
                 max_memory=self.max_memory,
                 match_levels=self.normalise_radiometry,
                 response=options.response_of(self.response),
+                align=self.align,
+                explain=self._note,
                 store=store,
                 device=self.device,
             )
@@ -286,8 +287,6 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        if self.response is not None:
-            raise ValueError("--response is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,
@@ -298,6 +297,8 @@ class Fuse:
             speed=self.speed,
             field=options.field_named(self.field),
             match_levels=self.normalise_radiometry,
+            response=options.response_of(self.response),
+            align=self.align,
             max_memory=self.max_memory,
             bits=self.bits,
             kind=self.kind,

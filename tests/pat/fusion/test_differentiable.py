@@ -34,7 +34,7 @@ def test_a_rotation_is_recovered_through_the_fused_image(cropped):
     optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
     for _ in range(10):
         optimiser.zero_grad()
-        frame = fuse(network, rotated(rig, angle), images, alpha="mono", differentiable=True)
+        frame = fuse(network, rotated(rig, angle), images, alpha="mono", align=False, differentiable=True)
         (frame.image - ground_truth).square().mean().backward()
         optimiser.step()
     assert abs(math.degrees(float(angle))) < 0.02
@@ -45,7 +45,7 @@ def test_gradients_reach_rig_images_and_weights(cropped):
     network = load_weights("mono-colour-small").requires_grad_(True)
     angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
     images = {name: image.clone().requires_grad_() for name, image in images.items()}
-    frame = fuse(network, rotated(rig, angle), images, alpha="mono", differentiable=True)
+    frame = fuse(network, rotated(rig, angle), images, alpha="mono", align=False, differentiable=True)
     frame.image.square().mean().backward()
     for tensor in (angle, *images.values(), *network.parameters()):
         assert tensor.grad is not None
