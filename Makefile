@@ -13,7 +13,7 @@ DATA ?= ../shared/data
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
-	@echo "make readme     run both and put what they print into README.md"
+	@echo "make readme     run both and put what they print into docs/results.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
@@ -38,8 +38,8 @@ showcase: $(READY)
 	@$(BIN)/pat showcase --data $(DATA) --out out/showcase
 
 readme: demo showcase
-	@echo "== bringing README.md up to date"
-	@$(BIN)/python -m docs.update_readme --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
+	@echo "== bringing docs/results.md and docs/demo.jpg up to date"
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
 		--image out/demo/demo.png docs/demo.jpg
 
 test: $(READY)
@@ -75,6 +75,7 @@ notebooks: $(READY)
 
 docs: $(READY)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "== out/site/index.html"
 
 drawings: $(READY)
 	@$(BIN)/python docs/drawings.py

@@ -30,7 +30,7 @@ def save_frame(
     rig: Rig | None = None,
     name: str = "",
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (near is bright).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (red is near).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml. With a `name` the

@@ -37,7 +37,7 @@ def test_a_rotation_is_recovered_through_the_fused_image(cropped):
         frame = fuse(network, rotated(rig, angle), images, alpha="mono", align=False, differentiable=True)
         (frame.image - ground_truth).square().mean().backward()
         optimiser.step()
-    assert abs(math.degrees(float(angle))) < 0.02
+    assert abs(math.degrees(angle.item())) < 0.02
 
 
 def test_gradients_reach_rig_images_and_weights(cropped):
