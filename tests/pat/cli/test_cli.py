@@ -61,6 +61,7 @@ def test_fuse_writes_everything(small):
         "depth.png",
         "depth.tif",
         "fused.png",
+        "index.html",
         "view.yaml",
     ]
     view = Rig.load(small / "out" / "view.yaml")
