@@ -21,7 +21,7 @@ from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numb
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from arraygeom import Rig
+    from arraygeom import Camera, Rig
 
     from ..fusion.report import Facts
     from ..fusion.results import Frame
@@ -91,6 +91,8 @@ class Fuse:
     """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
     resume: bool = False
     """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
+    points: bool = False
+    """Of a single frame, also write points.ply: the pixels of known depth as a coloured point cloud."""
     report: bool = True
     """Of a single frame, also write index.html: a page that shows images, confidence, depth and rig."""
     strict: bool = False
@@ -223,12 +225,15 @@ class Fuse:
 
     def _one(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None) -> None:
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
+        from arraygeom import Camera
         from arraygeom.atomic import sweep
 
         from ..fusion.report import write_report
         from ..fusion.results import save_frame, view_of
         from ..support.locks import folder_lock
 
+        if self.points and not isinstance(rig[alpha], Camera):
+            raise ValueError("--points: needs a calibrated alpha, and the rig knows it by F alone: leave it out")
         begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
@@ -253,12 +258,21 @@ class Fuse:
             found_rig = rig if found is not None else None
             written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig)
             shutil.rmtree(store, ignore_errors=True)
+            if self.points:
+                written.append(self._write_points(frame, rig[alpha]))
             page = self.out / "index.html"
             page.unlink(missing_ok=True)
             if self.report:
                 facts = self._facts(found, time.monotonic() - begin)
                 written.append(write_report(page, frame, images, rig, alpha, facts))
         say(f"written: {', '.join(map(str, written))}")
+
+    def _write_points(self, frame: Frame, camera: Camera) -> Path:
+        from ..media.points import write_points
+
+        count = write_points(self.out / "points.ply", camera, frame.depth, frame.image)
+        self._note(f"points.ply: {count} points in alpha's frame")
+        return self.out / "points.ply"
 
     def _facts(self, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""

@@ -146,7 +146,7 @@ def _png_of_heif(path: Path, label: str) -> bytes:
         image = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=True))
     except (OSError, ValueError) as error:
         raise ValueError(f"{label}: not a HEIC image that can be read ({error}): save it as PNG") from None
-    return cv2.imencode(".png", image[..., [2, 1, 0]])[1].tobytes()
+    return cv2.imencode(".png", image if image.ndim == 2 else image[..., [2, 1, 0]])[1].tobytes()
 
 
 def _applied(header: ImageHeader, orientation: str, label: str) -> int:
