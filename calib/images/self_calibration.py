@@ -41,11 +41,9 @@ ALIKE_SLACK = 0.03
 not distinguish a rotation from a translation where they are few or far. The smallest rotation is taken."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
-MARGIN = 0.6
-SPARSE_MARGIN = 1.0
-"""Depth bounds extend the range of the inverse depths of points by this share of it: of many points, and of few."""
-LEAST_MARGIN = 0.04
-"""They extend it by at least this share of beta's longer side, as a disparity."""
+MARGIN, SPARSE_MARGIN = (0.6, 0.04), (1.0, 0.12)
+"""Depth bounds extend the range of the inverse depths of points by this share of it, and by at least this share of
+beta's longer side, as a disparity: of many points, and of few, which may all be on one surface."""
 DENSE_POINTS = 2000
 SPACING = 4
 """Dense points at most, and their least distance, pixels."""
@@ -153,10 +151,10 @@ def dense_matches(
     return Matches(x, torch.from_numpy(refined)).only(torch.from_numpy(deviation < WELL_LOCALISED))
 
 
-def depth_bounds(rig: Rig, matches: Matches, *, margin: float) -> tuple[float, float] | None:
+def depth_bounds(rig: Rig, matches: Matches, *, margin: tuple[float, float]) -> tuple[float, float] | None:
     """Near and far of the matched points of a rig of two cameras, extended; far may be infinite.
 
-    None for points without parallax. `margin` is the share of the range of inverse depth to extend it by.
+    None for points without parallax. `margin` is as `MARGIN`.
     """
     pair = _pair(rig)
     near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
@@ -169,8 +167,8 @@ def depth_bounds(rig: Rig, matches: Matches, *, margin: float) -> tuple[float, f
     inverse = inverse[off <= OUTLYING * off.median() + 1e-9]
     low, high = inverse.quantile(inverse.new_tensor([0.01, 0.99])).tolist()
     baseline = float(pair.beta_from_alpha.t.norm())
-    least = LEAST_MARGIN * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
-    more = max(margin * (high - low), least)
+    least = margin[1] * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
+    more = max(margin[0] * (high - low), least)
     return 1 / (high + more), math.inf if low <= more else 1 / (low - more)
 
 

@@ -127,7 +127,6 @@ def found_rig(
 
     Calibrated, up to a scale, where points matched between alpha and every beta allow it; else known by F alone.
     """
-    note("finding the rig: matching features")
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: _scaled(image, factors[name]) for name, image in images.items()}
     found = rig_from_images(reduced, focal={name: length * factors[name] for name, length in focal.items()})
