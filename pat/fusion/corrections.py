@@ -171,6 +171,11 @@ class _Matches(NamedTuple):
     normal: Float[Tensor, "h w 2"]
     weight: Float[Tensor, "h w"]
 
+    @property
+    def place(self) -> Float[Tensor, "h w 2"]:
+        """The matches in beta's width and height, from its middle."""
+        return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
+
 
 def _matches(network: FusionNetwork, frame: FrameInputs, found: Corrections) -> list[_Matches]:
     """Matches of each beta with what has been found put right."""
@@ -212,9 +217,10 @@ def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
     own = blurred(frame.inputs.alpha[:, :, :h, :w], [BLUR])[0, 0]
-    colour = [(m.before, m.weight > 0) for m in matches if len(m.before) == 3]
-    points = [bands[:, counts] for bands, counts in colour]
-    return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]))
+    colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
+    points = [found.before[:, counts] for found, counts in colour]
+    places = [found.place[counts] for found, counts in colour]
+    return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]), torch.cat(places))
 
 
 def _misaligned(found: _Matches) -> Misalignment:

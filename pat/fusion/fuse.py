@@ -15,7 +15,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, find_corrections
-from .inputs import FrameInputs, frame_inputs
+from .inputs import FrameInputs, background_filled, frame_inputs
 from .response import Given
 from .results import Frame
 from .steps import steps_for
@@ -107,6 +107,7 @@ def fuse(
     with torch.set_grad_enabled(differentiable):
         frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
     warn_of_confidence(network, frame, inputs)
+    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
     for back in (found.undone, *undo):
         frame = back(frame)
     return frame if differentiable else Frame(*(part.detach() for part in frame))

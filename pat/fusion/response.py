@@ -16,6 +16,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom import pixel_grid
+
 from ..media.colour import REC601
 
 GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
@@ -29,10 +31,15 @@ class ResponseSettings(NamedTuple):
     error: standard deviation of one of those, at least: light and surfaces differ between the views.
     outlier: residuals of this many robust deviations count half.
     points: pixels used at most, and the fewest that are enough.
-    least_change: root mean square change of luma below which the weights are left at Rec. 601's, without and with a
-        gain or a gamma: wrong matches and light that differs between the views make as much.
-    least_gain: logarithm of the weights' sum below which it is not taken for another exposure.
-    better: the error of another gamma than 1, over that of 1, up to which it is taken.
+    least_change: root mean square change of luma below which the weights are left at Rec. 601's, usually, and where
+        there is a gamma or a gain that is poorly known: wrong matches and light that differs between the views make
+        as much.
+    known: relative standard deviation of the weights' sum up to which it is well known. In a scene of one hue it is
+        not: there another exposure is as good an explanation as another response.
+    least_gain: logarithm of the weights' sum below which it is not taken for another exposure, where the sum is well
+        known and where not.
+    better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
+    least_shading: largest logarithm of vignetting below which there is none.
     explained: share of alpha's variance that must be explained.
     """
 
@@ -42,8 +49,10 @@ class ResponseSettings(NamedTuple):
     outlier: float = 2.0
     points: tuple[int, int] = (6000, 300)
     least_change: tuple[float, float] = (0.0125, 0.033)
-    least_gain: float = 0.18
+    known: float = 0.015
+    least_gain: tuple[float, float] = (0.04, 0.18)
     better: float = 0.8
+    least_shading: float = 0.08
     explained: float = 0.5
 
 
@@ -51,16 +60,18 @@ SETTINGS = ResponseSettings()
 
 
 class Response(NamedTuple):
-    """alpha = weights . (gain * beta^gamma).
+    """alpha = weights . (gain * shaded beta^gamma).
 
     The weights' sum is near 1; where it is not 1, light differs between the views.
     explained: the share of alpha's variance at the matches that this explains, 0 to 1.
+    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none without.
     """
 
     weights: Float[Tensor, "3"]
     gain: float = 1.0
     gamma: float = 1.0
     explained: float = 1.0
+    shading: tuple[float, ...] = ()
 
     @classmethod
     def rec601(cls) -> Response:
@@ -70,13 +81,14 @@ class Response(NamedTuple):
     @property
     def is_rec601(self) -> bool:
         """Whether images need not be changed."""
-        return self.gain == self.gamma == 1.0 and self.weights.tolist() == list(REC601)
+        return self.gain == self.gamma == 1.0 and not self.shading and self.weights.tolist() == list(REC601)
 
     def __str__(self) -> str:
         red, green, blue = self.weights.tolist()
         gain = "" if self.gain == 1 else f" x {self.gain:.2f}"
         gamma = "" if self.gamma == 1 else f" of beta to the power {self.gamma:g}"
-        return f"alpha is {red:.2f} R + {green:.2f} G + {blue:.2f} B{gain}{gamma}"
+        shading = ", of beta freed of vignetting" if self.shading else ""
+        return f"alpha is {red:.2f} R + {green:.2f} G + {blue:.2f} B{gain}{gamma}{shading}"
 
     def of_alpha(self, alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
         """Alpha on the scale of `of_beta`'s luma."""
@@ -85,8 +97,16 @@ class Response(NamedTuple):
 
     def of_beta(self, beta: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         """Beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is what alpha sees."""
-        scaled = self.gain * (beta if self.gamma == 1 else beta.clamp(min=0) ** self.gamma)
+        even = beta * self._brightening(beta) if self.shading else beta
+        scaled = self.gain * (even if self.gamma == 1 else even.clamp(min=0) ** self.gamma)
         return scaled + self._shear(scaled)
+
+    def _brightening(self, beta: Tensor) -> Float[Tensor, "h w"]:
+        h, w = beta.shape[-2:]
+        grid = pixel_grid((h, w), dtype=torch.float64, device=beta.device) + 0.5
+        where = (grid / grid.new_tensor([w, h]) - 0.5).reshape(-1, 2)
+        terms = _shading_terms(where)
+        return (terms.new_tensor(self.shading) @ terms).exp().reshape(h, w).to(beta)
 
     def undone(self, image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
         """The fused image sheared back: the weights' combination of its colours is alpha."""
@@ -109,10 +129,16 @@ def stated_response(weights: Sequence[float]) -> Response:
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
-def fit(bands: Float[Tensor, "3 n"], alpha: Float[Tensor, " n"], settings: ResponseSettings = SETTINGS) -> Response:
+def fit(
+    bands: Float[Tensor, "3 n"],
+    alpha: Float[Tensor, " n"],
+    where: Float[Tensor, "n 2"] | None = None,
+    settings: ResponseSettings = SETTINGS,
+) -> Response:
     """The response by robust least squares over points, drawn towards Rec. 601 as far as the scene is grey.
 
-    Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
+    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found too. Rec.
+    601's where there are too few points, or where a combination of bands does not explain alpha.
     """
     most, fewest = settings.points
     step = max(alpha.numel() // most, 1)
@@ -121,30 +147,67 @@ def fit(bands: Float[Tensor, "3 n"], alpha: Float[Tensor, " n"], settings: Respo
     x, y = x[:, unclipped], y[unclipped]
     if len(y) < fewest:
         return Response.rec601()
+    gamma, found = _best_gamma(x, y, settings)
+    shading: tuple[float, ...] = ()
+    if where is not None:
+        terms = _shading_terms(where[::step][unclipped].double())
+        slopes = _shading(x, y, terms, settings)
+        even = x * (slopes @ terms).exp()
+        other_gamma, other = _best_gamma(even, y, settings)
+        if other.error < settings.better * found.error and float((slopes @ terms).abs().max()) > settings.least_shading:
+            x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
+    if found.explained < settings.explained:
+        return Response.rec601()
+    return _decided(x**gamma, y, gamma, found, settings)._replace(shading=shading)
+
+
+def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
+    """1, or the gamma that explains alpha clearly better."""
     trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in GAMMAS}
     gamma = min(trials, key=lambda g: trials[g].error)
-    if trials[gamma].error > settings.better * trials[1.0].error:
-        gamma = 1.0
-    if trials[gamma].explained < settings.explained:
-        return Response.rec601()
-    return _decided(x**gamma, y, gamma, trials[gamma], settings)
+    gamma = gamma if trials[gamma].error <= settings.better * trials[1.0].error else 1.0
+    return gamma, trials[gamma]
+
+
+def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
+    """What vignetting, off its centre too, is made of: 0 in the middle of the image."""
+    u, v = where.unbind(-1)
+    return torch.stack([u, v, u * u, u * v, v * v])
+
+
+def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
+    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's weights."""
+    slopes = terms.new_zeros(len(terms))
+    design = torch.cat([terms, torch.ones_like(terms[:1])])
+    for _ in range(3):
+        even = x * (slopes @ terms).exp()
+        found = _weighted_fit(even, y, settings)
+        ratio = (y / (found.weights @ even).clamp(min=0.01)).log()
+        counts = found.share * y.square()
+        ridge = 1e-4 * counts.sum() * torch.eye(len(design)).to(y)
+        slopes = slopes + torch.linalg.solve((design * counts) @ design.T + ridge, (design * counts) @ ratio)[:-1]
+    return slopes
 
 
 class _Fit(NamedTuple):
+    """`deviation` is the relative standard deviation of the weights' sum."""
+
     weights: Tensor
     share: Tensor
     error: float
     explained: float
+    deviation: float
 
 
 def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> Response:
     """The response of a fit: its gain apart if it is one, and Rec. 601's weights if hardly anything changes."""
     rec601, gain = Response.rec601().weights, float(found.weights.sum())
-    exposed = gamma != 1 or abs(math.log(gain)) > settings.least_gain
+    unknown = found.deviation > settings.known
+    exposed = gamma != 1 or abs(math.log(gain)) > settings.least_gain[unknown]
     gain = gain if exposed else 1.0
     weights = found.weights / gain
     change = gain * float(((weights - rec601) @ x).square().mean().sqrt())
-    if change < settings.least_change[exposed]:
+    if change < settings.least_change[gamma != 1 or (exposed and unknown)]:
         luma = rec601 @ x
         gain = float((found.share * luma) @ y / ((found.share * luma) @ luma)) if exposed else 1.0
         weights = rec601
@@ -167,9 +230,11 @@ def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
         counts = share * (settings.independent / share.sum() / max(deviation, settings.error) ** 2)
         prior = torch.zeros(3, 3, dtype=torch.float64)
         prior[1:, 1:] = free.T @ free / (settings.prior * float(weights.sum())) ** 2
-        scale, *change = torch.linalg.solve((design * counts) @ design.T + prior, (design * counts) @ y)
+        covariance = torch.linalg.inv((design * counts) @ design.T + prior)
+        scale, *change = covariance @ ((design * counts) @ y)
         weights = scale * rec601 + free @ torch.stack(change)
     rest = y - weights @ x
     centred = y - share @ y / share.sum()
     explained = 1 - float(share @ rest.square() / (share @ centred.square()).clamp(min=1e-12))
-    return _Fit(weights, share, float(torch.log1p((rest / 0.02).square()).mean()), max(explained, 0.0))
+    error = float(torch.log1p((rest / 0.02).square()).mean())
+    return _Fit(weights, share, error, max(explained, 0.0), float(covariance[0, 0].sqrt() / scale))

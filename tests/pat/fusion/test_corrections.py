@@ -60,6 +60,22 @@ def test_gain_and_gamma_are_fitted_by_themselves(sample, network, images):
     assert psnr(network, sample, other) > psnr(network, sample, images) - 1.0
 
 
+@pytest.mark.parametrize("gain", [0.6, 0.9])
+def test_another_exposure_is_not_taken_for_another_response(sample, network, images, gain):
+    other = images | {BETA: gain * images[BETA]}
+    assert psnr(network, sample, other) > psnr(network, sample, images) - 0.5
+
+
+def test_vignetting_is_found_by_itself(sample, network, images):
+    h, w = images[BETA].shape[-2:]
+    y, x = torch.meshgrid(torch.linspace(-1, 1, h) * h / w, torch.linspace(-1, 1, w), indexing="ij")
+    other = images | {BETA: images[BETA] * (1 + 0.5 * (x.square() + y.square())) ** -0.9}
+    lines: list[str] = []
+    assert psnr(network, sample, other, explain=lines.append) > psnr(network, sample, images) - 0.7
+    assert "vignetting" in lines[0]
+    assert psnr(network, sample, other, response="rec601") < psnr(network, sample, other) - 0.3
+
+
 def test_nothing_is_changed_where_the_cameras_are_as_the_rig_says(sample, network, images):
     lines: list[str] = []
     given = fuse(network, sample.rig, images, alpha=ALPHA, explain=lines.append)
