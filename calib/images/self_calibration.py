@@ -41,9 +41,9 @@ ALIKE_SLACK = 0.03
 not distinguish a rotation from a translation where they are few or far. The smallest rotation is taken."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
-MARGIN, SPARSE_MARGIN = (0.6, 0.04), (1.0, 0.12)
+MARGIN, LEAST_MARGIN = 1.0, 0.12
 """Depth bounds extend the range of the inverse depths of points by this share of it, and by at least this share of
-beta's longer side, as a disparity: of many points, and of few, which may all be on one surface."""
+beta's longer side, as a disparity: points may all be on one surface, and too wide a range hardly costs quality."""
 DENSE_POINTS = 2000
 SPACING = 4
 """Dense points at most, and their least distance, pixels."""
@@ -80,7 +80,7 @@ def self_calibrated(
     for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
         rig = _unit_baseline(_refined(Rig(cameras), matches))
-        distance, bounds = _distance(rig, near), depth_bounds(rig, near, margin=SPARSE_MARGIN)
+        distance, bounds = _distance(rig, near), depth_bounds(rig, near)
         if bounds is not None and distance <= best:
             trials.append(RefinedPair(rig.replace(depth=bounds), len(near.alpha), distance))
     if not trials:
@@ -104,7 +104,7 @@ def refined_by_depth(
     if len(matches.alpha) < 5 * ENOUGH:
         return pair
     rig = _unit_baseline(_refined(pair.rig, matches))
-    bounds = depth_bounds(rig, matches, margin=MARGIN)
+    bounds = depth_bounds(rig, matches)
     if bounds is None:
         return pair
     return RefinedPair(rig.replace(depth=bounds), len(matches.alpha), _distance(rig, matches))
@@ -151,11 +151,10 @@ def dense_matches(
     return Matches(x, torch.from_numpy(refined)).only(torch.from_numpy(deviation < WELL_LOCALISED))
 
 
-def depth_bounds(rig: Rig, matches: Matches, *, margin: tuple[float, float]) -> tuple[float, float] | None:
+def depth_bounds(rig: Rig, matches: Matches) -> tuple[float, float] | None:
     """Near and far of the matched points of a rig of two cameras, extended; far may be infinite.
 
-    None for points without parallax. `margin` is as `MARGIN`.
-    """
+    None for points without parallax.
     pair = _pair(rig)
     near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
     cameras = [camera.to(torch.float64) for camera in pair.cameras]
@@ -167,8 +166,8 @@ def depth_bounds(rig: Rig, matches: Matches, *, margin: tuple[float, float]) -> 
     inverse = inverse[off <= OUTLYING * off.median() + 1e-9]
     low, high = inverse.quantile(inverse.new_tensor([0.01, 0.99])).tolist()
     baseline = float(pair.beta_from_alpha.t.norm())
-    least = margin[1] * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
-    more = max(margin[0] * (high - low), least)
+    least = LEAST_MARGIN * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
+    more = max(MARGIN * (high - low), least)
     return 1 / (high + more), math.inf if low <= more else 1 / (low - more)
 
 
