@@ -155,6 +155,7 @@ def depth_bounds(rig: Rig, matches: Matches) -> tuple[float, float] | None:
     """Near and far of the matched points of a rig of two cameras, extended; far may be infinite.
 
     None for points without parallax.
+    """
     pair = _pair(rig)
     near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
     cameras = [camera.to(torch.float64) for camera in pair.cameras]
