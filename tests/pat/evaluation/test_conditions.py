@@ -74,7 +74,8 @@ def test_every_method_is_scored_under_every_condition(tmp_path):
     )
     ours = [row for row in rows if row.method == "fusion"]
     assert [row.condition for row in ours] == ["ideal", "rows off 1 px", "rows off 3 px"]
-    assert all(row.psnr["whole"] > 20 for row in ours)
+    as_it_is = [row for row in rows if row.method == "uncorrected"]
+    assert ours[1].psnr["whole"] > as_it_is[1].psnr["whole"] + 1.0
     assert ours[0].within_one[1] > 0.9
     text = conditions_markdown(rows)
     assert "| rows off 3 px |" in text
