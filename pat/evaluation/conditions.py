@@ -18,7 +18,9 @@ import torch
 from jaxtyping import Bool, Float
 from skimage.restoration import denoise_nl_means
 from torch import Generator, Tensor
-from torch.nn.functional import grid_sample, interpolate
+from torch.nn.functional import interpolate
+
+from arraygeom.sampling import sample
 
 from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair
 from ..fusion.fuse import corrections_of
@@ -97,9 +99,11 @@ def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor
         h, w = image.shape[-2:]
         c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
         y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2 - rows, torch.arange(w) - (w - 1) / 2, indexing="ij")
-        where = torch.stack([(c * x + s * y) * 2 / w, (c * y - s * x) * 2 / h], -1)
-        found = grid_sample(image[None], where[None], mode="bicubic", padding_mode="border", align_corners=False)
-        return found[0].clamp(0, 1)
+        columns = (c * x + s * y + (w - 1) / 2).clamp(0, w - 1)
+        lines = (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)
+        where = torch.stack([columns, lines], -1).reshape(1, -1, 2)
+        found = sample(image[None], where, interpolation="bicubic").values
+        return found.reshape(image.shape).clamp(0, 1)
 
     return moved
 
