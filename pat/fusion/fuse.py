@@ -13,6 +13,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .inputs import frame_inputs
+from .low_light import Noise, denoised_views
 from .response import Given, with_response
 from .results import Frame
 from .steps import steps_for
@@ -34,6 +35,8 @@ def fuse(
     max_memory: float | str | None = None,
     match_levels: bool = False,
     response: Given | None = None,
+    noise: Noise | None = None,
+    keep_alpha: bool = False,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
@@ -61,6 +64,9 @@ def fuse(
         response: how alpha weighs red, green and blue of its one colour beta (three numbers), where that is not Rec.
             601 luma: a mono sensor without a filter, for instance; "fit" fits it, a gain and a gamma to matches. The
             result then has alpha as this combination of its colours.
+        noise: the noise level of each camera that has some, or "estimate": views are denoised before they are matched,
+            and jointly once they are fused.
+        keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak of.
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
@@ -79,7 +85,9 @@ def fuse(
     check_bands(network, rig, {name: len(views.images[name]) for name in views.betas})
     for name in views.betas:
         warn_of_grey(name, views.images[name])
-    for step in steps_for(network, normalise=match_levels):
+    quiet = denoised_views(views, noise)
+    views, steps = quiet.views, steps_for(network, normalise=match_levels)
+    for step in steps:
         views, back = step.do(views)
         undo.append(back)
     inputs = frame_inputs(network, views)
@@ -87,10 +95,11 @@ def fuse(
     if announce:
         announce(plan)
     inputs, back = with_response(inputs, response)
-    undo.append(back)
     state = network.prepare(inputs.inputs)
-    frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
+    frame = fused_in_tiles(quiet.wrapped(network), inputs, state, plan.tiles, progress=progress, store=store)
+    frame, found = quiet.split(frame)
     warn_of_confidence(network, frame, inputs)
+    frame = quiet.corrected(back(frame), found, steps, keep_alpha=keep_alpha)
     for back in reversed(undo):
         frame = back(frame)
     return frame

@@ -1,0 +1,117 @@
+"""How noisy a camera's image is: stated, or estimated from the image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import nnls
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d, conv2d, pad
+
+from ..media.colour import linear_from_srgb, srgb_from_linear
+from .chain import normal
+
+Coding = Literal["srgb", "linear"]
+"""What noise was added to: sRGB-encoded values, or linear light that was encoded afterwards."""
+
+SMOOTHED = 7
+"""Side of the window over which the signal is averaged, pixels."""
+SIDE, GROUPS, FEWEST = 12, 16, 40
+"""Of blocks in which noise is estimated: their side in pixels, the groups of about equal value, and the least size of
+these."""
+SMOOTHEST, SHARE = 0.05, 0.677
+"""The quantile of the variances in a group that is taken, and what that is of the variance of white noise (from
+40,000 blocks of it)."""
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Variance of a pixel: `shot` times its value plus `read` squared; values 0..1.
+
+    coding: what the noise was added to, sRGB-encoded values or linear light that was encoded afterwards.
+    Numbers, or tensors (B, 1, 1, 1) of a batch.
+    """
+
+    shot: float | Tensor = 0.0
+    read: float | Tensor = 0.0
+    coding: Coding = "linear"
+
+    def __post_init__(self) -> None:
+        for name in ("shot", "read"):
+            value = torch.as_tensor(getattr(self, name))
+            if not bool(((value >= 0) & value.isfinite()).all()):
+                raise ValueError(f"noise: {name} must be 0 or more, got {getattr(self, name)}")
+
+    @classmethod
+    def of_electrons(cls, electrons: float, read: float = 0.0, coding: Coding = "linear") -> NoiseLevel:
+        """The noise of a camera that counts so many electrons at white, with a read noise in electrons."""
+        if not electrons > 0:
+            raise ValueError(f"noise: electrons at white must be more than 0, got {electrons:g}")
+        return cls(1 / electrons, read / electrons, coding)
+
+    @classmethod
+    def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
+        """The noise level of an sRGB image with white noise, from its smoothest parts, by brightness.
+
+        Blocks in which a second difference varies least hold noise alone; the better of the two codings is taken.
+        Noise that a demosaicing, a resampling or a codec has smoothed is underestimated.
+        """
+        value, variance = _smoothest(image.double())
+        if not len(value) or not float(variance.max()) > 0:
+            return cls()
+        fits = [_fitted(coding, value, variance) for coding in ("linear", "srgb")]
+        return min(fits, key=lambda fit: fit[1])[0]
+
+    def recorded(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """An ideal sRGB image with noise: electrons counted, read noise added, light clipped to 0..1."""
+        linear = self.coding == "linear"
+        light = linear_from_srgb(image) if linear else image
+        shot = torch.as_tensor(self.shot).to(light)
+        counted = torch.poisson((light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7), generator=generator) * shot
+        light = torch.where(shot > 1e-7, counted, light) + self.read * normal(light.shape, light, generator)
+        return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
+
+    def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The standard deviation of an sRGB image's values, by the mean of the noisy image around each pixel."""
+        signal = _smoothed(image).clamp(0, 1)
+        if self.coding == "srgb":
+            return (self.shot * signal + self.read**2).sqrt()
+        light = linear_from_srgb(signal)
+        step = (self.shot * light + self.read**2).sqrt()
+        return (srgb_from_linear(light + step) - srgb_from_linear((light - step).clamp(min=0))) / 2
+
+
+def _smoothed(image: Tensor) -> Tensor:
+    r = SMOOTHED // 2
+    return avg_pool2d(pad(image, (r, r, r, r), mode="replicate"), SMOOTHED, 1)
+
+
+def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Values, and the variance of the noise there: of the blocks of about each value those that vary least."""
+    c = image.shape[1]
+    kernel = image.new_tensor([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]).expand(c, 1, 3, 3) / 6
+    inner = image[..., 1:-1, 1:-1]
+    rough = avg_pool2d(conv2d(image, kernel, groups=c).square(), SIDE)
+    mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).double(), SIDE)
+    unclipped = (empty < 0.02) & (mean < 0.95)
+    mean, rough = mean[unclipped], rough[unclipped]
+    groups = mean.argsort().split(max(-(-len(mean) // GROUPS), FEWEST)) if len(mean) else ()
+    values = [mean[group].median() for group in groups]
+    variances = [rough[group].quantile(SMOOTHEST) / SHARE for group in groups]
+    return torch.stack([*values, mean.new_zeros(())])[:-1], torch.stack([*variances, mean.new_zeros(())])[:-1]
+
+
+def _fitted(coding: Coding, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]) -> tuple[NoiseLevel, float]:
+    """The level of one coding by least squares of relative errors, and its mean squared logarithmic error."""
+    signal = linear_from_srgb(value) if coding == "linear" else value
+    slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4) if coding == "linear" else 1.0
+    design = torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
+    (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))
+    predicted = design @ torch.tensor([shot, read]).to(design)
+    error = float(predicted.clamp(min=1e-6).log().square().mean())
+    return NoiseLevel(float(shot), math.sqrt(read), coding), error
