@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from arraygeom import sample
 
 from ..media.colour import luminance
-from ..networks.denoiser import LowLightNetwork, NoisyView
+from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
 from ..networks.pieces import tiles_of
 from ..networks.protocol import FusionNetwork, FusionOutput, Inputs
 from ..networks.weights import load_denoiser
@@ -89,11 +89,17 @@ class DenoisedViews:
 
         Except for `Radiometry`: values keep their scale.
         """
-        images = {name: torch.cat(self._noisy(name), 1)[0] for name in self.views.images}
+        views = {name: self._noisy(name) for name in self.views.images}
+        parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
+        return {
+            name: NoisyView(*(part[name][None] for part in parts)) for name in (self.views.alpha, *self.views.betas)
+        }
+
+    def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
         views = self.views.replace(images)
         for step in steps:
             views = views if isinstance(step, Radiometry) else step.do(views).views
-        return {name: NoisyView(*views.images[name][None].chunk(3, 1)) for name in (views.alpha, *views.betas)}
+        return views.images
 
     def _noisy(self, name: str) -> NoisyView:
         image = self.views.images[name][None]
@@ -153,10 +159,11 @@ def warped(betas: Sequence[NoisyView], found: Sequence[Found]) -> tuple[NoisyVie
 
 
 def _in_pieces(work: Callable[..., Tensor], *images: Tensor) -> Tensor:
-    """A function of images of one size, computed piece by piece."""
+    """A network on images of one size, computed piece by piece."""
     whole = torch.empty_like(images[0])
-    for (top, bottom, left, right), (y0, y1, x0, x1) in tiles_of(images[0].shape[-2:], PIECE, HALO):
-        part = work(*(image[..., y0:y1, x0:x1] for image in images))
+    h, w = whole.shape[-2:]
+    for (top, bottom, left, right), (y0, y1, x0, x1) in tiles_of((h, w), PIECE, HALO):
+        part = over_flips(work, *(image[..., y0:y1, x0:x1] for image in images))
         whole[..., top:bottom, left:right] = part[..., top - y0 : bottom - y0, left - x0 : right - x0]
     return whole
 

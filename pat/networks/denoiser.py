@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import pad, pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
 from .guided import UNet
 
@@ -16,6 +17,11 @@ MULTIPLE = 8
 """Images are padded to multiples of this."""
 SCALE = 4.0
 """Deviations and differences are given to networks this many times larger: then they are about as large as values."""
+
+OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
+"""Brightness and two colour differences, orthogonal and of unit length, of red, green and blue."""
+BLUR, COLOUR_NOISE = 2, 0.02
+"""Radius of the blur of colour differences, pixels, and the deviation at which half of it is taken."""
 
 
 @dataclass(frozen=True)
@@ -59,6 +65,36 @@ class Denoising(nn.Module):
         return image - deviation * noise
 
 
+class ColourDenoising(nn.Module):
+    """A colour image minus its noise, by brightness and two colour differences, on orthogonal axes.
+
+    Brightness loses noise that the network estimates, as in `Denoising`. Colour differences are first blurred, the more
+    the noisier they are, and the network adds what that took: most of it is known from brightness, and a network
+    this small need not hold the noise of every band.
+    """
+
+    def __init__(self, widths: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.network = UNet(4 * 3 + 3 + 2, widths, 4 * 3)
+        nn.init.zeros_(self.network.last.weight)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"], deviation: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Of any size."""
+        h, w = image.shape[-2:]
+        enough = (0, -w % MULTIPLE, 0, -h % MULTIPLE)
+        axes = image.new_tensor(OPPONENT)
+        bands = pad(torch.einsum("ij,bjhw->bihw", axes, image - 0.5), enough, mode="replicate")
+        noise = torch.einsum("ij,bjhw->bihw", axes.square(), deviation.square()).sqrt()
+        noise = pad(noise, enough, mode="replicate")
+        blurred = avg_pool2d(pad(bands, (BLUR,) * 4, mode="replicate"), 2 * BLUR + 1, 1)
+        share = noise.square() / (noise.square() + COLOUR_NOISE**2)
+        share = torch.cat([torch.zeros_like(share[:, :1]), share[:, 1:]], 1)
+        base = torch.lerp(bands, blurred, share)
+        given = [pixel_unshuffle(bands, 2), SCALE * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)]
+        found = pixel_shuffle(self.network(torch.cat(given, 1)).float(), 2)
+        return 0.5 + torch.einsum("ji,bjhw->bihw", axes, base - noise * found)[..., :h, :w]
+
+
 class LowLightNetwork(nn.Module):
     """Denoisers of one band, of a colour image, and of a fused image."""
 
@@ -66,7 +102,7 @@ class LowLightNetwork(nn.Module):
         super().__init__()
         self.config = config
         self.band = Denoising(1, config.band)
-        self.colour = Denoising(3, config.colour)
+        self.colour = ColourDenoising(config.colour)
         self.fused = Denoising(3, config.fused, further=9)
 
     def forward(
@@ -81,6 +117,14 @@ class LowLightNetwork(nn.Module):
         deviation = (alpha.deviation + gain * beta.deviation) / 2
         seen = [SCALE * x for x in (alpha.removed, alpha.deviation, difference, removed)]
         return self.fused(image, deviation, *seen, confidence)
+
+
+def over_flips(network: Callable[..., Tensor], *images: Float[Tensor, "b _ h w"]) -> Tensor:
+    """The mean of a network's results on the images as they are and flipped: its own errors differ, and average out."""
+    total: Tensor | float = 0.0
+    for axes in ((), (-1,), (-2,), (-2, -1)):
+        total = total + network(*(image.flip(axes) for image in images)).flip(axes)
+    return torch.as_tensor(total) / 4
 
 
 def _gain(image: Tensor, like: Tensor, weight: Tensor) -> Tensor:

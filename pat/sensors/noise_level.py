@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 import torch
@@ -16,8 +16,8 @@ from torch.nn.functional import avg_pool2d, conv2d, pad
 from ..media.colour import linear_from_srgb, srgb_from_linear
 from .chain import normal
 
-Coding = Literal["srgb", "linear"]
-"""What noise was added to: sRGB-encoded values, or linear light that was encoded afterwards."""
+AddedTo = Literal["light", "values"]
+"""What noise was added to: linear light, encoded as sRGB afterwards, or the values themselves."""
 
 SMOOTHED = 7
 """Side of the window over which the signal is averaged, pixels."""
@@ -33,43 +33,48 @@ SMOOTHEST, SHARE = 0.05, 0.677
 class NoiseLevel:
     """Variance of a pixel: `shot` times its value plus `read` squared; values 0..1.
 
-    coding: what the noise was added to, sRGB-encoded values or linear light that was encoded afterwards.
+    added_to: linear light, encoded as sRGB afterwards, or the values themselves.
     Numbers, or tensors (B, 1, 1, 1) of a batch.
     """
 
     shot: float | Tensor = 0.0
     read: float | Tensor = 0.0
-    coding: Coding = "linear"
+    added_to: AddedTo = "light"
 
     def __post_init__(self) -> None:
+        if self.added_to not in get_args(AddedTo):
+            raise ValueError(f"noise: added_to is light or values, got '{self.added_to}'")
         for name in ("shot", "read"):
             value = torch.as_tensor(getattr(self, name))
             if not bool(((value >= 0) & value.isfinite()).all()):
                 raise ValueError(f"noise: {name} must be 0 or more, got {getattr(self, name)}")
 
     @classmethod
-    def of_electrons(cls, electrons: float, read: float = 0.0, coding: Coding = "linear") -> NoiseLevel:
+    def of_electrons(cls, electrons: float, read: float = 0.0, added_to: AddedTo = "light") -> NoiseLevel:
         """The noise of a camera that counts so many electrons at white, with a read noise in electrons."""
         if not electrons > 0:
             raise ValueError(f"noise: electrons at white must be more than 0, got {electrons:g}")
-        return cls(1 / electrons, read / electrons, coding)
+        return cls(1 / electrons, read / electrons, added_to)
 
     @classmethod
     def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
         """The noise level of an sRGB image with white noise, from its smoothest parts, by brightness.
 
-        Blocks in which a second difference varies least hold noise alone; the better of the two codings is taken.
-        Noise that a demosaicing, a resampling or a codec has smoothed is underestimated.
+        Blocks in which a second difference varies least hold noise alone; noise of light or of values is taken, as
+        it fits. Noise that a demosaicing, a resampling or a codec has smoothed is underestimated; an image that has
+        fine texture everywhere seems noisier than it is.
         """
+        if min(image.shape[-2:]) < SIDE + 2:
+            return cls()
         value, variance = _smoothest(image.double())
         if not len(value) or not float(variance.max()) > 0:
             return cls()
-        fits = [_fitted(coding, value, variance) for coding in ("linear", "srgb")]
+        fits = [_fitted(added_to, value, variance) for added_to in ("light", "values")]
         return min(fits, key=lambda fit: fit[1])[0]
 
     def recorded(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
         """An ideal sRGB image with noise: electrons counted, read noise added, light clipped to 0..1."""
-        linear = self.coding == "linear"
+        linear = self.added_to == "light"
         light = linear_from_srgb(image) if linear else image
         shot = torch.as_tensor(self.shot).to(light)
         counted = torch.poisson((light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7), generator=generator) * shot
@@ -79,7 +84,7 @@ class NoiseLevel:
     def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The standard deviation of an sRGB image's values, by the mean of the noisy image around each pixel."""
         signal = _smoothed(image).clamp(0, 1)
-        if self.coding == "srgb":
+        if self.added_to == "values":
             return (self.shot * signal + self.read**2).sqrt()
         light = linear_from_srgb(signal)
         step = (self.shot * light + self.read**2).sqrt()
@@ -106,12 +111,12 @@ def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Fl
     return torch.stack([*values, mean.new_zeros(())])[:-1], torch.stack([*variances, mean.new_zeros(())])[:-1]
 
 
-def _fitted(coding: Coding, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]) -> tuple[NoiseLevel, float]:
-    """The level of one coding by least squares of relative errors, and its mean squared logarithmic error."""
-    signal = linear_from_srgb(value) if coding == "linear" else value
-    slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4) if coding == "linear" else 1.0
+def _fitted(added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]) -> tuple[NoiseLevel, float]:
+    """The level by least squares of relative errors, and its mean squared logarithmic error."""
+    signal = linear_from_srgb(value) if added_to == "light" else value
+    slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4) if added_to == "light" else 1.0
     design = torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
     (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))
     predicted = design @ torch.tensor([shot, read]).to(design)
     error = float(predicted.clamp(min=1e-6).log().square().mean())
-    return NoiseLevel(float(shot), math.sqrt(read), coding), error
+    return NoiseLevel(float(shot), math.sqrt(read), added_to), error

@@ -43,7 +43,7 @@ class DenoiserTraining:
     out: Path = Path("runs/low-light")
     """Folder for weights and checkpoints."""
     start: Path | None = None
-    """File of weights whose denoisers of single views are taken instead of training them."""
+    """File of weights to go on from with the second part."""
     fusion: str = "mono-colour"
     """Weights by which the scenes of the second part are fused."""
     steps: tuple[int, int] = (6000, 6000)
@@ -71,16 +71,13 @@ def train_denoiser(config: DenoiserTraining) -> Path:
     """
     with folder_lock(config.out):
         torch.manual_seed(config.seed)
-        network = LowLightNetwork()
+        network = load_denoiser(config.start) if config.start else LowLightNetwork()
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
-        if config.start:
-            views = load_denoiser(config.start)
-            network.band, network.colour = views.band, views.colour
-        else:
+        if not config.start:
             single = nn.ModuleDict({"band": network.band, "colour": network.colour})
-            single = fit(config, "views", single, view_losses(config, bank, network), config.steps[0])
-            network.band.load_state_dict(single["band"].state_dict())
-            network.colour.load_state_dict(single["colour"].state_dict())
+            single.load_state_dict(
+                fit(config, "views", single, view_losses(config, bank, network), config.steps[0]).state_dict()
+            )
             _save(network, config, config.out / VIEWS)
         network.eval().requires_grad_(False)
         network.fused.train().requires_grad_(True)

@@ -9,13 +9,13 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
-from torch import Generator, Tensor
+from torch import Generator, Tensor, nn
 from torch.nn.functional import interpolate
 
 from arraygeom import Epipolar, sample
 from arraygeom.fields.grid import FieldOnGrid
 from pat.media.colour import luminance
-from pat.networks.denoiser import Denoising, LowLightNetwork, NoisyView
+from pat.networks.denoiser import LowLightNetwork, NoisyView, over_flips
 from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import NoiseLevel, generator_for
 from pat.synthesis.layered import LayeredScenes
@@ -30,7 +30,7 @@ TOGETHER = 4
 """Scenes made at once."""
 KEPT = 40
 """Groups of scenes that windows are drawn from, the last ones made."""
-STEPS = 8
+STEPS = 16
 """Steps for which one group is added."""
 EARLIER = 7
 """Groups that are there before the first step."""
@@ -59,11 +59,11 @@ class NoisyScene(NamedTuple):
 
 def noise_levels(count: int, g: Generator) -> NoiseLevel:
     """Random levels: 15 to 3,000 electrons at white and up to 5 of read noise, or 1 to 60 of 255 at any value."""
-    draw, linear = torch.rand(4, count, 1, 1, 1, generator=g), bool(torch.randint(2, (), generator=g))
-    electrons, constant = 15 * 200 ** draw[0], (draw[2] < 0.3) & (not linear)
+    draw, light = torch.rand(4, count, 1, 1, 1, generator=g), bool(torch.randint(2, (), generator=g))
+    electrons, constant = 15 * 200 ** draw[0], (draw[2] < 0.3) & (not light)
     shot = torch.where(constant, 0.0, 1 / electrons)
     read = torch.where(constant, 60 ** draw[3] / 255, 5 * draw[1].square() / electrons)
-    return NoiseLevel(shot, read, "linear" if linear else "srgb")
+    return NoiseLevel(shot, read, "light" if light else "values")
 
 
 def noisy(image: Tensor, level: NoiseLevel, g: Generator) -> tuple[Tensor, Tensor]:
@@ -123,9 +123,9 @@ def windows_of(groups: Sequence[Tensor], batch: int, side: int, g: Generator) ->
     return NoisyScene.of_stacked(torch.stack(found))
 
 
-def _view(denoiser: Denoising, ideal: Tensor, level: NoiseLevel, g: Generator) -> NoisyView:
+def _view(denoiser: nn.Module, ideal: Tensor, level: NoiseLevel, g: Generator) -> NoisyView:
     recorded, deviation = noisy(ideal, level, g)
-    return NoisyView(recorded, denoiser(recorded, deviation), deviation)
+    return NoisyView(recorded, over_flips(denoiser, recorded, deviation), deviation)
 
 
 def _enlarged(image: Tensor) -> Tensor:
