@@ -11,6 +11,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+from tyro.conf import UseAppendAction
+
 from . import options
 from .options import Depth, FieldName, Images, Memory, Numbers, Out, RigFile, Weights, optional, say
 
@@ -58,6 +60,10 @@ class Fuse:
     """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
     response: Annotated[str | None, options.optional("R,G,B|fit")] = None
     """How a mono alpha weighs red, green and blue, if not as Rec. 601 luma; fit: from matches, with gain and gamma."""
+    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate")]] = ()
+    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly."""
+    keep_alpha: bool = False
+    """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -159,6 +165,8 @@ class Fuse:
                 max_memory=self.max_memory,
                 match_levels=self.normalise_radiometry,
                 response=options.response_of(self.response),
+                noise=options.noise_of(self.noise),
+                keep_alpha=self.keep_alpha,
                 store=store,
             )
             view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
@@ -170,8 +178,9 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        if self.response is not None:
-            raise ValueError("--response is of a single frame: fuse frames with it one by one, or use pat.fuse")
+        for option, given in (("--response", self.response), ("--noise", self.noise)):
+            if given:
+                raise ValueError(f"{option} is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,

@@ -47,8 +47,9 @@ class Found(NamedTuple):
 
 @dataclass(frozen=True)
 class DenoisedViews:
-    """Views without noise, and those that had some: (1, C, H, W) by camera."""
+    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but unbiased."""
 
+    given: Views
     views: Views
     noisy: Mapping[str, NoisyView]
 
@@ -82,7 +83,10 @@ class DenoisedViews:
             image = jointly_denoised(image, own, betas, found)
             if keep_alpha or alpha not in self.noisy:
                 image = image - luminance(image - frame.image)
-        return frame._replace(image=image + own.removed[0] if keep_alpha else image)
+        if keep_alpha:
+            recorded = self._stepped(self.given.images, steps)[alpha]
+            image = image + recorded - own.denoised[0]
+        return frame._replace(image=image)
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
         """Every view, alpha first, as recorded, denoised, and its deviation, after the steps before it is fused.
@@ -121,8 +125,9 @@ def denoised_views(views: Views, noise: Noise | None) -> DenoisedViews:
         image = views.images[name][None]
         deviation = level.deviation(image)
         if float(deviation.mean()) > LEAST_DEVIATION:
-            noisy[name] = NoisyView(image, denoised(image, deviation), deviation)
-    return DenoisedViews(views.replace({name: view.denoised[0] for name, view in noisy.items()}), noisy)
+            recorded = level.unbiased(image)
+            noisy[name] = NoisyView(recorded, denoised(recorded, deviation), deviation)
+    return DenoisedViews(views, views.replace({name: view.denoised[0] for name, view in noisy.items()}), noisy)
 
 
 @torch.no_grad()

@@ -43,7 +43,7 @@ class DenoiserTraining:
     out: Path = Path("runs/low-light")
     """Folder for weights and checkpoints."""
     start: Path | None = None
-    """File of weights to go on from with the second part."""
+    """File of weights to go on from."""
     fusion: str = "mono-colour"
     """Weights by which the scenes of the second part are fused."""
     steps: tuple[int, int] = (6000, 6000)
@@ -71,9 +71,9 @@ def train_denoiser(config: DenoiserTraining) -> Path:
     """
     with folder_lock(config.out):
         torch.manual_seed(config.seed)
-        network = load_denoiser(config.start) if config.start else LowLightNetwork()
+        network = load_denoiser(config.start).requires_grad_(True) if config.start else LowLightNetwork()
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
-        if not config.start:
+        if config.steps[0]:
             single = nn.ModuleDict({"band": network.band, "colour": network.colour})
             single.load_state_dict(
                 fit(config, "views", single, view_losses(config, bank, network), config.steps[0]).state_dict()

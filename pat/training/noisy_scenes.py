@@ -67,10 +67,10 @@ def noise_levels(count: int, g: Generator) -> NoiseLevel:
 
 
 def noisy(image: Tensor, level: NoiseLevel, g: Generator) -> tuple[Tensor, Tensor]:
-    """The image as recorded, and its deviation as one would state it, up to some 8 % wrong."""
+    """The image as recorded, unbiased, and its deviation as one would state it, up to some 8 % wrong."""
     recorded = level.recorded(image, g)
     wrong = (0.08 * torch.randn(len(image), 1, 1, 1, generator=g)).exp()
-    return recorded, level.deviation(recorded) * wrong
+    return level.unbiased(recorded), level.deviation(recorded) * wrong
 
 
 class NoisyScenes:

@@ -15,12 +15,33 @@ LEVELS = {
 
 
 @pytest.mark.parametrize("name", LEVELS)
-@pytest.mark.parametrize("value", [0.4, 0.6, 0.8])
+@pytest.mark.parametrize("value", [0.1, 0.25, 0.5, 0.8])
 def test_recorded_noise_has_the_stated_deviation(name, value):
     recorded = LEVELS[name].recorded(torch.full((1, 1, 200, 200), value), generator_for(0, name, value))
     stated = float(LEVELS[name].deviation(recorded).mean())
-    assert float(recorded.std()) == pytest.approx(stated, rel=0.1)
-    assert float(recorded.mean()) == pytest.approx(value, abs=0.2 * stated)
+    assert float(recorded.std()) == pytest.approx(stated, rel=0.05)
+
+
+@pytest.mark.parametrize(("name", "value", "bias"), [("50 electrons", 0.05, 0.048), ("50 electrons", 0.25, -0.029)])
+def test_the_bias_of_clipped_and_encoded_noise_is_removed(name, value, bias):
+    recorded = LEVELS[name].recorded(torch.full((1, 1, 200, 200), value), generator_for(0, name, value))
+    assert float(recorded.mean()) - value == pytest.approx(bias, abs=0.004)
+    assert float(LEVELS[name].unbiased(recorded).mean()) == pytest.approx(value, abs=0.006)
+
+
+def test_each_image_of_a_batch_has_its_own_level():
+    shot, read = torch.tensor([0.02, 0.002]).view(2, 1, 1, 1), torch.tensor([0.04, 0.0]).view(2, 1, 1, 1)
+    image = torch.rand(2, 3, 20, 21, generator=generator_for(0, "batch"))
+    both = NoiseLevel(shot, read)
+    for i in range(2):
+        alone, part = NoiseLevel(float(shot[i]), float(read[i])), image[i : i + 1]
+        torch.testing.assert_close(both.deviation(image)[i : i + 1], alone.deviation(part))
+        torch.testing.assert_close(both.unbiased(image)[i : i + 1], alone.unbiased(part))
+
+
+def test_without_noise_nothing_is_biased():
+    image = torch.rand(1, 3, 20, 21, generator=generator_for(0, "clean"))
+    torch.testing.assert_close(NoiseLevel().unbiased(image), image, atol=1e-6, rtol=0)
 
 
 def test_light_is_recorded_as_the_forward_model_does():
