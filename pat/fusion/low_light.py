@@ -57,11 +57,11 @@ class DenoisedViews:
         """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""
         return WithPositions(network) if self.noisy else network
 
-    def split(self, frame: Frame) -> tuple[Frame, list[Found]]:
-        """The frame that a `wrapped` network made without its further bands, and what those say of each beta."""
+    def split(self, frame: Frame, betas: int) -> tuple[Frame, list[Found]]:
+        """The frame that a `wrapped` network made of so many betas, and what its further bands say of each of them."""
         if not self.noisy:
             return frame, []
-        bands = sum(len(self.views.images[name]) for name in self.views.betas)
+        bands = len(frame.image) - 3 * betas
         further = frame.image[bands:].split(3)
         return frame._replace(image=frame.image[:bands]), [Found(f[:2].movedim(0, -1), f[2]) for f in further]
 
@@ -78,7 +78,7 @@ class DenoisedViews:
         (h, w), alpha, image = frame.image.shape[-2:], self.views.alpha, frame.image
         views = self.prepared(steps)
         own = NoisyView(*(part[..., :h, :w] for part in views[alpha]))
-        if all(len(self.views.images[name]) == 3 for name in self.views.betas):
+        if all(len(self.views.images[name]) == 3 for name in self.views.betas) and len(found) == len(views) - 1:
             betas = [view for name, view in views.items() if name != alpha]
             image = jointly_denoised(image, own, betas, found)
             if keep_alpha or alpha not in self.noisy:
