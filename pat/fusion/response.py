@@ -52,7 +52,7 @@ class ResponseSettings(NamedTuple):
     known: float = 0.015
     least_gain: tuple[float, float] = (0.04, 0.18)
     better: float = 0.8
-    least_shading: float = 0.12
+    least_shading: float = 0.08
     explained: float = 0.5
 
 
