@@ -95,7 +95,7 @@ class NoiseLevel:
         electrons at white by up to 0.05 and 0.03. No denoiser that averages values sees that.
         """
         value, mean, _ = self._curves(image)
-        return image + _interpolated(_smoothed(image), mean, value - mean)
+        return image + _interpolated(_smoothed(_smoothed(image)), mean, value - mean)
 
     def _curves(self, like: Tensor) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
         """Ideal values, and the mean and the deviation of what is recorded of each; noise taken as normal."""
