@@ -13,7 +13,7 @@ from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, find_corrections
-from .inputs import FrameInputs, frame_inputs
+from .inputs import FrameInputs, background_filled, frame_inputs
 from .low_light import Noise, denoised_views
 from .response import Given
 from .results import Frame
@@ -104,6 +104,7 @@ def fuse(
     frame = fused_in_tiles(quiet.wrapped(network), inputs, state, plan.tiles, progress=progress, store=store)
     frame, matched = quiet.split(frame, len(inputs.inputs.betas))
     warn_of_confidence(network, frame, inputs)
+    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
     steps = steps_for(network, normalise=match_levels)
     frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
     for back in undo:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -131,3 +131,39 @@ def depth_and_confidence(
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
     return depth.to(output.image), overall[0, :h, :w]
+
+
+LOST = 0.3
+"""Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
+
+
+def background_filled(
+    depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], inputs: Inputs
+) -> Float[Tensor, "h w"]:
+    """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
+
+    What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
+    are above or below alpha. What is unknown stays NaN.
+    """
+    steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
+    if not steps:
+        return depth
+    apart = torch.stack([(part.end - part.start).abs().mean((0, 1, 2)) for part in steps]).sum(0)
+    along_rows = bool(apart[0] >= apart[1])
+    inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
+    known = (confidence >= LOST) & depth.isfinite()
+    if not along_rows:
+        inverse, known = inverse.mT, known.mT
+    before = _nearest_known(inverse, known)
+    after = _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1)
+    beside = torch.fmin(before, after)
+    found = torch.where(known | beside.isnan(), inverse, beside)
+    found = found if along_rows else found.mT
+    return torch.where(depth.isfinite() & (found > 0), 1 / found, depth)
+
+
+def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
+    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
+    last = torch.where(known, columns, -1).cummax(1).values
+    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)

@@ -298,7 +298,8 @@ class SequenceFusion:
     def _corrections(self) -> Corrections:
         """What is put right in every frame: found once, near the middle, so that nothing flickers.
 
-        At the key frame nearest to the middle whose images can be read: what cannot is reported when it is fused.
+        At the key frame nearest to the middle whose images can be read: what cannot is reported when it is fused. Betas
+        that did not record at alpha's time are not aligned: motion too moves points off their segments.
         """
         keys = self.timeline.key_frames()
         for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
@@ -310,6 +311,8 @@ class SequenceFusion:
 
     def _found_at(self, key: KeyFrame) -> Corrections:
         images = {name: self.frames[name][j] for name, j in key.betas.items()}
+        gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())
+        together = all(abs(gap) * self.timeline.rate(self.alpha) < SYNCHRONOUS for gap in gaps)
         return corrections_of(
             self.network,
             self.rig,
@@ -319,7 +322,7 @@ class SequenceFusion:
             field=self.field,
             match_levels=self.match_levels,
             response=self.response,
-            align=self.align,
+            align=self.align and together,
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:

@@ -75,6 +75,7 @@ class BetaEstimate(NamedTuple):
     diffused: (B, fills, C, H, W), the same diffused within alpha from pixels of high weight.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
     choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of `diffused`.
+    position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut there.
     """
 
     attended: Attended
@@ -82,6 +83,7 @@ class BetaEstimate(NamedTuple):
     diffused: Tensor
     logit: Tensor
     choice: Tensor
+    position: Tensor
 
     @property
     def confidence(self) -> Float[Tensor, "b h w"]:
@@ -232,7 +234,8 @@ class GuidedPAT(nn.Module):
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
         colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
-        return BetaEstimate(attended, colour, found.colour, logit, choice)
+        position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
+        return BetaEstimate(attended, colour, found.colour, logit, choice, position)
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -251,7 +254,7 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
     """The image with the position in each beta, its deviation, and its confidence."""
     return FusionOutput(
         image,
-        [s.attended.position for s in estimates],
+        [s.position for s in estimates],
         [s.attended.deviation for s in estimates],
         [s.confidence for s in estimates],
     )
@@ -275,6 +278,7 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
         mean([e.diffused.transpose(0, 1) for e in estimates]).transpose(0, 1),
         logits.amax(0),
         mean([e.choice for e in estimates]),
+        first.position,
     )
 
 

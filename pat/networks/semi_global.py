@@ -380,11 +380,16 @@ def _regressed(
     return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
 
 
-def matches(segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels."""
+def matches(
+    segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"], *, beyond_edge: bool = False
+) -> Float[Tensor, "b h w 2"]:
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels.
+
+    Not beyond the segments' near ends, unless `beyond_edge`.
+    """
     length = segments.length
-    far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
-    return segments.end + far.clamp(min=0).minimum(length)[..., None] * along(segments)
+    far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length).clamp(min=0)
+    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments)
 
 
 def along(segments: Segments) -> Float[Tensor, "*n 2"]:
