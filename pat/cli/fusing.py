@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
@@ -73,6 +73,10 @@ class Fuse:
     exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
     """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
     alpha has it. By default auto without a rig, and keep with one."""
+    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate")]] = ()
+    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly."""
+    keep_alpha: bool = False
+    """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -250,6 +254,8 @@ class Fuse:
                 response=options.response_of(self.response),
                 align=self.align,
                 explain=self._note,
+                noise=options.noise_of(self.noise),
+                keep_alpha=self.keep_alpha,
                 store=store,
                 device=self.device,
             )
@@ -301,6 +307,8 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        if self.noise:
+            raise ValueError("--noise is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,

@@ -45,6 +45,30 @@ def response_of(text: str) -> Any:
     return red, green, blue
 
 
+def noise_of(texts: Iterable[str]) -> Any:
+    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; None without. Raises ValueError else."""
+    from ..sensors import NoiseLevel
+
+    entries = list(texts)
+    if entries == ["estimate"] or not entries:
+        return entries[0] if entries else None
+    levels = []
+    for entry in entries:
+        name, _, numbers = entry.partition("=")
+        try:
+            electrons, *read = (float(number) for number in numbers.split(","))
+        except ValueError:
+            raise ValueError(
+                f"--noise: '{entry}' is neither 'estimate' nor NAME=ELECTRONS[,READ], as mono=200,2"
+            ) from None
+        if len(read) > 1:
+            raise ValueError(
+                f"--noise: '{entry}' has {len(read) + 1} numbers; wanted electrons at white and read noise"
+            )
+        levels.append((name, NoiseLevel.of_electrons(electrons, sum(read))))
+    return dict(_once("--noise", levels))
+
+
 def optional(metavar: str) -> Any:
     """Marks an option that may be left out."""
     return arg(metavar=metavar, help_behavior_hint="")

@@ -16,7 +16,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from skimage.restoration import denoise_nl_means
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
@@ -185,16 +184,6 @@ def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult
     image = classical_fusion(alpha, beta, max_disparity)
     enlarged = interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
     return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
-
-
-def non_local(image: Float[Tensor, "c h w"], level: NoiseLevel) -> Float[Tensor, "c h w"]:
-    """Non-local means (Buades et al. 2005) with the true mean noise level."""
-    sigma = float(level.deviation(image[None]).mean())
-    planes = image.permute(1, 2, 0).numpy()
-    found = denoise_nl_means(
-        planes, patch_size=5, patch_distance=6, h=0.8 * sigma, sigma=sigma, fast_mode=True, channel_axis=-1
-    )
-    return torch.from_numpy(np.ascontiguousarray(found.transpose(2, 0, 1))).float().clamp(0, 1)
 
 
 def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:

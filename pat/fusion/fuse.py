@@ -16,6 +16,7 @@ from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
+from .low_light import Noise, denoised_views
 from .response import Given
 from .results import Frame
 from .steps import steps_for
@@ -41,6 +42,8 @@ def fuse(
     align: bool = True,
     corrections: Corrections | None = None,
     explain: Callable[[str], None] | None = None,
+    noise: Noise | None = None,
+    keep_alpha: bool = False,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
@@ -72,6 +75,9 @@ def fuse(
         align: find how far the betas lie across their search segments, and put that right.
         corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
         explain: called with a line for each thing that was found and put right.
+        noise: the noise level of each camera that has some, or "estimate": views are denoised before they are matched,
+            and jointly once they are fused.
+        keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak of.
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
@@ -93,7 +99,8 @@ def fuse(
     if differentiable and not (max_memory is None and store is None):
         raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
     limit = None if max_memory is None else parse_bytes(max_memory)
-    views = Views.of(rig, images, alpha=alpha, depth=depth, field=field)
+    quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
+    views = quiet.views
     inputs, undo = _prepared(network, views, match_levels)
     plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
     if announce:
@@ -105,10 +112,14 @@ def fuse(
     inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
     state = network.prepare(inputs.inputs)
     with torch.set_grad_enabled(differentiable):
-        frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
+        wrapped = quiet.wrapped(network)
+        frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
+        frame, matched = quiet.split(frame, len(inputs.inputs.betas))
     warn_of_confidence(network, frame, inputs)
     frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
-    for back in (found.undone, *undo):
+    steps = steps_for(network, normalise=match_levels)
+    frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+    for back in undo:
         frame = back(frame)
     return frame if differentiable else Frame(*(part.detach() for part in frame))
 

@@ -92,6 +92,12 @@ class PhotoBank:
         high = self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5)
         return torch.lerp(low, high, weight)
 
+    def window(self, texture: int, level: int, xy: tuple[int, int], side: int) -> Float[Tensor, "3 side side"]:
+        """A square of a texture at one level, its first pixel at (x, y), repeated by mirroring."""
+        w, h = self.wh[texture, level].tolist()
+        x, y = (_mirrored(start + torch.arange(side), torch.tensor(n)) for start, n in zip(xy, (w, h)))
+        return self._fetch(int(self.starts[texture, level]) + w * y[:, None] + x)
+
     def _bilinear(self, index: Tensor, xy: Tensor) -> Tensor:
         """Colours at positions (2, n) of the level with flat index."""
         start = self.starts.view(-1)[index]
