@@ -105,14 +105,17 @@ class Pair(Batched):
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
         """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through lenses.
 
-        Raises ValueError if neither is known.
+        0 where the cameras' baseline is no more than the rounding of their poses. Raises ValueError if neither is known.
         """
         if self.link is not None:
             return self.link.F
         if not self.calibrated:
             raise ValueError("neither the cameras' calibration nor F is known for this pair: give the rig a link")
         alpha, beta = self.cameras
-        return fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
+        F = fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
+        baseline, rounding = self.beta_from_alpha.t.norm(dim=-1), torch.finfo(alpha.t.dtype).eps
+        moved = baseline > 8 * rounding * (alpha.t.norm(dim=-1) + beta.t.norm(dim=-1))
+        return torch.where(moved[..., None, None], F, 0.0)
 
     @property
     def homography(self) -> Float[Tensor, "*b 3 3"]:

@@ -1,4 +1,4 @@
-"""What is damaged, and what is asked of the damaged file: rigs of all formats, images, weights, checkpoints, documents."""
+"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance files."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
             write_rig(rich if format == "native" else plain, target, format=format)
         for file in sorted(target.iterdir()) if target.is_dir() else [target]:
             yield Seed("rig", f"{format} (written)", file, target.is_dir())
-    for seed in (_matlab(folder / "matlab"), *_colmap_binary(folder / "colmap_binary")):
-        yield seed
+    yield _matlab(folder / "matlab")
+    yield from _colmap_binary(folder / "colmap_binary")
 
 
 def _matlab(folder: Path) -> Seed:

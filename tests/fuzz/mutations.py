@@ -107,9 +107,10 @@ def flip(source: random.Random, content: bytes) -> bytes:
 
 def overwrite_word(source: random.Random, content: bytes) -> bytes:
     """A 4-byte or 8-byte integer or a double of an extreme value somewhere, the file's length unchanged."""
+    real = source.choice((0.0, 1e308, float("nan"), float("inf"), -1.0))
+    word = source.choice(WORDS)
     packed = source.choice(
-        [struct.pack(source.choice("<>") + "i", source.choice(WORDS)), struct.pack("<q", source.choice(WORDS))]
-        + [struct.pack("<d", source.choice((0.0, 1e308, float("nan"), float("inf"), -1.0)))]
+        [struct.pack("<i", word), struct.pack(">i", word), struct.pack("<q", word), struct.pack("<d", real)]
     )
     at = source.randrange(max(len(content) - len(packed), 1))
     return content[:at] + packed + content[at + len(packed) :]
