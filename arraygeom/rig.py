@@ -105,7 +105,9 @@ class Pair(Batched):
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
         """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through lenses.
 
-        0 where the cameras' baseline is no more than the rounding of their poses. Raises ValueError if neither is known.
+        0 where the cameras' baseline is no more than the rounding of their poses.
+
+        Raises ValueError if neither is known.
         """
         if self.link is not None:
             return self.link.F

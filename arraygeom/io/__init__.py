@@ -12,8 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ..atomic import write_text
-from ..camera import Camera
+from ..camera import Camera, LensView
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -99,6 +101,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
     rig = rig if scale == 1.0 else _scaled(rig, scale)
+    _check_magnitudes(path, rig)
     if doubt := unit_warning(rig):
         RigSource(path).warn(doubt)
     return rig
@@ -153,6 +156,25 @@ def _left_out(rig: Rig, format: str) -> str:
         "sensors": any(sensor != Sensor() for sensor in sensors),
     }
     return ", ".join(name for name, is_stated in stated.items() if is_stated)
+
+
+SMALLEST_FOCAL, LARGEST_NUMBER = 1e-3, 1e9
+"""Bounds of focal lengths (pixels), of all of K, and of translations (metres). Beyond them pixels lose their digits."""
+
+
+def _check_magnitudes(path: Path, rig: Rig) -> None:
+    """Raise RigFileError for numbers that no camera has, whose squares or inverses are not numbers."""
+    for name, view in rig.cameras.items():
+        if isinstance(view, LensView):
+            size = float(view.K.abs().max())
+            if size > LARGEST_NUMBER or float(torch.linalg.svdvals(view.K[:2, :2]).min()) < SMALLEST_FOCAL:
+                raise RigFileError(
+                    path, name, f"has a K of numbers up to {size:g} or a focal length near 0: use pixels"
+                )
+        if isinstance(view, Camera) and float(view.t.abs().max()) > LARGEST_NUMBER:
+            raise RigFileError(path, name, f"has a translation of {float(view.t.abs().max()):g} m: use metres")
+    if rig.depth is not None and float(rig.depth[0]) < 1 / LARGEST_NUMBER:
+        raise RigFileError(path, "depth", f"begins at {float(rig.depth[0]):g} m: give a near bound in metres")
 
 
 def _scaled(rig: Rig, scale: float) -> Rig:

@@ -165,7 +165,10 @@ def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
     near, far = (float(d) for d in one.rig.depth)
     step = torch.full((2, *one.pair.alpha.hw), 0.5)
     both: list[tuple[str, Any, float | None, float | None]] = [("Curved", Curved(48), near, far)]
-    both += [("ThroughLenses", ThroughLenses(Epipolar(), 48), None, None), ("Moved", Moved(Curved(16), step), None, None)]
+    both += [
+        ("ThroughLenses", ThroughLenses(Epipolar(), 48), None, None),
+        ("Moved", Moved(Curved(16), step), None, None),
+    ]
     both += [("Widened(Curved)", Widened(Curved(48), 1.5, 2), near, far)]
     if one.pair.has_lens:
         return both
@@ -337,4 +340,3 @@ def _same(name: str, found: Any, expected: Any, tolerance: float = 0.0) -> None:
     for f in dataclasses.fields(expected):
         a, b = getattr(found, f.name), getattr(expected, f.name)
         torch.testing.assert_close(a.expand_as(b), b, atol=tolerance, rtol=tolerance, msg=lambda m: f"{name}: {m}")
-

@@ -8,10 +8,13 @@ import struct
 import sys
 import time
 import zlib
+from pathlib import Path
 
 import pytest
 import torch
 
+from arraygeom import Rig
+from arraygeom.io import RigFileError
 from calib.boards.covariance import RigCovariance
 from pat.networks.weights import load_weights, save_weights
 from pat.support.tensor_files import write_tensors
@@ -140,3 +143,30 @@ def test_what_is_damaged_was_whole(kind, tmp_path):
     make, check, _ = cases.KINDS[kind]
     for seed in make(tmp_path):
         assert check(seed.file, random.Random(0)) == "read", seed
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("focal: 800", "focal: 1.0e-308"),
+        ("focal: 800", "focal: 1.0e+300"),
+        ("centre: [319.5", "centre: [1.0e+300"),
+        ("translation: [-0.1", "translation: [1.0e+300"),
+        ("depth: [2,", "depth: [1.0e-308,"),
+    ],
+)
+def test_numbers_that_no_camera_has_are_refused(old, new, tmp_path):
+    """Their squares or inverses are 0 or infinite."""
+    rig = (Path(cases.__file__).parent / "native.yaml").read_text()
+    assert old in rig
+    (tmp_path / "rig.yaml").write_text(rig.replace(old, new))
+    with pytest.raises(RigFileError, match="use pixels|use metres|in metres"):
+        Rig.load(tmp_path / "rig.yaml")
+
+
+def test_a_rig_of_huge_images_is_summarised_within_seconds(tmp_path):
+    rig = (Path(cases.__file__).parent / "native.yaml").read_text()
+    (tmp_path / "rig.yaml").write_text(rig.replace("size: [640, 400]", "size: [65535, 16384]"))
+    outcome = sandbox.ended(lambda: cases.command("rig", "info", str(tmp_path / "rig.yaml")), tmp_path / "log")
+    assert outcome.verdict == "read"
+    assert outcome.peak < 2**30
