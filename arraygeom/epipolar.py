@@ -17,6 +17,7 @@ from .homography import infinite_homography
 from .pixels import HW, floating, map_homogeneous, product, to_homogeneous
 from .pose import Pose, cross_matrix, matvec
 from .segments import FLAT, Segments
+from .tracing import traced
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
@@ -159,11 +160,12 @@ def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor)
     rising, falling = slope > FLAT, slope < -FLAT
     flat = ~(rising | falling)
     crossing = g * (-1 / torch.where(flat, 1.0, slope))
-    if bool(rising.any()):
+    every = traced()
+    if every or bool(rising.any()):
         low = torch.maximum(low, torch.where(rising, crossing, 0.0))
-    if bool(falling.any()):
+    if every or bool(falling.any()):
         high = torch.minimum(high, torch.where(falling, crossing, 1.0))
-    if bool(flat.any()):
+    if every or bool(flat.any()):
         valid = valid & ((g >= 0) | ~flat)
     return low, high, valid
 

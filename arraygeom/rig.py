@@ -21,6 +21,7 @@ from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
 from .text import baseline_text, depth_text, rig_html, rig_text, view_text
+from .tracing import traced
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -89,7 +90,7 @@ class Pair(Batched):
     def beta_from_alpha(self) -> Pose:
         """X_beta = R X_alpha + t."""
         alpha, beta = self.cameras
-        return beta.cam_from_world @ alpha.cam_from_world.inverse()
+        return beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())  # torch.compile cannot trace @ of these
 
     @property
     def depth_range(self) -> Depths:
@@ -323,10 +324,10 @@ def _view(name: str, camera: Any) -> View:
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far."""
+    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where they are known)."""
     bounds = [d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)]
     near, far = bounds
-    if not bool(((near > 0) & (far >= near)).all()):
+    if not traced() and not bool(((near > 0) & (far >= near)).all()):
         raise ValueError(
             f"depth bounds must satisfy 0 < near <= far, in metres; got near = {_shown(near)}, far = {_shown(far)}"
         )

@@ -17,6 +17,7 @@ from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
 from ..segments import Positions, Segments, fractions_on_image, sample_fractions
+from ..tracing import traced
 from ..undistortion import pinhole_view
 from .protocol import ReceptiveField
 from .straight import Epipolar
@@ -175,7 +176,7 @@ TINY = 1e-24
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
     """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 % wider.
 
-    None if it reaches 75 degrees off axis, or over the range of its lens.
+    None if it reaches 75 degrees off axis, or over the range of its lens, and where numbers cannot decide (`traced`).
     """
     h, w = camera.hw
     along = torch.linspace(0, 1, 17).to(camera.K)
@@ -185,7 +186,7 @@ def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] 
     rays, valid = camera.rays(edges)
     ahead = valid & (rays[..., 2] > 1e-3)
     xy = rays[..., :2] / torch.where(ahead, rays[..., 2], 1.0)[..., None]
-    if not bool((ahead & (xy.square().sum(-1) < WIDE**2)).all()):
+    if traced() or not bool((ahead & (xy.square().sum(-1) < WIDE**2)).all()):
         return None
     low, high = xy.amin(-2), xy.amax(-2)
     margin = 0.02 * (high - low)

@@ -25,7 +25,7 @@ import tyro
 from arraygeom.atomic import write_text
 from docs.update_readme import with_block
 
-from .cases import FIXTURES, KINDS, Check, Seed, damaged
+from .cases import KINDS, Check, Seed, damaged
 from .sandbox import Outcome, ended
 
 FAULTS = Path("out/fuzz")
@@ -80,6 +80,8 @@ def faults_of(kind: str, cases: int, first: int = 0) -> list[Case]:
             log = Path(folder) / "log.txt"
             outcome = ended(lambda path=path, number=number: check(path, random.Random(number)), log)
             done.append(Case(seed, number, outcome))
+            if len(done) % 500 == 0:
+                print(f"{kind}: {len(done)} of {cases}", file=sys.stderr)
             if outcome.verdict not in ("read", "refused"):
                 keep(done[-1], Path(folder) / "case", log)
     return done
@@ -87,14 +89,16 @@ def faults_of(kind: str, cases: int, first: int = 0) -> list[Case]:
 
 def warm_up(seeds: list[Seed], check: Check, folder: Path) -> None:
     """Ask for undamaged files in this process, so that what is imported late is there before it forks."""
+    home = folder / "case"
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        for i in range(3):
-            home = folder / "case"
+        for i, seed in enumerate(seeds):
             shutil.rmtree(home, ignore_errors=True)
-            shutil.copytree(seeds[0].file.parent if seeds[0].whole_folder else FIXTURES, home)
-            if not seeds[0].whole_folder:
-                shutil.copy(seeds[0].file, home)
-            check(home / seeds[0].file.name, random.Random(i))
+            if seed.whole_folder:
+                shutil.copytree(seed.file.parent, home)
+            else:
+                home.mkdir(parents=True)
+                shutil.copy(seed.file, home)
+            check(home if seed.whole_folder and seed.kind == "rig" else home / seed.file.name, random.Random(i))
 
 
 def keep(case: Case, home: Path, log: Path) -> None:
