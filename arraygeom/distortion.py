@@ -172,7 +172,6 @@ def _brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     first derivatives and the next one the second (the error of a Newton step is the square of the one before).
     """
     lens = _Brown.named(c)
-    limit = _brown_limit(lens).to(xy_d)
     target, ahead = _untilt(lens, xy_d)
     with torch.no_grad():
         inverse = _traced_brown_inverse if torch.compiler.is_compiling() else _brown_inverse_of
@@ -239,7 +238,9 @@ def _brown_inverse_of(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     return _brown_inverse(lens, target, _brown_limit(lens).to(target))
 
 
-@torch.library.custom_op("arraygeom::brown_inverse", mutates_args=())
+@torch.library.custom_op(
+    "arraygeom::brown_inverse", mutates_args=(), schema="(Tensor c, Tensor target) -> (Tensor, Tensor)"
+)
 def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The same for torch.compile, which cannot follow iterations that numbers end."""
     solved, valid = _brown_inverse_of(c, target)
@@ -380,7 +381,9 @@ def _fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
     return _invert_increasing(radius, u_d.sqrt(), limit.sqrt().expand_as(u_d)).square()
 
 
-@torch.library.custom_op("arraygeom::fisheye_start", mutates_args=())
+@torch.library.custom_op(
+    "arraygeom::fisheye_start", mutates_args=(), schema="(Tensor c, Tensor u_d, Tensor limit) -> Tensor"
+)
 def _traced_fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
     """The same for torch.compile, which cannot follow iterations that numbers end."""
     return _fisheye_start(c, u_d, limit).contiguous()

@@ -31,9 +31,11 @@ from . import (
     multical,
     native,
     nerfstudio,
+    open3d,
     opencv,
     pycalib,
     ros,
+    strecha,
     syntim,
 )
 from .errors import RigFileError
@@ -56,6 +58,8 @@ READERS: dict[str, Any] = {
     "multical": multical,
     "aniposelib": aniposelib,
     "pycalib": pycalib,
+    "strecha": strecha,
+    "open3d": open3d,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {
@@ -68,12 +72,7 @@ WRITERS: dict[str, Any] = {
 
 # Recognised by a word in the file or by its suffix, and what to do instead.
 NOT_READ = {
-    ".camera": ("one camera of Strecha's data", "write K, R^T and -R^T t of all into a native rig file"),
     "<chunk": ("a Metashape project", "export its cameras in COLMAP's format"),
-    "PinholeCamera": (
-        "a file of Open3D",
-        "write intrinsic_matrix and extrinsic (X_camera = R X + t) into a native file",
-    ),
 }
 
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]

@@ -113,7 +113,7 @@ def verdict(operator: str, transformation: str) -> str:
         return f"wrong: {str(error).splitlines()[0]}"
     except Exception as error:
         last = traceback.extract_tb(error.__traceback__)[-1].filename
-        ours = isinstance(error, OURS) and "site-packages" not in last or "depends on numbers" in str(error)
+        ours = (isinstance(error, OURS) and "site-packages" not in last) or "depends on numbers" in str(error)
         return f"{'refused' if ours else 'wrong'}: {_line(str(error))}"
     return "right"
 
