@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Fixed, Positional, arg
 
-from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say
+from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
 
 RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
 
@@ -53,6 +53,7 @@ class Evaluate:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
+        writable(self.out, folder=True)
         network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
         wrong = protocols.controls(network, bands=bands) if self.controls else {}
         methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}

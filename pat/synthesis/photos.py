@@ -138,7 +138,7 @@ def _decoded(path: Path) -> np.ndarray | None:
     """RGB bytes, or None for a file that is no image, or one too small or too large to be a texture."""
     content = path.read_bytes()
     header = image_header(content)
-    if header is None or not (_MULTIPLE <= min(header.hw) and header.hw[0] * header.hw[1] <= MOST_PIXELS):
+    if header is None or not (min(header.hw) >= _MULTIPLE and header.hw[0] * header.hw[1] <= MOST_PIXELS):
         return None
     image = decoded(content, cv2.IMREAD_COLOR)
     if image is None or min(image.shape[:2]) < _MULTIPLE:
