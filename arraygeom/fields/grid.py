@@ -60,6 +60,12 @@ class FieldOnGrid:
         found = cls(at, int(torch.ceil(longest)) + 1, pixels)
         return replace(found, blocks=found.of_blocks(BLOCK)) if blocks else found
 
+    @classmethod
+    def evaluated(cls, at: Callable[[Tensor], Segments], hw: HW, samples: int) -> FieldOnGrid:
+        """A straight field, given as a function of alpha's pixels, on a grid of even sides."""
+        found = cls(at, samples, _on_grid(at, pixel_grid(hw, dtype=torch.float64)))
+        return replace(found, blocks=found.of_blocks(BLOCK))
+
     def of_blocks(self, side: int) -> Segments:
         """The segments of the centres of blocks of `side` x `side` pixels of the grid, (B or 1, H / side, W / side).
 

@@ -35,8 +35,9 @@ def _camera(source: RigSource, fields: Any, name: str) -> Camera:
     intrinsic = source.mapping(source.get(fields, "intrinsic", name), entry)
     columns = source.numbers(source.get(intrinsic, "intrinsic_matrix", entry), (3, 3), f"{entry}.intrinsic_matrix")
     extrinsic = source.numbers(source.get(fields, "extrinsic", name), (4, 4), f"{name}.extrinsic")
+    width, height = (source.get(intrinsic, side, entry) for side in ("width", "height"))
     return Camera(
         K=source.intrinsics(columns.T, f"{entry}.intrinsic_matrix"),
         cam_from_world=source.pose_matrix(extrinsic.T, f"{name}.extrinsic"),
-        hw=source.size(*(source.get(intrinsic, side, entry) for side in ("width", "height")), f"{entry} width, height"),
+        hw=source.size(width, height, f"{entry} width, height"),
     )

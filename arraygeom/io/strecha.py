@@ -40,10 +40,11 @@ def _camera(source: RigSource) -> Camera:
     if skipped.any():
         raise source.fail("line 4", f"is {skipped.tolist()}: a lens, which is not read: undistort the images first")
     world_from_cam = source.rotation(R, "lines 5 to 7")
+    width, height = wh.tolist()
     return Camera(
         K=source.intrinsics(K, "lines 1 to 3"),
         cam_from_world=Pose.from_centre(world_from_cam.mT, centre),
-        hw=source.size(*wh.tolist(), "line 9"),
+        hw=source.size(width, height, "line 9"),
     )
 
 

@@ -6,11 +6,15 @@ import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from tyro.conf import Fixed, Positional, arg
 
+from . import options
 from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
+
+if TYPE_CHECKING:
+    from ..networks.protocol import FusionNetwork
 
 RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
 
@@ -37,6 +41,12 @@ class Evaluate:
     """The paper's: mono + colour (table1), or mono + three bands (table2)."""
     controls: bool = False
     """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must get worse."""
+    conditions: bool = False
+    """Instead: other responses, exposures, noise, misalignment; by region, with depth. Also conditions.png."""
+    only: tuple[str, ...] = ()
+    """Of these conditions, by name."""
+    half: Literal["tune", "report", "all"] = "all"
+    """The pairs on which settings may be chosen, or those that are reported."""
     out: Out = Path("out/evaluate")
     """Folder for scores.md, scores.csv and, for each data set, a strip of images a pair."""
     weights: Weights = "mono-colour"
@@ -55,6 +65,8 @@ class Evaluate:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         writable(self.out, folder=True)
         network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
+        if self.conditions or self.only:
+            return self._under_conditions(network, folders)
         wrong = protocols.controls(network, bands=bands) if self.controls else {}
         methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}
         rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out)
@@ -65,6 +77,27 @@ class Evaluate:
         write_csv(self.out / "scores.csv", stereo.StereoRow._fields, every)
         print(text, end="")
         say(f"written: {self.out / 'scores.md'}, {self.out / 'scores.csv'}, images in {self.out}")
+
+    def _under_conditions(self, network: FusionNetwork, folders: dict[str, Path]) -> None:
+        from arraygeom.atomic import write_text
+
+        from ..evaluation import conditions, stereo
+
+        names = self.only or tuple(conditions.CONDITIONS)
+        unknown = [name for name in names if name not in conditions.CONDITIONS]
+        if unknown:
+            raise ValueError(f"--only: no condition '{unknown[0]}': there are {', '.join(conditions.CONDITIONS)}")
+        pairs = [
+            p for name, folder in folders.items() for p in conditions.of_half(stereo.DATA_SETS[name](folder), self.half)
+        ]
+        if not pairs:
+            raise ValueError(f"--half {self.half}: none of the pairs is of that half")
+        rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))
+        text = conditions.conditions_markdown(rows)
+        write_text(self.out / "conditions.md", text)
+        conditions.save_condition_curves(rows, self.out / "conditions.png")
+        print(text, end="")
+        say(f"written: {self.out / 'conditions.md'}")
 
 
 @dataclass

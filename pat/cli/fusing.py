@@ -56,8 +56,10 @@ class Fuse:
     """Memory limit of the whole process, such as 4GiB; larger frames are fused in tiles."""
     normalise_radiometry: bool = False
     """First bring every beta to alpha's mean and contrast (other exposures, filters). Also: --match-levels."""
-    response: Annotated[str | None, options.optional("R,G,B|fit")] = None
-    """How a mono alpha weighs red, green and blue, if not as Rec. 601 luma; fit: from matches, with gain and gamma."""
+    response: Annotated[str, options.arg(metavar="fit|rec601|R,G,B")] = "fit"
+    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
+    align: bool = True
+    """Find how far the other cameras lie off their search segments, and put that right."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -95,6 +97,7 @@ class Fuse:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
+        options.response_of(self.response)
         rig = self._rig()
         files = options.files_by_name(self.image)
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
@@ -159,6 +162,8 @@ class Fuse:
                 max_memory=self.max_memory,
                 match_levels=self.normalise_radiometry,
                 response=options.response_of(self.response),
+                align=self.align,
+                explain=say,
                 store=store,
             )
             view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
@@ -170,8 +175,6 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        if self.response is not None:
-            raise ValueError("--response is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,
@@ -182,6 +185,8 @@ class Fuse:
             speed=self.speed,
             field=options.field_named(self.field),
             match_levels=self.normalise_radiometry,
+            response=options.response_of(self.response),
+            align=self.align,
             max_memory=self.max_memory,
             bits=self.bits,
             kind=self.kind,

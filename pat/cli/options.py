@@ -44,14 +44,16 @@ else:
     FieldName = Literal[("auto", *FIELD_NAMES)]
 
 
-def response_of(text: str | None) -> Any:
-    """The response that `--response fit` or `--response R,G,B` gives. Raises ValueError for anything else."""
-    if text is None or text == "fit":
+def response_of(text: str) -> Any:
+    """What `--response fit`, `rec601` or `R,G,B` states. Raises ValueError for anything else."""
+    if text in ("fit", "rec601"):
         return text
     try:
         red, green, blue = (float(number) for number in text.split(","))
     except ValueError:
-        raise ValueError(f"--response: '{text}' is neither 'fit' nor R,G,B, such as 0.33,0.33,0.33") from None
+        raise ValueError(
+            f"--response: '{text}' is neither 'fit' nor 'rec601' nor R,G,B, such as 0.33,0.33,0.33"
+        ) from None
     return red, green, blue
 
 

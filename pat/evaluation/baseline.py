@@ -109,6 +109,14 @@ def classical_calibrated(
     return (alpha + torch.from_numpy(_warped(difference, to_alpha, wh))[None].to(alpha)).clamp(0, 1)
 
 
+def sgbm_disparity(
+    alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "1 h w"], max_disparity: float
+) -> Float[Tensor, "h w"]:
+    """OpenCV's semi-global matching of a rectified pair, alpha on the left; NaN where it gives nothing."""
+    found = torch.from_numpy(_disparity(to_bytes(alpha[0]), to_bytes(beta[0]), max_disparity))
+    return torch.where(found >= 0, found, torch.nan)
+
+
 class _Plane(NamedTuple):
     """A common image plane: where alpha's and beta's pixels are in it, its size, its disparities."""
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -110,23 +110,29 @@ def rectified_fusion(
     bands: bool = False,
     beta: Callable[[Tensor], Tensor] = lambda beta: beta,
     shuffled: bool = False,
+    **options: Any,
 ) -> StereoMethod:
     """`fuse` with a network as a method, alpha on the left: segments are rows, `max_disparity` pixels long.
 
     With `bands` each channel of beta is a camera. For controls: `beta` is applied to beta before the network gets it,
-    and `shuffled` gives each pixel the segment of another one, drawn at random.
+    and `shuffled` gives each pixel the segment of another one, drawn at random. Other options go to `fuse`.
     """
 
     def fused(alpha: Tensor, given: Tensor, max_disparity: float) -> StereoResult:
         image = beta(given)
         betas = dict(zip("rgb", image.split(1))) if bands else {"beta": image}
         rig = rectified_rig(_hw(alpha), {name: _hw(band) for name, band in betas.items()}, max_disparity)
-        field: ReceptiveField = Rectified(max_disparity, alpha_is="left")
+        field = rectified_field(max_disparity)
         field = ShuffledField(field) if shuffled else field
-        frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=field)
+        frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=field, **options)
         return StereoResult(frame.image, alpha.shape[-1] / frame.depth)
 
     return fused
+
+
+def rectified_field(max_disparity: float) -> ReceptiveField:
+    """Rows of `max_disparity` pixels, alpha on the left."""
+    return Rectified(max_disparity, alpha_is="left")
 
 
 def rectified_rig(hw: HW, betas: Mapping[str, HW], max_disparity: float) -> Rig:

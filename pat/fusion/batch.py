@@ -17,7 +17,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 from rich.console import Console
@@ -86,6 +86,8 @@ class Batch:
     speed: float | None = None
     field: ReceptiveField | None = None
     match_levels: bool = False
+    response: Literal["fit", "rec601"] | tuple[float, float, float] = "fit"
+    align: bool = True
     max_memory: str | None = None
     bits: int = 8
     kind: ImageFormat = "png"
@@ -120,6 +122,8 @@ class Batch:
             "speed": self.speed,
             "field": repr(self.field),
             "match_levels": self.match_levels,
+            "response": self.response if isinstance(self.response, str) else list(self.response),
+            "align": self.align,
             "alone": self.alone,
             "bits": self.bits,
             "kind": self.kind,
@@ -218,6 +222,8 @@ class Batch:
             entries["files"] = {name: [Path(file) for file in files] for name, files in entries["files"].items()}
             entries["out"] = Path(entries["out"])
             entries["field"] = field_of(entries["field"])
+            if not isinstance(entries["response"], str):
+                entries["response"] = tuple(entries["response"])
             return cls(**entries)
         except (AttributeError, KeyError, RecursionError, TypeError, ValueError) as error:
             raise ValueError(f"{source}: not a plan of this program ({error}): start the job again") from None
@@ -235,6 +241,8 @@ class Batch:
             self.speed,
             self.field,
             self.match_levels,
+            self.response,
+            self.align,
             options,
         )
 
@@ -272,6 +280,8 @@ class Batch:
                 field=self.field,
                 max_memory=self.max_memory,
                 match_levels=self.match_levels,
+                response=self.response,
+                align=self.align,
             )
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)

@@ -41,14 +41,11 @@ def check_bands(network: FusionNetwork, rig: Rig, bands: Mapping[str, int]) -> N
     """
     wanted = network.config.bands if isinstance(network, GuidedPAT) else None
     total = sum(bands.values())
-    if wanted is None or total == wanted:
+    if wanted is None or total == wanted or wanted in bands.values():
         return
-    colours = [name for name, count in bands.items() if count == 3]
     listed = ", ".join(f"'{name}' {count}" for name, count in bands.items())
     advice = ""
-    if wanted == 3 and len(colours) > 1:
-        advice = f"give one of the colour cameras {' and '.join(map(repr, colours))} alone, or "
-    elif wanted == 3 and total == 1:
+    if wanted == 3 and total == 1:
         said = ", and the rig says that it is in colour" if rig[next(iter(bands))].sensor.response == "rgb" else ""
         advice = f"its image is grey{said}: give one in colour, or "
     raise ValueError(

@@ -12,13 +12,15 @@ from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
-from .inputs import frame_inputs
-from .response import Given, with_response
+from .corrections import Corrections, find_corrections
+from .inputs import FrameInputs, background_filled, frame_inputs
+from .response import Given
 from .results import Frame
 from .steps import steps_for
 from .tiles import Plan, fused_in_tiles, plan_frame
 from .views import Views
 
+Undo = Callable[[Frame], Frame]
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
@@ -33,7 +35,10 @@ def fuse(
     field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
     max_memory: float | str | None = None,
     match_levels: bool = False,
-    response: Given | None = None,
+    response: Given = "fit",
+    align: bool = True,
+    corrections: Corrections | None = None,
+    explain: Callable[[str], None] | None = None,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
@@ -58,9 +63,12 @@ def fuse(
             is nothing else in it. Default: no limit.
         match_levels: bring each beta to alpha's mean and standard deviation first, for cameras whose exposures or
             filters differ and which are not radiometrically calibrated.
-        response: how alpha weighs red, green and blue of its one colour beta (three numbers), where that is not Rec.
-            601 luma: a mono sensor without a filter, for instance; "fit" fits it, a gain and a gamma to matches. The
-            result then has alpha as this combination of its colours.
+        response: how alpha weighs red, green and blue of its one colour beta. "fit" fits it to matches, with a gain and
+            a gamma, and leaves it at Rec. 601 luma ("rec601") where that explains the images as well; three numbers
+            state it. The result has alpha as this combination of its colours.
+        align: find how far the betas lie across their search segments, and put that right.
+        corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
+        explain: called with a line for each thing that was found and put right.
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
@@ -75,22 +83,52 @@ def fuse(
             `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
     limit = None if max_memory is None else parse_bytes(max_memory)
-    views, undo = Views.of(rig, images, alpha=alpha, depth=depth, field=field), []
-    check_bands(network, rig, {name: len(views.images[name]) for name in views.betas})
-    for name in views.betas:
-        warn_of_grey(name, views.images[name])
-    for step in steps_for(network, normalise=match_levels):
-        views, back = step.do(views)
-        undo.append(back)
-    inputs = frame_inputs(network, views)
+    views = Views.of(rig, images, alpha=alpha, depth=depth, field=field)
+    inputs, undo = _prepared(network, views, match_levels)
     plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
     if announce:
         announce(plan)
-    inputs, back = with_response(inputs, response)
-    undo.append(back)
+    found = corrections or find_corrections(network, inputs, response, align=align)
+    if explain:
+        for line in found.described(views.betas, inputs.hw):
+            explain(line)
+    inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
     state = network.prepare(inputs.inputs)
     frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
     warn_of_confidence(network, frame, inputs)
-    for back in reversed(undo):
+    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
+    for back in (found.undone, *undo):
         frame = back(frame)
     return frame
+
+
+def corrections_of(
+    network: FusionNetwork,
+    rig: Rig,
+    images: Images,
+    *,
+    alpha: str,
+    depth: tuple[float, float] | None = None,
+    field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
+    match_levels: bool = False,
+    response: Given = "fit",
+    align: bool = True,
+) -> Corrections:
+    """What `fuse` finds and puts right before it fuses; give it to `fuse` for other frames of the same cameras.
+
+    Arguments and errors are as of `fuse`.
+    """
+    views = Views.of(rig, images, alpha=alpha, depth=depth, field=field)
+    return find_corrections(network, _prepared(network, views, match_levels)[0], response, align=align)
+
+
+def _prepared(network: FusionNetwork, views: Views, normalise: bool) -> tuple[FrameInputs, list[Undo]]:
+    """The network's inputs, and how the frame is taken back to the views, the last step first."""
+    check_bands(network, views.rig, {name: len(views.images[name]) for name in views.betas})
+    for name in views.betas:
+        warn_of_grey(name, views.images[name])
+    undo: list[Undo] = []
+    for step in steps_for(network, normalise=normalise):
+        views, back = step.do(views)
+        undo.insert(0, back)
+    return frame_inputs(network, views), undo

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom import Moved, Pair, Segments, depth_from_track, pixel_grid
+from arraygeom.epipolar import Track
 from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
@@ -30,6 +31,15 @@ class Placement(NamedTuple):
 
     pair: Pair
     points: Callable[[Tensor], Tensor]
+
+    @property
+    def has_depth(self) -> bool:
+        """Whether positions in beta give depth."""
+        return self.pair.link is None and self.pair.calibrated
+
+    def track(self, x: Float[Tensor, "*n 2"]) -> Track:
+        """The tracks in beta of alpha's pixels."""
+        return pinhole_track(self.pair, self.points(x))
 
 
 class FrameInputs(NamedTuple):
@@ -52,9 +62,10 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
-        betas.append(Beta(padded(views.images[name][None], m), on_grid))
+        place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x)
+        betas.append(Beta(padded(views.images[name][None], m), on_grid, track=place.track if place.has_depth else None))
         _check_overlap(on_grid, pair, name)
-        placements.append(Placement(pair, field.points if isinstance(field, Moved) else lambda x: x))
+        placements.append(place)
     return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo), placements, hw)
 
 
@@ -91,7 +102,7 @@ def _within(where: Float[Tensor, "h w 2"], segments: Segments) -> Float[Tensor, 
 def depth_and_confidence(
     output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
 ) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
-    """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the least confidence.
+    """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the image's confidence.
 
     A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel beyond the
     far end may otherwise stand for any distance.
@@ -101,10 +112,10 @@ def depth_and_confidence(
     like = output.position[0]
     x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
     total, weights = like.new_zeros(2, h, w)
-    for beta, (pair, points), position, confidence in zip(part.betas, placements, output.position, output.confidence):
-        if pair.link is not None or not pair.calibrated:
+    for beta, place, position, confidence in zip(part.betas, placements, output.position, output.confidence):
+        if not place.has_depth:
             continue
-        track, offset = pinhole_track(pair, points(x)), like.new_tensor(beta.offset)
+        pair, track, offset = place.pair, place.track(x), like.new_tensor(beta.offset)
         where = position[0, :, :h, :w].movedim(0, -1)
         found = depth_from_track(track, (where + offset).reshape(-1, 2))
         if beta.field.pixels is not None and pair.depth is not None:
@@ -118,4 +129,41 @@ def depth_and_confidence(
         weights = weights + weight
     known = weights > 0
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
-    return depth.to(output.image), torch.stack([c[0, :h, :w] for c in output.confidence]).amin(0)
+    overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
+    return depth.to(output.image), overall[0, :h, :w]
+
+
+LOST = 0.3
+"""Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
+
+
+def background_filled(
+    depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], inputs: Inputs
+) -> Float[Tensor, "h w"]:
+    """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
+
+    What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
+    are above or below alpha. What is unknown stays NaN.
+    """
+    steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
+    if not steps:
+        return depth
+    apart = torch.stack([(part.end - part.start).abs().mean((0, 1, 2)) for part in steps]).sum(0)
+    along_rows = bool(apart[0] >= apart[1])
+    inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
+    known = (confidence >= LOST) & depth.isfinite()
+    if not along_rows:
+        inverse, known = inverse.mT, known.mT
+    before = _nearest_known(inverse, known)
+    after = _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1)
+    beside = torch.fmin(before, after)
+    found = torch.where(known | beside.isnan(), inverse, beside)
+    found = found if along_rows else found.mT
+    return torch.where(depth.isfinite() & (found > 0), 1 / found, depth)
+
+
+def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
+    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
+    last = torch.where(known, columns, -1).cummax(1).values
+    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)

@@ -2,67 +2,76 @@
 
 The network compares alpha with Rec. 601 luma of beta and keeps alpha as the result's luma. A real mono sensor weighs
 red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter. Here alpha is explained
-as gain * weights . beta^gamma over points that match, and beta is mapped so that its luma is that: scaled, raised to
+as weights . (gain * beta^gamma) over points that match, and beta is mapped so that its luma is that: scaled, raised to
 the power, and sheared along grey, so that neutral stays neutral. The fused image is sheared back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
 
-from ..media.colour import REC601, luminance
-from ..networks.protocol import Inputs
-from ..networks.semi_global import FINE, Normalisations, at_matches, is_consistent, matched_at_half_size
-from ..networks.spectral_mix import reduced
-from .inputs import FrameInputs
-from .results import Frame
+from arraygeom import pixel_grid
+
+from ..media.colour import REC601
 
 GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
 
 
 class ResponseSettings(NamedTuple):
-    """Constants of the fit, chosen on Middlebury's Bowling1, Cloth1, Flowerpots, Midd1, Plastic and Wood1.
+    """Constants of the fit, chosen on Middlebury's Bowling1 and 2, Cloth1, 2 and 4, Flowerpots, Midd1, Plastic, Wood1.
 
-    prior: standard deviation of the weights (their sum is 1) about Rec. 601's, before anything is fitted.
-    correlated: pixels that count as one independent observation.
-    points: pixels used at most.
-    floor: residual of alpha at which a pixel counts half, at least.
-    least_change: root mean square change of the luma below which the weights are left at Rec. 601's: wrong matches and
-        light that differs between the views make as much.
-    least_gain: logarithm of the gain below which beta's scale is left as it is.
-    better: the error of another gamma than 1, over that of 1, up to which it is taken.
+    prior: standard deviation of the weights about Rec. 601's (where their sum is 1), before anything is fitted.
+    independent: how many independent observations all points count as: as many as there are materials, about.
+    error: standard deviation of one of those, at least: light and surfaces differ between the views.
+    outlier: residuals of this many robust deviations count half.
+    points: pixels used at most, and the fewest that are enough.
+    least_change: root mean square change of luma below which the weights are left at Rec. 601's, usually, and where
+        there is a gamma or a gain that is poorly known: wrong matches and light that differs between the views make
+        as much.
+    known: relative standard deviation of the weights' sum up to which it is well known. In a scene of one hue it is
+        not: there another exposure is as good an explanation as another response.
+    least_gain: logarithm of the weights' sum below which it is not taken for another exposure, where the sum is well
+        known and where not.
+    better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
+    least_shading: largest logarithm of vignetting below which there is none.
+    explained: share of alpha's variance that must be explained.
     """
 
     prior: float = 0.15
-    correlated: float = 40.0
-    points: int = 8000
-    floor: float = 0.04
-    least_change: float = 0.0205
-    least_gain: float = 0.1
-    better: float = 0.97
+    independent: float = 30.0
+    error: float = 0.012
+    outlier: float = 2.0
+    points: tuple[int, int] = (6000, 300)
+    least_change: tuple[float, float] = (0.0125, 0.033)
+    known: float = 0.015
+    least_gain: tuple[float, float] = (0.04, 0.18)
+    better: float = 0.8
+    least_shading: float = 0.08
+    explained: float = 0.5
 
 
 SETTINGS = ResponseSettings()
 
 
 class Response(NamedTuple):
-    """alpha = gain * weights . beta^gamma, where the three weights add up to 1.
+    """alpha = weights . (gain * shaded beta^gamma).
 
+    The weights' sum is near 1; where it is not 1, light differs between the views.
     explained: the share of alpha's variance at the matches that this explains, 0 to 1.
+    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none without.
     """
 
     weights: Float[Tensor, "3"]
     gain: float = 1.0
     gamma: float = 1.0
-    explained: float = 0.0
+    explained: float = 1.0
+    shading: tuple[float, ...] = ()
 
     @classmethod
     def rec601(cls) -> Response:
@@ -72,39 +81,44 @@ class Response(NamedTuple):
     @property
     def is_rec601(self) -> bool:
         """Whether images need not be changed."""
-        return self.gain == self.gamma == 1.0 and self.weights.tolist() == list(REC601)
+        return self.gain == self.gamma == 1.0 and not self.shading and self.weights.tolist() == list(REC601)
 
-    def applied(self, beta: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
-        """Beta on alpha's scale, sheared along grey so that its Rec. 601 luma is what alpha sees."""
-        scaled = self.gain * (beta if self.gamma == 1 else beta.clamp(min=0) ** self.gamma)
+    def __str__(self) -> str:
+        red, green, blue = self.weights.tolist()
+        gain = "" if self.gain == 1 else f" x {self.gain:.2f}"
+        gamma = "" if self.gamma == 1 else f" of beta to the power {self.gamma:g}"
+        shading = ", of beta freed of vignetting" if self.shading else ""
+        return f"alpha is {red:.2f} R + {green:.2f} G + {blue:.2f} B{gain}{gamma}{shading}"
+
+    def of_alpha(self, alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
+        """Alpha on the scale of `of_beta`'s luma."""
+        total = float(self.weights.sum())
+        return alpha if total == 1 else alpha / total
+
+    def of_beta(self, beta: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is what alpha sees."""
+        even = beta * self._brightening(beta) if self.shading else beta
+        scaled = self.gain * (even if self.gamma == 1 else even.clamp(min=0) ** self.gamma)
         return scaled + self._shear(scaled)
 
+    def _brightening(self, beta: Tensor) -> Float[Tensor, "h w"]:
+        h, w = beta.shape[-2:]
+        grid = pixel_grid((h, w), dtype=torch.float64, device=beta.device) + 0.5
+        where = (grid / grid.new_tensor([w, h]) - 0.5).reshape(-1, 2)
+        terms = _shading_terms(where)
+        return (terms.new_tensor(self.shading) @ terms).exp().reshape(h, w).to(beta)
+
     def undone(self, image: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
-        """The fused image sheared back: the weights' combination of its colours is what its luma was."""
+        """The fused image sheared back: the weights' combination of its colours is alpha."""
         return image - self._shear(image)
 
     def _shear(self, image: Tensor) -> Tensor:
-        change = (self.weights - self.weights.new_tensor(REC601)).to(image)
+        change = (self.weights / self.weights.sum() - self.weights.new_tensor(REC601)).to(image)
         return (image * change[:, None, None]).sum(-3, keepdim=True)
 
 
-Given = Literal["fit"] | tuple[float, float, float]
+Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 """What is known of alpha's response: its weights of red, green and blue, or that it is to be fitted."""
-
-
-def with_response(frame: FrameInputs, given: Given | None) -> tuple[FrameInputs, Callable[[Frame], Frame]]:
-    """The inputs with beta as alpha's response sees it, and how the fused frame is taken back.
-
-    Raises ValueError for a response that is not three weights, none negative, or where there is not one RGB beta.
-    """
-    if given is None:
-        return frame, lambda fused: fused
-    if [beta.image.shape[1] for beta in frame.inputs.betas] != [3]:
-        raise ValueError("a response is of one RGB beta: leave it out for several betas, or for bands of another kind")
-    response = fitted_response(frame.inputs) if given == "fit" else stated_response(given)
-    (beta,) = frame.inputs.betas
-    inputs = replace(frame.inputs, betas=(replace(beta, image=response.applied(beta.image)),))
-    return frame._replace(inputs=inputs), lambda fused: fused._replace(image=response.undone(fused.image))
 
 
 def stated_response(weights: Sequence[float]) -> Response:
@@ -115,71 +129,112 @@ def stated_response(weights: Sequence[float]) -> Response:
     return Response(values / values.sum(), gain=float(values.sum()))
 
 
-@torch.no_grad()
-def fitted_response(inputs: Inputs) -> Response:
-    """The response of alpha (1, 1, H, W) in the bands of the one beta (1, 3, Hb, Wb), from matches at half size."""
-    alpha, (beta,) = inputs.alpha, inputs.betas
-    segments, blocks = (reduced(beta.field.of_blocks(side), FINE) for side in (FINE, FINE * FINE))
-    own, bands = avg_pool2d(alpha, FINE), avg_pool2d(beta.image, FINE)
-    normalisations = Normalisations.of(own, luminance(bands))
-    disparity, facts = matched_at_half_size(own, luminance(bands), blocks, normalisations.half)
-    values, valid = at_matches(bands, segments, disparity)
-    matched = (valid * is_consistent(facts))[0, 0] > 0
-    return fit(values[0][:, matched], normalisations.whole.softened(own)[0, 0][matched])
+def fit(
+    bands: Float[Tensor, "3 n"],
+    alpha: Float[Tensor, " n"],
+    where: Float[Tensor, "n 2"] | None = None,
+    settings: ResponseSettings = SETTINGS,
+) -> Response:
+    """The response by robust least squares over points, drawn towards Rec. 601 as far as the scene is grey.
 
-
-def fit(bands: Float[Tensor, "3 n"], alpha: Float[Tensor, " n"], settings: ResponseSettings = SETTINGS) -> Response:
-    """The response by robust least squares over points, drawn towards Rec. 601 as far as the scene is grey."""
-    step = max(alpha.numel() // settings.points, 1)
+    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found too. Rec.
+    601's where there are too few points, or where a combination of bands does not explain alpha.
+    """
+    most, fewest = settings.points
+    step = max(alpha.numel() // most, 1)
     x, y = bands[:, ::step].double(), alpha[::step].double()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
     x, y = x[:, unclipped], y[unclipped]
-    if len(y) < 300:
+    if len(y) < fewest:
         return Response.rec601()
+    gamma, found = _best_gamma(x, y, settings)
+    shading: tuple[float, ...] = ()
+    if where is not None:
+        terms = _shading_terms(where[::step][unclipped].double())
+        slopes = _shading(x, y, terms, settings)
+        even = x * (slopes @ terms).exp()
+        other_gamma, other = _best_gamma(even, y, settings)
+        if other.error < settings.better * found.error and float((slopes @ terms).abs().max()) > settings.least_shading:
+            x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
+    if found.explained < settings.explained:
+        return Response.rec601()
+    return _decided(x**gamma, y, gamma, found, settings)._replace(shading=shading)
+
+
+def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
+    """1, or the gamma that explains alpha clearly better."""
     trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in GAMMAS}
     gamma = min(trials, key=lambda g: trials[g].error)
-    if trials[gamma].error > settings.better * trials[1.0].error:
-        gamma = 1.0
-    found, x = trials[gamma], x**gamma
-    gain = float((found.share @ y.square() / (found.share @ (found.weights @ x).square())).sqrt())
-    gain = gain if abs(math.log(gain)) > settings.least_gain or gamma != 1 else 1.0
-    rec601 = Response.rec601().weights
-    change = float(gain * ((found.weights - rec601) @ x).square().mean().sqrt())
-    weights = found.weights if change > settings.least_change else rec601
-    return Response(weights, gain, gamma, found.explained)
+    gamma = gamma if trials[gamma].error <= settings.better * trials[1.0].error else 1.0
+    return gamma, trials[gamma]
+
+
+def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
+    """What vignetting, off its centre too, is made of: 0 in the middle of the image."""
+    u, v = where.unbind(-1)
+    return torch.stack([u, v, u * u, u * v, v * v])
+
+
+def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
+    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's weights."""
+    slopes = terms.new_zeros(len(terms))
+    design = torch.cat([terms, torch.ones_like(terms[:1])])
+    for _ in range(3):
+        even = x * (slopes @ terms).exp()
+        found = _weighted_fit(even, y, settings)
+        ratio = (y / (found.weights @ even).clamp(min=0.01)).log()
+        counts = found.share * y.square()
+        ridge = 1e-4 * counts.sum() * torch.eye(len(design)).to(y)
+        slopes = slopes + torch.linalg.solve((design * counts) @ design.T + ridge, (design * counts) @ ratio)[:-1]
+    return slopes
 
 
 class _Fit(NamedTuple):
+    """`deviation` is the relative standard deviation of the weights' sum."""
+
     weights: Tensor
     share: Tensor
     error: float
     explained: float
+    deviation: float
+
+
+def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> Response:
+    """The response of a fit: its gain apart if it is one, and Rec. 601's weights if hardly anything changes."""
+    rec601, gain = Response.rec601().weights, float(found.weights.sum())
+    unknown = found.deviation > settings.known
+    exposed = gamma != 1 or abs(math.log(gain)) > settings.least_gain[unknown]
+    gain = gain if exposed else 1.0
+    weights = found.weights / gain
+    change = gain * float(((weights - rec601) @ x).square().mean().sqrt())
+    if change < settings.least_change[gamma != 1 or (exposed and unknown)]:
+        luma = rec601 @ x
+        gain = float((found.share * luma) @ y / ((found.share * luma) @ luma)) if exposed else 1.0
+        weights = rec601
+    return Response(weights, gain, gamma, found.explained)
 
 
 def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
-    """Weights that sum to 1, by iteratively reweighted least squares about the means, with Cauchy's weights.
+    """Weights s (Rec. 601's + d), d's sum 0, by iteratively reweighted least squares with Cauchy's weights.
 
-    Both sides are noisy: the gain is the ratio of the deviations, not a slope. The error is robust, and grows with an
-    offset, which exposure and tone curve do not have.
+    Nothing is assumed of s; d is drawn to 0.
     """
     rec601 = Response.rec601().weights
     free = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
-    prior = free.T @ free / settings.prior**2
-    weights, share, variance = rec601, torch.ones_like(y), 0.05**2
-    for _ in range(6):
-        total = share.sum()
-        middle, centre = x @ share / total, y @ share / total
-        dx, dy = x - middle[:, None], y - centre
-        gain = ((share @ dy.square()) / (share @ (weights @ dx).square()).clamp(min=1e-12)).sqrt()
-        chroma, rest = free.T @ dx, dy / gain - rec601 @ dx
-        noise = settings.correlated * variance
-        normal = (share * chroma) @ chroma.T / noise + prior
-        weights = rec601 + free @ torch.linalg.solve(normal, (share * chroma) @ rest / noise)
-        rest = dy - gain * (weights @ dx)
-        scale = max(3 * float(rest.abs().median()), settings.floor)
-        share = 1 / (1 + (rest / scale).square())
-        variance = float(share @ rest.square() / share.sum() / gain**2) + 1e-9
-    offset = float(centre - gain * (weights @ middle))
-    error = float(torch.log1p((rest / settings.floor).square()).mean()) + 2 * offset**2
-    explained = 1 - float(share @ rest.square() / (share @ dy.square()).clamp(min=1e-12))
-    return _Fit(weights, share, error, max(explained, 0.0))
+    design = torch.stack([rec601 @ x, *(free.T @ x)])
+    weights, share = rec601 * (y.median() / (rec601 @ x).median()), torch.ones_like(y)
+    for _ in range(8):
+        rest = y - weights @ x
+        deviation = max(1.4826 * float(rest.abs().median()), 1e-3)
+        share = 1 / (1 + (rest / (settings.outlier * max(deviation, settings.error / 3))).square())
+        counts = share * (settings.independent / share.sum() / max(deviation, settings.error) ** 2)
+        prior = torch.zeros(3, 3, dtype=torch.float64)
+        prior[1:, 1:] = free.T @ free / (settings.prior * float(weights.sum())) ** 2
+        covariance = torch.linalg.inv((design * counts) @ design.T + prior)
+        scale, *change = covariance @ ((design * counts) @ y)
+        weights = scale * rec601 + free @ torch.stack(change)
+    rest = y - weights @ x
+    centred = y - share @ y / share.sum()
+    explained = 1 - float(share @ rest.square() / (share @ centred.square()).clamp(min=1e-12))
+    error = float(torch.log1p((rest / 0.02).square()).mean())
+    return _Fit(weights, share, error, max(explained, 0.0), float(covariance[0, 0].sqrt() / scale))

@@ -13,7 +13,7 @@ import dataclasses
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -27,8 +27,10 @@ from arraygeom.fields import default_field
 
 from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
-from .fuse import fuse
+from .corrections import Corrections
+from .fuse import corrections_of, fuse
 from .optical_flow import flow_between, still, warped
+from .response import Given, Response
 from .results import Frame
 from .views import grey_alpha, read_view
 
@@ -191,6 +193,8 @@ class SequenceFusion:
     speed: float | None = None
     field: ReceptiveField | None = None
     match_levels: bool = False
+    response: Given = "fit"
+    align: bool = True
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -286,7 +290,39 @@ class SequenceFusion:
             alpha=self.alpha,
             field={**common, **fields},
             match_levels=alone,
+            corrections=self._corrections,
             **self.options,
+        )
+
+    @cached_property
+    def _corrections(self) -> Corrections:
+        """What is put right in every frame: found once, near the middle, so that nothing flickers.
+
+        At the key frame nearest to the middle whose images can be read: what cannot is reported when it is fused. Betas
+        that did not record at alpha's time are not aligned: motion too moves points off their segments.
+        """
+        keys = self.timeline.key_frames()
+        for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
+            try:
+                return self._found_at(key)
+            except (OSError, ValueError):
+                continue
+        return Corrections(Response.rec601())
+
+    def _found_at(self, key: KeyFrame) -> Corrections:
+        images = {name: self.frames[name][j] for name, j in key.betas.items()}
+        gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())
+        together = all(abs(gap) * self.timeline.rate(self.alpha) < SYNCHRONOUS for gap in gaps)
+        return corrections_of(
+            self.network,
+            self.rig,
+            {self.alpha: self.grey(key.alpha), **images},
+            alpha=self.alpha,
+            depth=self.options.get("depth"),
+            field=self.field,
+            match_levels=self.match_levels,
+            response=self.response,
+            align=self.align and together,
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
@@ -341,12 +377,15 @@ def fuse_sequence(
     speed: float | None = None,
     field: ReceptiveField | None = None,
     match_levels: bool = False,
+    response: Given = "fit",
+    align: bool = True,
     **options: Any,
 ) -> Iterator[Frame]:
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
-        network: as of `fuse`, and so are `field`, `match_levels` and other options (`depth`, `max_memory`).
+        network: as of `fuse`, and so are `field`, `match_levels`, `response`, `align` (both found once, at the key
+            frame in the middle) and other options (`depth`, `max_memory`).
         rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
         frames: by camera name, in the order of time. Cameras without are left out.
         alpha: the camera whose frames are wanted.
@@ -355,7 +394,7 @@ def fuse_sequence(
 
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """
-    job = SequenceFusion(network, rig, frames, alpha, speed, field, match_levels, options)
+    job = SequenceFusion(network, rig, frames, alpha, speed, field, match_levels, response, align, options)
     keys = job.timeline.key_frames()
 
     @lru_cache(maxsize=2 * int(INTERVALS) + 1)

@@ -100,8 +100,8 @@ class LinearLuminance:
     """The result as bright as alpha's camera saw it, if that measured the luminance of light (`as_bright`)."""
 
     def do(self, views: Views) -> Done:
-        """Leave the views as they are; undone, one colour beta's frame is made as bright as alpha."""
-        if [views.images[name].shape[0] for name in views.betas] != [3]:
+        """Leave the views as they are; undone, a frame in the colours of RGB betas is made as bright as alpha."""
+        if 3 not in [views.images[name].shape[0] for name in views.betas]:
             return Done(views, _as_it_is)
         own, sensor = views.own, views.rig[views.alpha].sensor
         return Done(views, lambda frame: frame._replace(image=as_bright(frame.image, own, sensor)))
@@ -168,11 +168,11 @@ class JoinBands:
 
     def do(self, views: Views) -> Done:
         """Concatenate the bands of co-located betas under the first one's name."""
-        names = views.betas
+        names, bands = views.betas, {name: len(views.images[name]) for name in views.betas}
         groups = co_located(views.rig, names, views.fields, self.which)
-        if len(groups) == len(names):
+        if len(groups) == len(names) or (self.which == "neighbours" and 3 in bands.values()):
             return Done(views, _as_it_is)
-        order = _band_order(names, groups, {name: views.images[name].shape[0] for name in names})
+        order = _band_order(names, groups, bands)
         joined = {group[0]: torch.cat([views.images[name] for name in group]) for group in groups}
         done = Views(views.rig, {views.alpha: views.own, **joined}, views.alpha, views.fields)
         return Done(done, lambda frame: frame._replace(image=frame.image[order]))

@@ -9,7 +9,7 @@ pixels of high confidence to the others, and adds it to alpha.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -24,7 +24,18 @@ from ..media.colour import luminance
 from .blocks import ResidualBlock, conv, enlarge
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
-from .semi_global import FILLS, FINE, Normalisations, SemiGlobalMatches, along, matches, semi_global_matching
+from .semi_global import (
+    FILLS,
+    FINE,
+    Normalisations,
+    SemiGlobalMatches,
+    along,
+    diffused_from,
+    matched_colours,
+    matches,
+    semi_global_matching,
+)
+from .several import agreed, can_agree
 
 COARSE = 4
 """Context is computed at a quarter of the size."""
@@ -64,6 +75,7 @@ class BetaEstimate(NamedTuple):
     diffused: (B, fills, C, H, W), the same diffused within alpha from pixels of high weight.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
     choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of `diffused`.
+    position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut there.
     """
 
     attended: Attended
@@ -71,6 +83,12 @@ class BetaEstimate(NamedTuple):
     diffused: Tensor
     logit: Tensor
     choice: Tensor
+    position: Tensor
+
+    @property
+    def confidence(self) -> Float[Tensor, "b h w"]:
+        """That `colour` is of the point that alpha sees, 0 to 1."""
+        return self.logit[:, 0].sigmoid() * (self.attended.peak > 0)
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
@@ -86,7 +104,9 @@ class Encoded(NamedTuple):
 
 
 class GuidedPAT(nn.Module):
-    """Any number of betas whose bands, in order, are the output's: one RGB camera, or three with filters.
+    """Betas whose bands, in order, are the output's: three cameras with filters, or any number of RGB cameras.
+
+    Other betas beside those with all bands help to find depth.
 
     Betas are to be of about alpha's angular resolution (enlarge or reduce them with the rig), and all sizes
     multiples of 16.
@@ -114,8 +134,35 @@ class GuidedPAT(nn.Module):
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
     def prepare(self, inputs: Inputs) -> Prepared:
-        """Semi-global matches of each beta, and how its whole image is normalised."""
-        return prepared(inputs, _normalisations, _matches)
+        """Semi-global matches of each beta, and how its whole image is normalised.
+
+        Betas that each have all bands agree on depth, and share the colour that is diffused.
+        """
+        found = prepared(inputs, _normalisations, _matches)
+        if not can_agree(inputs) or self._in_parts(inputs):
+            return found
+        return replace(found, matches=self._shared(inputs, found))
+
+    def _in_parts(self, inputs: Inputs) -> bool:
+        """Whether each beta has some of the bands, in order; else those with all of them show the same colours."""
+        return all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
+
+    @torch.no_grad()
+    def _shared(self, inputs: Inputs, found: Prepared) -> tuple[SemiGlobalMatches, ...]:
+        """The matches with the depth on which all betas agree, and colour diffused from all that have all bands."""
+        alpha, agreement = inputs.alpha, agreed(inputs, found.matches)
+        colours = [
+            matched_colours(alpha, brightness(b.image), b.image, b.field.straight, *where, normalisations.whole)
+            for b, where, normalisations in zip(inputs.betas, agreement, found.common)
+        ]
+        full = [(m, w) for m, w in colours if m.shape[1] == self.config.bands]
+        weights = torch.stack([weight for _, weight in full])
+        mixed = (weights * torch.stack([m for m, _ in full])).sum(0) / weights.sum(0)
+        diffused = diffused_from(mixed, alpha, weights.amax(0))
+        return tuple(
+            SemiGlobalMatches(*where, matched, diffused if matched.shape[1] == self.config.bands else own.colour)
+            for where, (matched, _), own in zip(agreement, colours, found.matches)
+        )
 
     def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
@@ -126,16 +173,19 @@ class GuidedPAT(nn.Module):
 
     def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
+        parts = self._in_parts(inputs)
         bands = sum(beta.image.shape[1] for beta in inputs.betas)
-        if bands != self.config.bands:
+        if parts and bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
         alpha, state = inputs.alpha, state or self.prepare(inputs)
         own = self.encoder(alpha)
         estimates = [self.estimate(own, alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
-        residual = self.blended(own, alpha, estimates)
+        used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
+        residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - luminance(residual)
-        return output_of(alpha + residual, estimates), estimates
+        output = output_of(alpha + residual, estimates)
+        return (output if parts else output._replace(overall=used[0].confidence)), estimates
 
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
@@ -184,7 +234,8 @@ class GuidedPAT(nn.Module):
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
         colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
-        return BetaEstimate(attended, colour, found.colour, logit, choice)
+        position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
+        return BetaEstimate(attended, colour, found.colour, logit, choice, position)
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -203,9 +254,31 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
     """The image with the position in each beta, its deviation, and its confidence."""
     return FusionOutput(
         image,
-        [s.attended.position for s in estimates],
+        [s.position for s in estimates],
         [s.attended.deviation for s in estimates],
-        [s.logit[:, 0].sigmoid() * (s.attended.peak > 0) for s in estimates],
+        [s.confidence for s in estimates],
+    )
+
+
+def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
+    """The estimate of several betas with the same bands: what each shows, weighted by its odds of being right."""
+    if len(estimates) == 1:
+        return estimates[0]
+    logits = torch.stack([e.logit for e in estimates])
+    weights = logits.softmax(0)
+
+    def mean(parts: Sequence[Tensor]) -> Tensor:
+        return sum(w * p for w, p in zip(weights, parts)) + torch.zeros_like(parts[0])
+
+    first = estimates[0]
+    peak = torch.stack([e.attended.peak for e in estimates]).amax(0)
+    return BetaEstimate(
+        first.attended._replace(peak=peak),
+        mean([e.colour for e in estimates]),
+        mean([e.diffused.transpose(0, 1) for e in estimates]).transpose(0, 1),
+        logits.amax(0),
+        mean([e.choice for e in estimates]),
+        first.position,
     )
 
 

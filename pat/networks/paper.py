@@ -75,7 +75,8 @@ class PAT(nn.Module):
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
             image = image + self._enlarged(inputs.alpha)
-        return FusionOutput(image, *(list(part) for part in list(zip(*attended))[1:]))
+        _, position, deviation, confidence = (list(part) for part in zip(*attended))
+        return FusionOutput(image, position, deviation, confidence)
 
     def prepare(self, inputs: Inputs) -> None:
         """Nothing: each part of a frame is fused by itself."""

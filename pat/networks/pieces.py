@@ -117,7 +117,7 @@ def prepared(
     common: Callable[[Inputs], Any],
     match: Callable[[Inputs, Any], SemiGlobalMatches],
 ) -> Prepared:
-    """`common` of each beta, and by that its matches."""
+    """`common` of each beta, and by that its matches. Each beta for itself."""
     betas = [inputs.of_beta(i) for i in range(len(inputs.betas))]
     facts = tuple(common(one) for one in betas)
     found = (matched_in_pieces(one, lambda piece, f=f: match(piece, f)) for one, f in zip(betas, facts))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Positions, Segments
+from arraygeom.epipolar import Track
 from arraygeom.fields.grid import Box, FieldOnGrid
 from arraygeom.pixels import HW
 
@@ -20,11 +21,13 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
+    `track` gives the tracks of alpha's pixels (*n, 2) in the whole image of a calibrated beta; None for parts.
     """
 
     image: Float[Tensor, "b c h w"]
     field: FieldOnGrid
     offset: tuple[int, int] = (0, 0)
+    track: Callable[[Tensor], Track] | None = None
 
 
 @dataclass(frozen=True)
@@ -126,12 +129,14 @@ class FusionOutput(NamedTuple):
     position: one (B, 2, H, W) for each beta, where its pixels were found, in beta's pixels.
     deviation: one (B, H, W) for each beta, the standard deviation of that position, in beta's pixels.
     confidence: one (B, H, W) for each beta, 0 to 1: that beta sees the point and that its position is right.
+    overall: (B, H, W), the confidence of the image; None: the least of the betas'.
     """
 
     image: Tensor
     position: list[Tensor]
     deviation: list[Tensor]
     confidence: list[Tensor]
+    overall: Tensor | None = None
 
 
 JoinsBands = Literal["no", "neighbours", "all"]

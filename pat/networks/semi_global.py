@@ -101,11 +101,11 @@ class Normalisation(NamedTuple):
 
     def softened(self, alpha: Tensor) -> Tensor:
         """Alpha (or a part of it), no sharper than beta."""
-        return _blurred(alpha, self.blurs[0])
+        return blurred(alpha, self.blurs[0])
 
     def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
         """Both (or parts of them), the sharper one blurred."""
-        own, other = (_blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
+        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
         return own, other
 
 
@@ -150,9 +150,8 @@ def semi_global_matching(
     """
     normalisations = normalisations or Normalisations.of(alpha, guide)
     disparity, facts = matched_at_half_size(alpha, guide, blocks, normalisations.half)
-    return SemiGlobalMatches(
-        disparity, facts, *_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
-    )
+    matched, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
+    return SemiGlobalMatches(disparity, facts, matched, diffused_from(matched, alpha, weight))
 
 
 def matched_at_half_size(
@@ -165,8 +164,8 @@ def matched_at_half_size(
     found, measured = _matched_blocks(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
     consistent = (measured[..., 0] < CONSISTENT).astype(np.float32)
     planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
-    filled = np.stack([_filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
-    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, filled)])
+    dense = np.stack([filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
+    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, dense)])
     disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
     return disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha)
 
@@ -267,11 +266,13 @@ def equalising_blurs(
 
 def _least_blur(image: Tensor, contrast: float) -> float:
     """The least of `BLURS` after which there is no more contrast than that."""
-    enough = (b for b in (0.0, *BLURS) if float(_contrast(_blurred(image[None], [b])[0])) <= 1.05 * contrast)
+    enough = (b for b in (0.0, *BLURS) if float(_contrast(blurred(image[None], [b])[0])) <= 1.05 * contrast)
     return next(enough, BLURS[-1])
 
 
-def _blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+    """Each blurred with its standard deviation in pixels; 0: as it is."""
+
     def one(image: Tensor, blur: float) -> Tensor:
         return torch.from_numpy(cv2.GaussianBlur(_numpy(image), (0, 0), blur)).to(image) if blur else image
 
@@ -282,16 +283,16 @@ def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
     return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
 
 
-def _colours(
-    alpha: Tensor,
-    guide: Tensor,
-    beta: Tensor,
+def matched_colours(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    disparity: Tensor,
-    facts: Tensor,
+    disparity: Float[Tensor, "b 1 h2 w2"],
+    facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
-) -> tuple[Tensor, Tensor]:
-    """Beta's bands minus alpha at the matches, and the same diffused by weight over what is connected in alpha."""
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+    """Beta's bands minus alpha at the matches, with the detail that alpha has and beta has not; their weight."""
     bands = beta.shape[1]
     seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
     values, own, brightness = seen.split([bands, 1, 1], 1)
@@ -302,7 +303,7 @@ def _colours(
         matched = _detailed(values - own, brightness, alpha) + own - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
-    return matched, diffused_from(matched, alpha, match_weight(brightness - soft, consistent, valid))
+    return matched, match_weight(brightness - soft, consistent, valid)
 
 
 def at_matches(
@@ -339,7 +340,7 @@ def diffused_from(
 
     def as_it_is(i: int) -> None:
         colour, _, weight, like = planes[i]
-        diffused[i, 1] = _filled(colour, weight, like, COLOUR_FILL)
+        diffused[i, 1] = filled(colour, weight, like, COLOUR_FILL)
 
     in_parallel([partial(how, i) for i in range(len(planes)) for how in (along_brightness, as_it_is)])
     return torch.from_numpy(diffused).to(alpha)
@@ -373,17 +374,22 @@ def _regressed(
     The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no beta sees
     has colour that varies with brightness as it does nearby.
     """
-    moments = _filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
+    moments = filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
     mean, square, (middle, product) = moments[0], moments[1], np.split(moments[2:], 2)
     slope = (product - middle * mean) / (np.maximum(square - mean**2, 0) + FLOOR)
     return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
 
 
-def matches(segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels."""
+def matches(
+    segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"], *, beyond_edge: bool = False
+) -> Float[Tensor, "b h w 2"]:
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels.
+
+    Not beyond the segments' near ends, unless `beyond_edge`.
+    """
     length = segments.length
-    far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length)
-    return segments.end + far.clamp(min=0).minimum(length)[..., None] * along(segments)
+    far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length).clamp(min=0)
+    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments)
 
 
 def along(segments: Segments) -> Float[Tensor, "*n 2"]:
@@ -396,7 +402,7 @@ def _enlarged(x: Tensor) -> Tensor:
     return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)
 
 
-def _filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
+def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
     """The weighted mean of planes (c, h, w) over what is connected in the guide. Weights are positive."""
 
     def smooth(plane: NDArray) -> NDArray:

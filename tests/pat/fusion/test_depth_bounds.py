@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from arraygeom import Camera, Epipolar, Pose, Rig, intrinsics
+from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
-from pat.fusion.inputs import Placement, depth_and_confidence
-from pat.networks.protocol import FusionOutput, Inputs
+from pat.fusion.inputs import Placement, background_filled, depth_and_confidence
+from pat.networks.protocol import Beta, FusionOutput, Inputs
 
 NEAR, FAR, HW = 1.4, 20.0, (12, 40)
 
@@ -37,3 +37,27 @@ def test_positions_beyond_a_segment_are_its_ends(share):
         assert depth[seen].isfinite().all()
         assert (depth[seen] > NEAR * 0.999).all()
         assert (depth[seen] < FAR * 1.001).all()
+
+
+def field_along(step):
+    end = torch.zeros(1, 6, 6, 2)
+    segments = Segments(end + torch.tensor(step), end, torch.ones(1, 6, 6, dtype=torch.bool))
+    return Inputs(
+        torch.zeros(1, 1, 6, 6), (Beta(torch.zeros(1, 1, 6, 6), FieldOnGrid(lambda x: segments, 2, segments)),)
+    )
+
+
+@pytest.mark.parametrize("step", [[4.0, 0.0], [0.0, 4.0]])
+def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
+    depth = torch.full((6, 6), 5.0)
+    depth[:, :2] = 2.0
+    depth[:, 2:4] = 1.0  # wrong, and not confident
+    depth[0, 2] = torch.nan
+    confidence = torch.ones(6, 6)
+    confidence[:, 2:4] = 0.1
+    wanted = depth.clone()
+    wanted[:, 2:4] = 5.0
+    wanted[0, 2] = torch.nan
+    if step[1]:
+        depth, confidence, wanted = depth.mT, confidence.mT, wanted.mT
+    torch.testing.assert_close(background_filled(depth, confidence, field_along(step)), wanted, equal_nan=True)

@@ -367,8 +367,9 @@ def test_lenses_of_cameras_known_by_f_are_seen_through():
     links = {("mono", "colour"): Link(pair.fundamental, pair.homography)}
     views = {name: LensView(hw=c.hw, K=c.K, distortion=c.distortion) for name, c in lensed.cameras.items()}
     frame = fuse(network, Rig(views, links=links), taken, alpha="mono")
-    blind = fuse(network, Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links), taken, alpha="mono")
-    clean = fuse(network, Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links), images, alpha="mono")
+    without = Rig({n: View(hw=v.hw) for n, v in views.items()}, links=links)
+    blind = fuse(network, without, taken, alpha="mono", align=False)
+    clean = fuse(network, without, images, alpha="mono")
     errors = [(clean.image - ground_truth).square().mean()]
     ground_truth = resampled(ground_truth, rig["mono"], lensed["mono"]).values[0]
     seen = ground_truth.sum(0) > 0

@@ -20,12 +20,12 @@ def combined(image, weights=WEIGHTS):
 @pytest.mark.parametrize("response", [Response(torch.tensor(WEIGHTS).double()), stated_response((0.1, 0.5, 0.6))])
 def test_neutral_stays_neutral_and_luma_becomes_what_alpha_sees(response):
     image = torch.rand(2, 3, 8, 9, dtype=torch.float64)
-    applied = response.applied(image)
+    applied = response.of_beta(image)
     seen = response.gain * combined(image, response.weights)
     torch.testing.assert_close(luminance(applied), seen)
     torch.testing.assert_close(response.undone(applied), response.gain * image)
     grey = torch.rand(1, 1, 8, 9, dtype=torch.float64).expand(-1, 3, -1, -1)
-    torch.testing.assert_close(response.applied(grey), response.gain * grey)
+    torch.testing.assert_close(response.of_beta(grey), response.gain * grey)
 
 
 @pytest.mark.parametrize("gamma", [0.77, 1.0, 1.3])
@@ -57,8 +57,8 @@ def test_fusion_of_another_response():
         frame = fuse(network, sample.rig, given, alpha=ALPHA, response=response)
         return score(frame.image.clamp(0, 1), sample.ground_truth).psnr, frame
 
-    ideal, _ = psnr(None, images | {ALPHA: luminance(sample.ground_truth)})
-    plain, _ = psnr(None)
+    ideal, _ = psnr("rec601", images | {ALPHA: luminance(sample.ground_truth)})
+    plain, _ = psnr("rec601")
     stated, frame = psnr(WEIGHTS)
     torch.testing.assert_close(combined(frame.image), images[ALPHA], atol=1e-4, rtol=0)
     assert stated > ideal - 1.0

@@ -1,0 +1,227 @@
+"""What cameras and rig are off by, found once a frame from a fusion of reduced images.
+
+A pre-pass fuses the images at half the size or less. Where its matches are of high confidence, alpha's response is
+fitted (`pat.fusion.response`), and how far beta lies across its search segments (`pat.fusion.misalignment`). Both are
+put right before the frame is fused.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import Segments
+from arraygeom.epipolar import Track
+from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.pixels import HW
+from arraygeom.sampling import on_image, sample
+
+from ..networks.bandwise import BandwisePAT
+from ..networks.guided import GuidedPAT, brightness
+from ..networks.protocol import Beta, FusionNetwork, Inputs
+from ..networks.semi_global import Normalisation, blurred
+from ..networks.spectral_mix import reduced
+from .inputs import FrameInputs, padded
+from .misalignment import Misalignment, fit_misalignment, normals
+from .response import Given, Response, fit, stated_response
+from .results import Frame
+
+PIXELS = 400_000
+"""Alpha's pixels in the pre-pass, at most."""
+SMALL = 50_000
+"""Alpha's pixels below which the pre-pass is at full size."""
+CONFIDENT = 0.6
+"""Confidence from which a match counts."""
+BLUR = 1.0
+"""Standard deviation of the blur of what is compared, pixels of the pre-pass."""
+PASSES = 3
+"""Pre-passes at most: matches are better where what was found is put right."""
+SETTLED = 0.25
+"""Change of the largest displacement, pixels of the pre-pass, up to which no other pass is made."""
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Alpha's response, and the misalignment of each beta, in order (none: all are right)."""
+
+    response: Response
+    misalignments: tuple[Misalignment, ...] = ()
+
+    def applied(self, inputs: Inputs, hw: HW) -> Inputs:
+        """The inputs put right; `hw` is alpha's size without padding."""
+        if not self.response.is_rec601:
+            betas = tuple(replace(b, image=self.response.of_beta(b.image)) if _is_rgb(b) else b for b in inputs.betas)
+            inputs = replace(inputs, alpha=self.response.of_alpha(inputs.alpha), betas=betas)
+        moves = self.misalignments or (Misalignment(),) * len(inputs.betas)
+        return replace(
+            inputs,
+            betas=tuple(replace(b, field=m.applied(b.field, hw)) for b, m in zip(inputs.betas, moves, strict=True)),
+        )
+
+    def described(self, betas: Sequence[str], hw: HW) -> list[str]:
+        """A line for each thing that is put right, for betas by name; `hw` is alpha's size."""
+        lines = [] if self.response.is_rec601 else [str(self.response)]
+        for name, move in zip(betas, self.misalignments):
+            if move != Misalignment():
+                off = f"'{name}' is up to {move.largest(hw):.1f} px off its search segments"
+                lines.append(f"{off}: put right for this frame; `pat rig refine` does so for the rig")
+        return lines
+
+    def undone(self, frame: Frame) -> Frame:
+        """The fused frame, whose bands give alpha as the response says."""
+        return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
+
+
+@torch.no_grad()
+def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
+    """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
+
+    Only for networks whose confidence is a trained probability; a response is fitted for RGB betas. Raises
+    ValueError for a stated response that is not three weights, none negative, or where there is no RGB beta.
+    """
+    found = Corrections(_given(response, frame.inputs))
+    judges = isinstance(network, GuidedPAT | BandwisePAT)
+    fits = response == "fit" and judges and any(map(_is_rgb, frame.inputs.betas))
+    align = align and judges and all(beta.field.pixels is not None for beta in frame.inputs.betas)
+    if not fits and not align:
+        return found
+    small = _reduced_frame(frame)
+    found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))
+    for _ in range(PASSES):
+        matches = _matches(network, small, found)
+        response_now = _fitted(small, matches) if fits else found.response
+        steps = [_misaligned(m) for m in matches] if align else [Misalignment()] * len(matches)
+        moves = tuple(before + step for before, step in zip(found.misalignments, steps))
+        found = Corrections(response_now, moves)
+        if all(step.largest(small.hw) <= SETTLED for step in steps):
+            break
+    return found
+
+
+def _given(response: Given, inputs: Inputs) -> Response:
+    if isinstance(response, Response):
+        return response
+    if isinstance(response, str):
+        return Response.rec601()
+    if not any(map(_is_rgb, inputs.betas)):
+        raise ValueError("a response is of RGB betas: leave it out for bands of another kind")
+    return stated_response(response)
+
+
+def _is_rgb(beta: Beta) -> bool:
+    return beta.image.shape[1] == 3
+
+
+def _reduced_frame(frame: FrameInputs) -> FrameInputs:
+    """The frame at a half, a quarter, ... of its size."""
+    pixels, inputs = math.prod(frame.hw), frame.inputs
+    factor = 1 if pixels < SMALL else 2
+    while pixels > PIXELS * factor**2:
+        factor *= 2
+    if factor == 1:
+        return frame
+    hw = (frame.hw[0] // factor, frame.hw[1] // factor)
+    alpha = padded(avg_pool2d(inputs.alpha, factor), inputs.multiple)
+    betas = tuple(
+        Beta(
+            padded(avg_pool2d(beta.image, factor), inputs.multiple),
+            _reduced_field(beta.field, alpha, factor),
+            track=beta.track and _reduced_track(beta.track, factor),
+        )
+        for beta in inputs.betas
+    )
+    return frame._replace(inputs=replace(inputs, alpha=alpha, betas=betas), hw=hw)
+
+
+def _reduced_field(field: FieldOnGrid, alpha: Tensor, factor: int) -> FieldOnGrid:
+    def at(x: Tensor) -> Segments:
+        found = field.at((x + 0.5) * factor - 0.5)
+        assert isinstance(found, Segments)
+        return reduced(found, factor)
+
+    return FieldOnGrid.evaluated(at, (alpha.shape[-2], alpha.shape[-1]), field.samples // factor + 2)
+
+
+def _reduced_track(track: Callable[[Tensor], Track], factor: int) -> Callable[[Tensor], Track]:
+    offset = 0.5 / factor - 0.5
+
+    def in_pixels(v: Tensor) -> Tensor:
+        return torch.cat([v[..., :2] / factor + offset * v[..., 2:], v[..., 2:]], -1)
+
+    return lambda x: Track(*map(in_pixels, track((x + 0.5) * factor - 0.5)))
+
+
+class _Matches(NamedTuple):
+    """What one beta shows at its matches: all (h, w) or (c, h, w), at the size of the pre-pass.
+
+    `before` are beta's own bands, blurred; `luma` is that of the corrected beta, as bright and sharp as `alpha`.
+    """
+
+    before: Float[Tensor, "c h w"]
+    alpha: Float[Tensor, "h w"]
+    luma: Float[Tensor, "hb wb"]
+    position: Float[Tensor, "h w 2"]
+    normal: Float[Tensor, "h w 2"]
+    weight: Float[Tensor, "h w"]
+
+    @property
+    def place(self) -> Float[Tensor, "h w 2"]:
+        """The matches in beta's width and height, from its middle."""
+        return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
+
+
+def _matches(network: FusionNetwork, frame: FrameInputs, found: Corrections) -> list[_Matches]:
+    """Matches of each beta with what has been found put right."""
+    inputs = found.applied(frame.inputs, frame.hw)
+    output = network(inputs)
+    parts = zip(frame.inputs.betas, inputs.betas, output.position, output.confidence)
+    return [_of_beta(inputs.alpha, *part, frame.hw) for part in parts]
+
+
+def _of_beta(alpha: Tensor, before: Beta, beta: Beta, position: Tensor, confidence: Tensor, hw: HW) -> _Matches:
+    h, w = hw
+    where = position[0, :, :h, :w].movedim(0, -1)
+    flat, size = where.reshape(1, -1, 2), (beta.image.shape[-2], beta.image.shape[-1])
+    luma = brightness(beta.image)
+    seen = sample(torch.cat([before.image, luma], 1), flat.to(luma), interpolation="bilinear").values
+    values = seen.reshape(seen.shape[1], h, w)
+    weight = ((confidence[0, :h, :w] > CONFIDENT) & on_image(where, size)).to(alpha)
+    whole = Normalisation.of(alpha, luma)
+    own = whole.softened(alpha)[:, :, :h, :w]
+    mean, deviation = _moments(values[-1:][None], weight)
+    wanted, spread = _moments(own, weight)
+    bright = (luma - mean) * (spread / deviation.clamp(min=1e-3)).clamp(max=4) + wanted
+    soft = blurred(values[:-1][:, None], [BLUR] * (len(values) - 1))[:, 0]
+    normal = normals(Segments(*(t[0, :h, :w] for t in _parts(beta.field.straight))))
+    return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
+
+
+def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
+    return found.start, found.end, found.valid
+
+
+def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and standard deviation where the weight is."""
+    share = (weight + 1e-6) / (weight + 1e-6).sum()
+    mean = (share * image).sum()
+    return mean, (share * (image - mean).square()).sum().sqrt()
+
+
+def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
+    h, w = frame.hw
+    own = blurred(frame.inputs.alpha[:, :, :h, :w], [BLUR])[0, 0]
+    colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
+    points = [found.before[:, counts] for found, counts in colour]
+    places = [found.place[counts] for found, counts in colour]
+    return fit(torch.cat(points, 1), torch.cat([own[counts] for _, counts in colour]), torch.cat(places))
+
+
+def _misaligned(found: _Matches) -> Misalignment:
+    return fit_misalignment(found.alpha, found.luma, found.position, found.normal, found.weight)

@@ -1,0 +1,221 @@
+"""How far beta's points lie across their search segments: a camera that has moved a little since its calibration.
+
+The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the optical
+axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade 1981), each
+freed of what it is off along its segment.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from arraygeom import Segments, pixel_grid
+from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.pixels import HW
+
+from ..networks.semi_global import along
+
+Image = NDArray[Any]
+
+
+class AlignmentSettings(NamedTuple):
+    """Constants of the fit, in pixels of the images it is given; chosen on the pairs that `ResponseSettings` names.
+
+    blur: standard deviation of the blur before gradients.
+    radius: of the windows.
+    steps: Gauss-Newton steps at most; a step below `finest` ends them.
+    contrast: mean squared gradient of a window that counts half.
+    farthest: a window's displacement in one step is at most this.
+    least: largest displacement of a pixel below which the rig is taken to be right.
+    better: residual with the displacement over that without, up to which it is accepted.
+    windows: fewest windows with texture.
+    """
+
+    blur: float = 1.5
+    radius: int = 7
+    steps: int = 6
+    finest: float = 5e-3
+    contrast: float = 2e-5
+    farthest: float = 2.0
+    least: float = 0.2
+    better: float = 0.98
+    windows: int = 50
+
+
+SETTINGS = AlignmentSettings()
+
+
+@dataclass(frozen=True)
+class Misalignment:
+    """The displacement across the segments, in widths of alpha: `shift` + `across` u + `down` v.
+
+    (u, v) is a pixel's place from the middle of alpha, in widths of alpha. Beta has about alpha's angular resolution.
+    Across is where along the segment from its end, turned by a right angle from x towards y, points.
+    """
+
+    shift: float = 0.0
+    across: float = 0.0
+    down: float = 0.0
+
+    def __add__(self, other: Misalignment) -> Misalignment:
+        return Misalignment(self.shift + other.shift, self.across + other.across, self.down + other.down)
+
+    def at(self, x: Float[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n"]:
+        """The displacement of alpha's pixels, in pixels."""
+        u, v = ((x[..., i] + 0.5) / hw[1] - 0.5 * hw[1 - i] / hw[1] for i in range(2))
+        return hw[1] * (self.shift + self.across * u + self.down * v)
+
+    def largest(self, hw: HW) -> float:
+        """The largest displacement of any pixel, in pixels."""
+        h, w = hw
+        corners = torch.tensor([[0, 0], [w - 1, 0], [0, h - 1], [w - 1, h - 1]], dtype=torch.float64)
+        return float(self.at(corners, hw).abs().max())
+
+    def applied(self, field: FieldOnGrid, hw: HW) -> FieldOnGrid:
+        """The field with its segments displaced; `hw` is alpha's size without padding."""
+        if self == Misalignment() or field.pixels is None:
+            return field
+
+        def at(x: Tensor) -> Segments:
+            found = field.at(x)
+            assert isinstance(found, Segments)
+            return self._displaced(found, x, hw)
+
+        def grid(found: Segments, side: int) -> Segments:
+            shape = found.valid.shape[-2:]
+            x = (pixel_grid((shape[0], shape[1]), dtype=torch.float64, device=found.start.device) + 0.5) * side - 0.5
+            return self._displaced(found, x, hw)
+
+        blocks = field.blocks and grid(field.blocks, 2)
+        return replace(field, at=at, pixels=grid(field.pixels, 1), blocks=blocks)
+
+    def _displaced(self, found: Segments, x: Tensor, hw: HW) -> Segments:
+        step = self.at(x, hw)[..., None] * normals(found)
+        return Segments(found.start + step, found.end + step, found.valid)
+
+
+def normals(segments: Segments) -> Float[Tensor, "*n 2"]:
+    """Unit vectors across the segments; zero where a segment is a point."""
+    direction = along(segments)
+    return torch.stack([-direction[..., 1], direction[..., 0]], -1)
+
+
+@torch.no_grad()
+def fit_misalignment(
+    alpha: Float[Tensor, "h w"],
+    beta: Float[Tensor, "hb wb"],
+    position: Float[Tensor, "h w 2"],
+    normal: Float[Tensor, "h w 2"],
+    weight: Float[Tensor, "h w"],
+    settings: AlignmentSettings = SETTINGS,
+) -> Misalignment:
+    """How far across its segments beta is, from matches; none if that explains the images hardly better.
+
+    `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is 0 to 1.
+    """
+    own, other, where, across, counts = (
+        t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight)
+    )
+    views = _Windows.of(own, other, where, across, counts, settings)
+    height, width = alpha.shape
+    coefficients = np.zeros(3)
+    for _ in range(settings.steps):
+        step = views.step(coefficients)
+        if step is None:
+            return Misalignment()
+        coefficients = coefficients + step
+        if np.abs(step).max() < settings.finest:
+            break
+    found = Misalignment(*(float(c) / width for c in coefficients))
+    if found.largest((height, width)) < settings.least:
+        return Misalignment()
+    accepted = views.residual(coefficients) < settings.better * views.residual(np.zeros(3))
+    return found if accepted else Misalignment()
+
+
+class _Windows(NamedTuple):
+    """Blurred images, beta's gradients, and what the displacement depends on (3, h, w)."""
+
+    alpha: Image
+    beta: Image
+    gradients: tuple[Image, Image]
+    position: Image
+    normal: Image
+    weight: Image
+    design: Image
+    settings: AlignmentSettings
+
+    @classmethod
+    def of(
+        cls, alpha: Image, beta: Image, position: Image, normal: Image, weight: Image, settings: AlignmentSettings
+    ) -> _Windows:
+        height, width = alpha.shape
+        y, x = np.mgrid[:height, :width].astype(np.float32)
+        design = np.stack([np.ones_like(x), (x + 0.5) / width - 0.5, (y + 0.5 - height / 2) / width])
+        own, other = (cv2.GaussianBlur(p, (0, 0), settings.blur) for p in (alpha, beta))
+        horizontal = cv2.Sobel(other, cv2.CV_32F, 1, 0, ksize=3) / 8
+        vertical = cv2.Sobel(other, cv2.CV_32F, 0, 1, ksize=3) / 8
+        return cls(own, other, (horizontal, vertical), position, normal, weight, design, settings)
+
+    def _sampled(self, coefficients: NDArray[np.float64]) -> tuple[Image, Image, Image, Image]:
+        """Beta and its gradients at the displaced matches, and the weight of those inside beta."""
+        displaced = self.position + np.tensordot(coefficients, self.design, 1)[..., None] * self.normal
+        columns, rows = (np.ascontiguousarray(displaced[..., i], np.float32) for i in range(2))
+        height, width = self.beta.shape
+        inside = (columns > 2) & (rows > 2) & (columns < width - 3) & (rows < height - 3)
+        planes = (self.beta, *self.gradients)
+        value, gx, gy = (cv2.remap(p, columns, rows, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for p in planes)
+        return value, gx, gy, self.weight * inside.astype(np.float32)
+
+    def _mean(self, plane: Image, weight: Image) -> Image:
+        side = (2 * self.settings.radius + 1,) * 2
+        product: Image = weight * plane
+        return cv2.blur(product, side) / (cv2.blur(weight, side) + 1e-6)
+
+    def residual(self, coefficients: NDArray[np.float64]) -> float:
+        """The mean difference of the images where these match, freed of its mean in each window."""
+        value, _, _, weight = self._sampled(coefficients)
+        rest = self.alpha - value
+        return float((weight * np.abs(rest - self._mean(rest, weight))).sum() / max(weight.sum(), 1.0))
+
+    def step(self, coefficients: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """By how much the coefficients should change; None for too little texture."""
+        value, gx, gy, weight = self._sampled(coefficients)
+        across = gx * self.normal[..., 0] + gy * self.normal[..., 1]
+        along_segment = gx * self.normal[..., 1] - gy * self.normal[..., 0]
+        rest = self.alpha - value
+        rest = rest - self._mean(rest, weight)
+        strength, mixed, other = (
+            self._mean(a * b, weight)
+            for a, b in ((across, across), (across, along_segment), (along_segment, along_segment))
+        )
+        towards, aside = self._mean(across * rest, weight), self._mean(along_segment * rest, weight)
+        strength = strength - mixed**2 / (other + 1e-6)
+        towards = towards - mixed * aside / (other + 1e-6)
+        some = (slice(None, None, 4), slice(None, None, 4))
+        useful = (strength[some] > self.settings.contrast / 10) & (weight[some] > 0.3)
+        if useful.sum() < self.settings.windows:
+            return None
+        found = towards[some][useful] / (strength[some][useful] + self.settings.contrast / 10)
+        counts = strength[some][useful] / (strength[some][useful] + self.settings.contrast)
+        limit = self.settings.farthest
+        return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts)
+
+
+def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:
+    """Weighted least squares with Cauchy's weights."""
+    found = np.zeros(len(design))
+    for _ in range(8):
+        rest = values - found @ design
+        deviation = max(1.4826 * float(np.median(np.abs(rest))), 0.05)
+        counts = weight / (1 + np.square(rest / (2 * deviation)))
+        found = np.linalg.solve((design * counts) @ design.T + 1e-3 * np.eye(len(design)), (design * counts) @ values)
+    return found

@@ -1,0 +1,135 @@
+"""What fuse finds and puts right by itself: another response, a beta off its search segments."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pat.data.sample_array import ALPHA, BETA, load_sample
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import corrections_of, fuse
+from pat.fusion.misalignment import Misalignment, fit_misalignment
+from pat.fusion.sequence import SequenceFusion
+from pat.media.colour import luminance
+from pat.networks.weights import load_weights
+
+
+@pytest.fixture(scope="module")
+def sample():
+    return load_sample()
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_weights("mono-colour")
+
+
+@pytest.fixture(scope="module")
+def images(sample):
+    return {ALPHA: luminance(sample.ground_truth), BETA: sample.images[BETA]}
+
+
+def combined(image, weights):
+    return (image * torch.tensor(weights)[:, None, None]).sum(0, keepdim=True)
+
+
+def psnr(network, sample, images, **options):
+    frame = fuse(network, options.pop("rig", sample.rig), images, alpha=ALPHA, **options)
+    return score(frame.image.clamp(0, 1), sample.ground_truth).psnr
+
+
+def with_beta_rotated(rig, degrees):
+    """The rig with beta's stated rotation off about its x axis: every point is off by about as many pixels."""
+    c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    wrong = torch.tensor([[1, 0, 0], [0, c, -s], [0, s, c]], dtype=rig[BETA].R.dtype)
+    pose = rig[BETA].cam_from_world
+    return rig.with_camera(BETA, rig[BETA].replace(cam_from_world=type(pose)(wrong @ pose.R, wrong @ pose.t)))
+
+
+@pytest.mark.parametrize("weights", [(1 / 3, 1 / 3, 1 / 3), (0.2, 0.4, 0.4), (0.6, 0.3, 0.1)])
+def test_a_response_is_fitted_by_itself(sample, network, images, weights):
+    other = images | {ALPHA: combined(sample.ground_truth, weights)}
+    ideal, fitted = psnr(network, sample, images), psnr(network, sample, other)
+    assert fitted > ideal - 1.5
+    assert fitted > psnr(network, sample, other, response="rec601") + 1.0
+
+
+def test_gain_and_gamma_are_fitted_by_themselves(sample, network, images):
+    other = images | {BETA: 0.6 * images[BETA] ** 1.3}
+    assert psnr(network, sample, other) > psnr(network, sample, images) - 1.0
+
+
+@pytest.mark.parametrize("gain", [0.6, 0.9])
+def test_another_exposure_is_not_taken_for_another_response(sample, network, images, gain):
+    other = images | {BETA: gain * images[BETA]}
+    assert psnr(network, sample, other) > psnr(network, sample, images) - 0.5
+
+
+def test_vignetting_is_found_by_itself(sample, network, images):
+    h, w = images[BETA].shape[-2:]
+    y, x = torch.meshgrid(torch.linspace(-1, 1, h) * h / w, torch.linspace(-1, 1, w), indexing="ij")
+    other = images | {BETA: images[BETA] * (1 + 0.5 * (x.square() + y.square())) ** -0.9}
+    lines: list[str] = []
+    assert psnr(network, sample, other, explain=lines.append) > psnr(network, sample, images) - 0.7
+    assert "vignetting" in lines[0]
+    assert psnr(network, sample, other, response="rec601") < psnr(network, sample, other) - 0.3
+
+
+def test_nothing_is_changed_where_the_cameras_are_as_the_rig_says(sample, network, images):
+    lines: list[str] = []
+    given = fuse(network, sample.rig, images, alpha=ALPHA, explain=lines.append)
+    plain = fuse(network, sample.rig, images, alpha=ALPHA, response="rec601", align=False)
+    assert lines == []
+    assert torch.equal(given.image, plain.image)
+    assert torch.equal(given.confidence, plain.confidence)
+
+
+@pytest.mark.parametrize("degrees", [0.3, -0.3])
+def test_a_rotated_camera_is_put_right(sample, network, images, degrees):
+    rig, lines = with_beta_rotated(sample.rig, degrees), []
+    right = psnr(network, sample, images)
+    assert psnr(network, sample, images, rig=rig, explain=lines.append) > right - 0.5
+    assert psnr(network, sample, images, rig=rig, align=False) < right - 1.0
+    assert "off its search segments" in lines[0]
+
+
+def test_found_corrections_serve_other_frames(sample, network, images):
+    rig = with_beta_rotated(sample.rig, 0.3)
+    found = corrections_of(network, rig, images, alpha=ALPHA)
+    one = fuse(network, rig, images, alpha=ALPHA)
+    assert torch.equal(fuse(network, rig, images, alpha=ALPHA, corrections=found).image, one.image)
+
+
+def test_a_sequence_finds_corrections_once(sample, network, images, monkeypatch):
+    from pat.fusion import sequence
+
+    calls = []
+    found = sequence.corrections_of
+    monkeypatch.setattr(sequence, "corrections_of", lambda *a, **k: calls.append(1) or found(*a, **k))
+    rig = sample.rig
+    for name in (ALPHA, BETA):
+        rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=10.0)))
+    frames = {name: [image] * 3 for name, image in images.items()}
+    job = SequenceFusion(load_weights("mono-colour-small"), rig, frames, ALPHA)
+    for key in job.timeline.key_frames():
+        job.colour(key)
+    assert calls == [1]
+
+
+def test_a_misalignment_is_recovered():
+    """Along rows, beta one pixel lower on the left and two on the right."""
+    g = torch.Generator().manual_seed(0)
+    h, w = 120, 160
+    texture = torch.nn.functional.interpolate(torch.rand(1, 1, 40, 50, generator=g), size=(h, w), mode="bicubic")[0, 0]
+    y, x = torch.meshgrid(torch.arange(h).float(), torch.arange(w).float(), indexing="ij")
+    true = Misalignment(1.5 / w, 1.0 / w, 0.0)
+    position = torch.stack([x, y], -1)
+    grid = torch.stack([(2 * x + 1) / w - 1, (2 * (y + true.at(position, (h, w))) + 1) / h - 1], -1)
+    alpha = torch.nn.functional.grid_sample(texture[None, None], grid[None], align_corners=False)[0, 0]
+    normal = torch.stack([torch.zeros_like(x), torch.ones_like(x)], -1)
+    found = fit_misalignment(alpha, texture, position, normal, torch.ones(h, w))
+    corners = torch.tensor([[0.0, 0.0], [w - 1.0, 0.0], [0.0, h - 1.0], [w - 1.0, h - 1.0]])
+    torch.testing.assert_close(found.at(corners, (h, w)), true.at(corners, (h, w)), atol=0.1, rtol=0)
+    assert fit_misalignment(texture, texture, position, normal, torch.ones(h, w)) == Misalignment()
+    assert fit_misalignment(0 * alpha, texture, position, normal, torch.ones(h, w)) == Misalignment()

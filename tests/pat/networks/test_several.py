@@ -1,0 +1,137 @@
+"""Several RGB betas of one scene: what one cannot see another can."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from arraygeom import Camera, Pose, Rig, Segments, intrinsics
+from arraygeom.fields import pinhole_track
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.media.colour import luminance
+from pat.networks.pieces import tiles_of
+from pat.networks.several import SUPPORT, View
+from pat.networks.weights import load_weights
+
+H, W = 96, 192
+NEAR, FAR = 2.0, 8.0
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_weights("mono-colour-small")
+
+
+def smooth_texture(seed, hw):
+    g = torch.Generator().manual_seed(seed)
+    coarse, fine = (torch.rand(1, 3, hw[0] // n, hw[1] // n, generator=g) for n in (16, 4))
+    parts = [torch.nn.functional.interpolate(t, size=hw, mode="bicubic", align_corners=False) for t in (coarse, fine)]
+    return (0.7 * parts[0] + 0.3 * parts[1])[0].clamp(0, 1)
+
+
+def camera(x):
+    """At x metres to the right of alpha: disparity is 24 px per metre of it at 8 m, 96 at 2 m."""
+    camera = Camera(K=intrinsics(float(W), (H, W)), cam_from_world=Pose.identity(), hw=(H, W))
+    return camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-x, 0.0, 0.0])))
+
+
+def seen_from(x):
+    """A near square in front of a wall, seen from x metres to the right of alpha."""
+    wall, square = smooth_texture(1, (H, W + 128)), smooth_texture(2, (40, 48))
+    image = wall[:, :, 64 + round(W / FAR * x) :][:, :, :W].clone()
+    left = 72 - round(W / NEAR * x)
+    image[:, 28:68, left : left + 48] = square
+    return image
+
+
+@pytest.fixture(scope="module")
+def scene():
+    cameras = {"mono": camera(0.0), "left": camera(-0.25), "right": camera(0.25)}
+    images = {"mono": luminance(seen_from(0.0)), "left": seen_from(-0.25), "right": seen_from(0.25)}
+    return Rig(cameras, depth=(NEAR, FAR)), images, seen_from(0.0)
+
+
+def fused(network, scene, *names):
+    rig, images, ground_truth = scene
+    frame = fuse(network, rig, {name: images[name] for name in ("mono", *names)}, alpha="mono")
+    return score(frame.image.clamp(0, 1), ground_truth).psnr, frame
+
+
+def test_two_colour_cameras_on_opposite_sides_see_more_than_either(network, scene):
+    (one, left), (other, _), (both, frame) = (
+        fused(network, scene, *n) for n in (["left"], ["right"], ["left", "right"])
+    )
+    assert both > max(one, other) + 1.0
+    assert frame.confidence.mean() > left.confidence.mean()
+    hidden_on_the_right = (slice(30, 66), slice(126, 138))
+    depth = frame.depth[hidden_on_the_right]
+    assert (depth - FAR).abs().nanmedian() < 0.5
+
+
+def test_the_order_of_the_betas_does_not_matter(network, scene):
+    rig, images, _ = scene
+    turned = Rig({n: rig[n] for n in ("mono", "right", "left")}, depth=(NEAR, FAR))
+    one, other = (fuse(network, r, images, alpha="mono").image for r in (rig, turned))
+    assert (one - other).abs().max() < 2e-2
+    assert (one - other).abs().mean() < 1e-4
+
+
+def test_tiles_of_several_betas_are_as_the_whole(network, scene, monkeypatch):
+    from pat.fusion import fuse as module
+
+    rig, images, _ = scene
+    plan = module.plan_frame
+    tiles = list(tiles_of((H, W), 64, 640))
+    assert len(tiles) > 1
+    whole = fuse(network, rig, images, alpha="mono").image
+    monkeypatch.setattr(module, "plan_frame", lambda *a, **k: plan(*a, **k)._replace(tiles=tiles))
+    assert (fuse(network, rig, images, alpha="mono").image - whole).abs().max() < 1e-5
+
+
+def test_a_band_camera_beside_a_colour_camera_gives_better_depth(network, scene):
+    rig, images, _ = scene
+    frame = fuse(network, rig, images | {"right": luminance(images["right"])}, alpha="mono")
+    _, alone = fused(network, scene, "left")
+    assert frame.image.shape[0] == 3
+    depth = torch.full((H, W), FAR)
+    depth[28:68, 72:120] = NEAR
+    one, both = (float(((f.depth - depth).abs() > 0.5).float().mean()) for f in (alone, frame))
+    assert both < 0.8 * one
+
+
+def test_uncalibrated_colour_cameras_are_fused_too(network, scene):
+    from arraygeom import Link
+    from arraygeom import View as Known
+
+    rig, images, _ = scene
+    links = {
+        ("mono", n): Link(rig.pair("mono", n).fundamental, rig.pair("mono", n).homography) for n in ("left", "right")
+    }
+    known = Rig({n: Known(hw=rig[n].hw) for n in rig.cameras}, links=links)
+    frame = fuse(network, known, images, alpha="mono")
+    assert frame.image.shape == (3, H, W)
+    assert frame.depth.isnan().all()
+
+
+def test_the_depth_buffer_finds_what_is_hidden():
+    """A near point and a far one at one pixel of beta: the far one is hidden by as much as their disparities differ."""
+    hw = (4, 8)
+    pair = Rig({"a": camera(0.0), "b": camera(1.0)}).pair("a", "b")
+    y, x = torch.meshgrid(torch.arange(4.0), torch.arange(8.0), indexing="ij")
+    pixels = torch.stack([x, y], -1).double() * 8 + torch.tensor([60.0, 0.0])
+    track = pinhole_track(pair, pixels)
+    near = torch.full(hw, 1 / NEAR, dtype=torch.float64)
+    far = torch.full(hw, 1 / FAR, dtype=torch.float64)
+    segments = Segments(track.at(near), track.at(far), torch.ones(hw, dtype=torch.bool))
+    view = View(segments, track, torch.zeros(hw).double(), torch.zeros(3, *hw).double(), (H, W))
+    depths = far.clone()
+    depths[1, 7] = 1 / NEAR
+    found = view.hidden(depths)
+    assert found[1, 7] == 0
+    column = (track.at(depths)[1, 7, 0] + 0.5).div(2).floor()
+    same = ((track.at(depths)[1, :, 0] + 0.5).div(2).floor() == column) & (depths[1] < 0.4)
+    assert same.sum() <= 1
+    assert (found[1][same] > SUPPORT).all()
+    assert (found[torch.tensor([0, 2, 3])] == 0).all()
+    assert replace(segments, valid=~segments.valid).valid.sum() == 0
