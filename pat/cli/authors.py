@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Fixed, Positional, arg
 
 from . import options
-from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say
+from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
 
 if TYPE_CHECKING:
     from ..networks.protocol import FusionNetwork
@@ -63,6 +63,7 @@ class Evaluate:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
+        writable(self.out, folder=True)
         network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
         if self.conditions or self.only:
             return self._under_conditions(network, folders)

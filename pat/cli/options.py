@@ -5,12 +5,15 @@ Nothing here or in the modules of the commands imports torch before a command ru
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -28,8 +31,20 @@ WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
 VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
 
-FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved"]
-FIELD_NAMES = get_args(FieldName)[1:]
+def _field_names() -> tuple[str, ...]:
+    """The keys of `arraygeom.fields.default.FIELDS`, from its text: importing it would import torch."""
+    package = importlib.util.find_spec("arraygeom")
+    folder = Path((package and package.origin) or "").parent
+    tree = ast.parse((folder / "fields" / "default.py").read_text(encoding="utf-8"))
+    made = next(n for n in tree.body if isinstance(n, ast.AnnAssign) and ast.unparse(n.target) == "FIELDS")
+    return tuple(ast.literal_eval(key) for key in made.value.keys if key)  # type: ignore[union-attr]
+
+
+FIELD_NAMES = _field_names()
+if TYPE_CHECKING:
+    FieldName = str
+else:
+    FieldName = Literal[("auto", *FIELD_NAMES)]
 
 
 def response_of(text: str) -> Any:
@@ -111,6 +126,22 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
             raise ValueError(f"{option}: give a file")
         (first if new == FIRST else last).append(value)
     return [*first, *rest, *last]
+
+
+def writable(out: Path, *, folder: bool = False) -> Path:
+    """The path of --out, before the work whose result is to be written there.
+
+    Raises ValueError if it cannot be: a folder where a file is wanted, a file in its way, no permission.
+    """
+    if out.exists() and out.is_dir() != folder:
+        raise ValueError(f"--out: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}")
+    above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
+    if above != out and not above.is_dir():
+        raise ValueError(f"--out: {above} is a file, so {out} cannot be made: give another path")
+    for place in {above, above if above.is_dir() else above.absolute().parent}:
+        if not os.access(place, os.W_OK):
+            raise ValueError(f"--out: {place} is not to be written to: give another path, or permission")
+    return out
 
 
 def field_named(name: str) -> ReceptiveField | None:

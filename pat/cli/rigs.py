@@ -36,6 +36,7 @@ class Show:
 
         from ..media.figures import save_figure
 
+        options.writable(self.out, folder=True)
         rig = load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
@@ -166,6 +167,8 @@ class Doctor:
     def run(self) -> None:
         from calib.images.doctor import diagnose
 
+        if self.out is not None:
+            options.writable(self.out)
         rig = load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
             found = diagnose(rig, options.read_images(rig, self.image))
@@ -207,6 +210,7 @@ class Refine:
 
         from ..attention import attend_with_statistics
 
+        options.writable(self.out)
         rig = load_rig(self.rig)
         deviations = options.numbers_by_name(self.sigma, "--sigma")
         options.say_when_compiling()
@@ -244,6 +248,7 @@ class RigFromImages:
 
         from ..media.images import read_image
 
+        options.writable(self.out)
         images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
         with options.working("matching features and fitting lines"):
             found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))

@@ -28,6 +28,7 @@ from ..media.figures import save_curves
 from ..networks.protocol import FusionNetwork
 from ..sensors.noise_level import NoiseLevel
 from .baseline import classical_fusion, sgbm_disparity
+from .low_light import non_local_means
 from .metrics import bootstrap_interval, disparity_score, score
 from .protocols import (
     MonoColourTask,
@@ -163,11 +164,16 @@ def methods_of(network: FusionNetwork, recording: Recording) -> dict[str, Stereo
     if level is None:
         found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
     else:
-        found["denoised, classical"] = lambda a, b, d: classical(non_local(a, level), non_local(b, level), d)
+        found["denoised, classical"] = lambda a, b, d: classical(_non_local(a, level), _non_local(b, level), d)
     found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
     noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
     found["fusion"] = rectified_fusion(network, **noisy)
     return found
+
+
+def _non_local(image: Tensor, level: NoiseLevel) -> Tensor:
+    """Non-local means with the true noise level, in the mean."""
+    return non_local_means(image, float(level.deviation(image[None]).mean())).clamp(0, 1)
 
 
 def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:

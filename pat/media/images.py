@@ -190,7 +190,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
 
     OpenCV shifts packed values up to 16 bits.
     """
-    values = _decode_bytes(np.frombuffer(_without_orientation(content, header), np.uint8))
+    values = decoded(_without_orientation(content, header))
     if values is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
     if values.shape[:2] != header.hw:
@@ -215,10 +215,11 @@ def _log_level(level: int) -> int:
     return int(logging.setLogLevel(level))
 
 
-def _decode_bytes(content: NDArray) -> NDArray | None:
+def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
+    """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
     level = _log_level(0)
     try:
-        return cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
         return None
     finally:

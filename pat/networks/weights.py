@@ -13,7 +13,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from ..support.schema import from_document
-from ..support.tensor_files import write_tensors
+from ..support.tensor_files import undamaged, write_tensors
 from .bandwise import BandwisePAT, BandwisePATConfig
 from .denoiser import DenoiserConfig, LowLightNetwork
 from .guided import GuidedPAT, GuidedPATConfig
@@ -74,9 +74,12 @@ def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
             network, config = _described(path, metadata, networks)
             shapes = {name: tuple(file.get_slice(key).get_shape()) for name, key in keys.items()}
             _check_shapes(path, network, config, shapes)
-            state = {name: file.get_tensor(key) for name, key in keys.items()}
+            stored = {key: file.get_tensor(key) for key in keys.values()}
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
+    if not undamaged(stored, metadata):
+        raise ValueError(f"{path}: its numbers are not those that were written: copy it again")
+    state = {name: stored[key] for name, key in keys.items()}
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
             raise ValueError(
