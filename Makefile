@@ -8,17 +8,19 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel
+.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel fuzz transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
-	@echo "make readme     run both and put what they print into README.md"
+	@echo "make readme     run both and put what they print into docs/results.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
+	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
+	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
 	@echo "make notebooks  run the notebooks and keep what they put out"
@@ -38,8 +40,8 @@ showcase: $(READY)
 	@$(BIN)/pat showcase --data $(DATA) --out out/showcase
 
 readme: demo showcase
-	@echo "== bringing README.md up to date"
-	@$(BIN)/python -m docs.update_readme --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
+	@echo "== bringing docs/results.md and docs/demo.jpg up to date"
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
 		--image out/demo/demo.png docs/demo.jpg
 
 test: $(READY)
@@ -70,11 +72,18 @@ bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
 	@$(BIN)/python -m tests.benchmarks.bench_training
 
+fuzz: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/fuzzing.md
+
+transformations: $(READY)
+	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.transformations.run --out docs/transformations.md
+
 notebooks: $(READY)
 	@$(BIN)/python notebooks/run.py
 
 docs: $(READY)
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	@echo "== out/site/index.html"
 
 drawings: $(READY)
 	@$(BIN)/python docs/drawings.py

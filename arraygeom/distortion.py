@@ -30,6 +30,7 @@ from torch import Tensor
 from .batching import Batched
 from .pixels import floating, product
 from .text import distortion_text
+from .tracing import traced
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
@@ -171,10 +172,10 @@ def _brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     first derivatives and the next one the second (the error of a Newton step is the square of the one before).
     """
     lens = _Brown.named(c)
-    limit = _brown_limit(lens).to(xy_d)
     target, ahead = _untilt(lens, xy_d)
     with torch.no_grad():
-        solved, valid = _brown_inverse(lens, target, limit)
+        inverse = _traced_brown_inverse if torch.compiler.is_compiling() else _brown_inverse_of
+        solved, valid = inverse(c.detach(), target.detach())
     safe_target = torch.where(valid[..., None], target, 0.0)
     xy = torch.where(valid[..., None], solved, 0.0)
     for _ in range(2):
@@ -232,6 +233,26 @@ def _brown_start(lens: _Brown, target: Tensor, limit: Tensor) -> Tensor:
     return target * (r / torch.where(wanted > 0, wanted, 1.0))[..., None]
 
 
+def _brown_inverse_of(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    lens = _Brown.named(c)
+    return _brown_inverse(lens, target, _brown_limit(lens).to(target))
+
+
+@torch.library.custom_op(
+    "arraygeom::brown_inverse", mutates_args=(), schema="(Tensor c, Tensor target) -> (Tensor, Tensor)"
+)
+def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """The same for torch.compile, which cannot follow iterations that numbers end."""
+    solved, valid = _brown_inverse_of(c, target)
+    return solved.contiguous(), valid.contiguous()
+
+
+@_traced_brown_inverse.register_fake
+def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    shape = torch.broadcast_shapes(target.shape[:-1], c.shape[:-1])
+    return target.new_empty((*shape, 2)), target.new_empty(shape, dtype=torch.bool)
+
+
 def _brown_inverse(lens: _Brown, target: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
     """The solution and whether there is one; where not, the solution of the radial terms alone.
 
@@ -245,7 +266,7 @@ def _brown_inverse(lens: _Brown, target: Tensor, limit: Tensor) -> tuple[Tensor,
         tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + _norm(target))
         valid = (_norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & _orients(jacobian)
         solved = torch.where(valid[..., None], attempt, start)
-        if bool(valid.all()):
+        if not traced() and bool(valid.all()):
             break
     return solved, valid
 
@@ -261,7 +282,7 @@ def _brown_solve(lens: _Brown, xy: Tensor, target: Tensor, limit: Tensor, iterat
     error, scale = _norm(planar - target), torch.ones_like(target[..., 0])
     enough = 2 * torch.finfo(target.dtype).eps * (1 + _norm(target))
     for _ in range(iterations):
-        if bool(((error <= enough) | (scale < 1e-3)).all()):
+        if not traced() and bool(((error <= enough) | (scale < 1e-3)).all()):
             break
         trial = xy - scale[..., None] * _newton_step(planar, jacobian, target)
         planar_trial, jacobian_trial = _brown_planar(lens, trial)
@@ -340,7 +361,8 @@ def _fisheye_unproject(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     pull = torch.where(inside, 1.0, (outermost / torch.where(inside, 1.0, u_d.clamp(min=TINY))).sqrt())
     xy_d = xy_d * pull[..., None]
     u_d = torch.where(inside, u_d, outermost)
-    v = _fisheye_start(c, u_d, limit)
+    start = _traced_fisheye_start if torch.compiler.is_compiling() else _fisheye_start
+    v = start(c.detach(), u_d.detach(), limit)
     for _ in range(2):
         p, slope = _fisheye_factor(c, v)
         v = v - (v * p.square() - u_d) / (p * slope)
@@ -357,6 +379,19 @@ def _fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
         return theta * p, slope
 
     return _invert_increasing(radius, u_d.sqrt(), limit.sqrt().expand_as(u_d)).square()
+
+
+@torch.library.custom_op(
+    "arraygeom::fisheye_start", mutates_args=(), schema="(Tensor c, Tensor u_d, Tensor limit) -> Tensor"
+)
+def _traced_fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
+    """The same for torch.compile, which cannot follow iterations that numbers end."""
+    return _fisheye_start(c, u_d, limit).contiguous()
+
+
+@_traced_fisheye_start.register_fake
+def _(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
+    return torch.empty_like(u_d, memory_format=torch.contiguous_format)
 
 
 def _fisheye_factor(c: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
@@ -447,7 +482,7 @@ def _invert_increasing(
         step = (following - r).abs()
         moved = step > enough
         r = following
-        if not bool(moved.any()):
+        if not traced() and not bool(moved.any()):
             break
     return torch.where(reached, r, high)
 

@@ -6,6 +6,7 @@ x_beta^T F x_alpha = 0.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -16,6 +17,7 @@ from .homography import infinite_homography
 from .pixels import HW, floating, map_homogeneous, product, to_homogeneous
 from .pose import Pose, cross_matrix, matvec
 from .segments import FLAT, Segments
+from .tracing import traced
 
 
 def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
@@ -100,34 +102,57 @@ def track(
     """
     a = map_homogeneous(infinite_homography(K_alpha, K_beta, beta_from_alpha.R), x)
     b = matvec(K_beta, beta_from_alpha.t).to(a.dtype)
-    return Track(a, _beside(b, a.ndim, trailing=1))
+    return Track(a, beside(b, a.ndim, trailing=1))
 
 
 def segments_between(track: Track, near: Float[Tensor, "*b"], far: Float[Tensor, "*b"], beta_hw: HW) -> Segments:
     """The part of each track between the depths `near` and `far` (metres; far may be inf) inside beta's image.
 
-    Clipped to the image's area and to the front of beta, in closed form: with s going from 0 at far to 1 at
-    near in proportion to inverse depth, the homogeneous pixel is P + s D, and every limit is linear in s with a
-    slope that is one number for the whole image.
+    Clipped to the image's area and to the front of beta, in closed form (`clipped`).
+    """
+    h, w = beta_hw
+    part = clipped(track, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
+    start, end = (_place(part.P.unbind(-1), part.D.unbind(-1), s, part.valid, beta_hw) for s in (part.high, part.low))
+    return Segments(start, end, part.valid)
+
+
+class Clipped(NamedTuple):
+    """The homogeneous points P + s D of a track, with s from `low` (towards far) to `high` (towards near)."""
+
+    P: Float[Tensor, "*n 3"]
+    D: Float[Tensor, "*m 3"]
+    low: Float[Tensor, "*n"]
+    high: Float[Tensor, "*n"]
+    valid: Bool[Tensor, "*n"]
+
+
+def clipped(
+    track: Track,
+    near: Float[Tensor, "*b"],
+    far: Float[Tensor, "*b"],
+    limits: Sequence[float | Tensor] | None,
+    *,
+    in_front: bool = True,
+) -> Clipped:
+    """The part of each track within `limits` (x low, y low, x high, y high; None: everywhere) and in front of beta.
+
+    With s going from 0 at far to 1 at near in proportion to inverse depth, every limit is linear in s with a slope that
+    is one number for the whole image.
     """
     a, b = track
-    w_far, w_near = (_beside(1 / d.to(a.dtype), a.ndim - 1) for d in (far, near))
-    X, Y, Z = (a + w_far[..., None] * b).unbind(-1)
-    DX, DY, DZ = ((w_near - w_far)[..., None] * b).unbind(-1)
-    h, w = beta_hw
+    w_far, w_near = (beside(1 / d.to(a.dtype), a.ndim - 1) for d in (far, near))
+    P, D = a + w_far[..., None] * b, (w_near - w_far)[..., None] * b
+    (X, Y, Z), (DX, DY, DZ) = P.unbind(-1), D.unbind(-1)
     low, high = torch.zeros_like(X), torch.ones_like(X)
     valid = torch.ones_like(X, dtype=torch.bool)
-    for g, slope in (
-        (X + 0.5 * Z, DX + 0.5 * DZ),
-        ((w - 0.5) * Z - X, (w - 0.5) * DZ - DX),
-        (Y + 0.5 * Z, DY + 0.5 * DZ),
-        ((h - 0.5) * Z - Y, (h - 0.5) * DZ - DY),
-        (Z - FRONT, DZ),
-    ):
+    bounds = []
+    if limits is not None:
+        left, top, right, bottom = limits
+        bounds += [(X - left * Z, DX - left * DZ), (right * Z - X, right * DZ - DX)]
+        bounds += [(Y - top * Z, DY - top * DZ), (bottom * Z - Y, bottom * DZ - DY)]
+    for g, slope in (*bounds, *([(Z - FRONT, DZ)] if in_front else [])):
         low, high, valid = _limited(low, high, valid, g, slope)
-    valid = valid & (low <= high)
-    start, end = (_place((X, Y, Z), (DX, DY, DZ), s, valid, beta_hw) for s in (high, low))
-    return Segments(start, end, valid)
+    return Clipped(P, D, low, high, valid & (low <= high))
 
 
 def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -135,11 +160,12 @@ def _limited(low: Tensor, high: Tensor, valid: Tensor, g: Tensor, slope: Tensor)
     rising, falling = slope > FLAT, slope < -FLAT
     flat = ~(rising | falling)
     crossing = g * (-1 / torch.where(flat, 1.0, slope))
-    if bool(rising.any()):
+    every = traced()
+    if every or bool(rising.any()):
         low = torch.maximum(low, torch.where(rising, crossing, 0.0))
-    if bool(falling.any()):
+    if every or bool(falling.any()):
         high = torch.minimum(high, torch.where(falling, crossing, 1.0))
-    if bool(flat.any()):
+    if every or bool(flat.any()):
         valid = valid & ((g >= 0) | ~flat)
     return low, high, valid
 
@@ -153,8 +179,8 @@ def _place(P: tuple[Tensor, ...], D: tuple[Tensor, ...], s: Tensor, valid: Tenso
     return torch.stack([torch.where(valid, (c / Z).clamp(-0.5, m), 0.0) for c, m in zip((X, Y), limits)], -1)
 
 
-def _beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
-    """A value for each rig of a batch, with axes of length 1 for its pixels."""
+def beside(v: Tensor, ndim: int, trailing: int = 0) -> Tensor:
+    """A value for each rig of a batch (*b, and `trailing` axes), with axes of length 1 for its pixels: `ndim` axes."""
     if v.ndim == trailing:
         return v
     batch = v.ndim - trailing

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .pixels import map_homogeneous, product, to_homogeneous
+from .tracing import needs_numbers
 
 
 class TransformedPoints(NamedTuple):
@@ -92,6 +93,7 @@ def fit_homography(x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], *, steps: i
     points. Differentiable, through `steps` of Gauss and Newton at the end. Raises ValueError where there is no such
     homography: points on a line, or some that would be behind.
     """
+    needs_numbers("the number of steps of fit_homography", x, y)
     dtype = torch.promote_types(x.dtype, y.dtype)
     x, y = x.double(), y.double()
     A, B = _normalising(x), _normalising(y)

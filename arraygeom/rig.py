@@ -21,6 +21,7 @@ from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
 from .text import baseline_text, depth_text, rig_html, rig_text, view_text
+from .tracing import traced
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -89,7 +90,7 @@ class Pair(Batched):
     def beta_from_alpha(self) -> Pose:
         """X_beta = R X_alpha + t."""
         alpha, beta = self.cameras
-        return beta.cam_from_world @ alpha.cam_from_world.inverse()
+        return beta.cam_from_world.__matmul__(alpha.cam_from_world.inverse())  # torch.compile cannot trace @ of these
 
     @property
     def depth_range(self) -> Depths:
@@ -105,6 +106,8 @@ class Pair(Batched):
     def fundamental(self) -> Float[Tensor, "*b 3 3"]:
         """F with x_beta^T F x_alpha = 0, from the cameras or as given; between undistorted pixels through lenses.
 
+        0 where the cameras' baseline is no more than the rounding of their poses.
+
         Raises ValueError if neither is known.
         """
         if self.link is not None:
@@ -112,7 +115,10 @@ class Pair(Batched):
         if not self.calibrated:
             raise ValueError("neither the cameras' calibration nor F is known for this pair: give the rig a link")
         alpha, beta = self.cameras
-        return fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
+        F = fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
+        baseline, rounding = self.beta_from_alpha.t.norm(dim=-1), torch.finfo(alpha.t.dtype).eps
+        moved = baseline > 8 * rounding * (alpha.t.norm(dim=-1) + beta.t.norm(dim=-1))
+        return torch.where(moved[..., None, None], F, 0.0)
 
     @property
     def homography(self) -> Float[Tensor, "*b 3 3"]:
@@ -318,10 +324,10 @@ def _view(name: str, camera: Any) -> View:
 
 
 def depth_range(near: Any, far: Any) -> Depths:
-    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far."""
+    """(near, far) as tensors, numbers in float64. Raises ValueError unless 0 < near <= far (where they are known)."""
     bounds = [d if isinstance(d, Tensor) else torch.tensor(float(d), dtype=torch.float64) for d in (near, far)]
     near, far = bounds
-    if not bool(((near > 0) & (far >= near)).all()):
+    if not traced() and not bool(((near > 0) & (far >= near)).all()):
         raise ValueError(
             f"depth bounds must satisfy 0 < near <= far, in metres; got near = {_shown(near)}, far = {_shown(far)}"
         )

@@ -56,8 +56,13 @@ def sample(
     x = floating(x).expand(batch, *x.shape[1:])
     valid = on_image(x, hw)
     grid = to_grid(torch.where(valid[..., None], x, 0.0), hw).reshape(batch, 1, -1, 2)
-    values = grid_sample(
-        image.to(dtype), grid.to(dtype), mode=interpolation, padding_mode="border", align_corners=False
-    )
+    try:
+        values = grid_sample(
+            image.to(dtype), grid.to(dtype), mode=interpolation, padding_mode="border", align_corners=False
+        )
+    except NotImplementedError:
+        raise NotImplementedError(
+            "sample has no forward mode (jvp, jacfwd, hessian): use grad, vjp or jacrev"
+        ) from None
     values = values.reshape(batch, image.shape[1], *x.shape[1:-1])
     return Sampled(torch.where(valid[:, None], values, 0.0).to(image.dtype), valid)

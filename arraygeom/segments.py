@@ -84,6 +84,16 @@ class Segments(Batched):
 
 def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:
     """The part of each segment on the image's area (Liang and Barsky 1984); invalid where there is none."""
+    low, high = fractions_on_image(start, end, hw)
+    valid = low <= high
+    first, last = (_on_image(start, end, s, valid, hw) for s in (low, high))
+    return Segments(first, last, valid)
+
+
+def fractions_on_image(
+    start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW
+) -> tuple[Float[Tensor, "*n"], Float[Tensor, "*n"]]:
+    """From which to which fraction (0 at start, 1 at end) each segment is on the image: low > high where nowhere."""
     low, high = torch.zeros_like(start[..., 0]), torch.ones_like(start[..., 0])
     for a, b, limit in zip(start.unbind(-1), end.unbind(-1), (hw[1] - 0.5, hw[0] - 0.5)):
         moves = b - a
@@ -93,9 +103,7 @@ def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: 
         inside = (a >= -0.5) & (a <= limit)
         low = torch.maximum(low, torch.where(flat, torch.where(inside, 0.0, 2.0), torch.minimum(first, last)))
         high = torch.minimum(high, torch.where(flat, 1.0, torch.maximum(first, last)))
-    valid = low <= high
-    first, last = (_on_image(start, end, s, valid, hw) for s in (low, high))
-    return Segments(first, last, valid)
+    return low, high
 
 
 def _on_image(start: Tensor, end: Tensor, s: Tensor, valid: Tensor, hw: HW) -> Tensor:

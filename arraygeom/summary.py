@@ -45,6 +45,10 @@ class PairSummary(NamedTuple):
     depth_step: tuple[float, float] | None
 
 
+MOST_PIXELS = 1 << 18
+"""Pixels of alpha for which segments are computed; a sixteenth of them through lenses."""
+
+
 def summarise_cameras(rig: Rig) -> list[CameraSummary]:
     """One summary for each camera, in the rig's order; what needs calibration is None without it."""
     return [_camera(name, rig) for name in rig.names]
@@ -64,7 +68,7 @@ def _camera(name: str, rig: Rig) -> CameraSummary:
     focal = (float(camera.K[0, :2].norm()), float(camera.K[1, :2].norm()))
     footprint = None
     if rig.depth is not None:
-        near, far = (1000 * float(d) / math.sqrt(focal[0] * focal[1]) for d in rig.depth)
+        near, far = (float(1000 * d / math.sqrt(focal[0] * focal[1])) for d in rig.depth)
         footprint = near, far
     return CameraSummary(name, (w, h), field_of_view(camera), focal, footprint)
 
@@ -97,11 +101,12 @@ def _pair(alpha: str, beta: str, pair: Pair) -> PairSummary:
 
 
 def _segments(pair: Pair) -> tuple[float, tuple[float, float] | None]:
-    """Share of alpha's pixels with a segment, and its (median, largest) length, on every fourth pixel."""
-    x = pixel_grid(pair.alpha.hw)[::4, ::4]
-    alpha, beta = pair.cameras
-    straight = alpha.distortion is None and beta.distortion is None
-    found = sampling_locations(Epipolar() if straight else Curved(64), pair, x)
+    """Share of alpha's pixels with a segment, and its (median, largest) length; of every fourth pixel, or fewer."""
+    h, w = pair.alpha.hw
+    field, most = (Curved(64), MOST_PIXELS // 16) if pair.has_lens else (Epipolar(), MOST_PIXELS)
+    step = max(4, math.ceil(math.sqrt(h * w / most)))
+    x = pixel_grid((-(-h // step), -(-w // step))) * step
+    found = sampling_locations(field, pair, x)
     if isinstance(found, Segments):
         valid, length = found.valid, found.length
     else:
@@ -117,6 +122,6 @@ def _depth_step(pair: Pair, baseline: float) -> tuple[float, float] | None:
     """By the small-angle rule: depth^2 / (focal length of beta x baseline)."""
     if pair.depth is None or baseline == 0:
         return None
-    focal = float(pair.cameras[1].K[:2, :2].det().abs().sqrt())
-    near, far = (float(d) ** 2 / (focal * baseline) for d in pair.depth)
+    focal = pair.cameras[1].K[:2, :2].det().abs().sqrt()
+    near, far = (float(d.square() / (focal * baseline)) for d in pair.depth)
     return near, far

@@ -11,6 +11,7 @@ from torch import Tensor
 from .camera import AnyLensView, Camera, LensView
 from .pixels import coarse_grid, pixel_grid, product
 from .sampling import Interpolation, Sampled, sample
+from .tracing import needs_numbers
 
 WIDEST = math.radians(62)
 """How far off axis a pinhole view reaches: there it stretches outwards 4.5 times what it does in its middle."""
@@ -23,6 +24,7 @@ def pinhole_view(camera: AnyLensView, *, widest: float = WIDEST) -> AnyLensView:
     `rig.transformed(name, view.K @ camera.K^-1, view.hw)`. Raises ValueError for a batch of cameras, and for an image
     whose middle is outside its lens's range.
     """
+    needs_numbers("the size of a pinhole view", camera.K)
     if camera.K.ndim > 2:
         raise ValueError("a pinhole view is made of one camera at a time: take one of the batch")
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""Keeps the figures in README.md those that the commands print: `make readme`."""
+"""Keeps the figures in docs/results.md those that the commands print: `make readme`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pat.media.images import read_image, write_image
 class Readme:
     """Put what commands wrote between `<!-- NAME:begin -->` and `<!-- NAME:end -->` of a document."""
 
-    document: Path = Path("README.md")
+    document: Path = Path("docs/results.md")
     """The document to bring up to date."""
     block: UseAppendAction[tuple[str, ...]] = ()
     """NAME=FILE, once for each block."""

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
-from ..epipolar import FRONT
+from ..distortion import KANNALA_BRANDT
+from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
-from ..segments import Positions, Segments, sample_fractions
+from ..segments import Positions, Segments, fractions_on_image, sample_fractions
+from ..tracing import traced
 from ..undistortion import pinhole_view
 from .protocol import ReceptiveField
 from .straight import Epipolar
@@ -24,11 +27,12 @@ from .straight import Epipolar
 class Curved:
     """Depth samples through the lens models: `samples` positions from near to far, evenly spaced in beta's pixels.
 
-    Needs a calibrated pair; without lenses it is `Epipolar` sampled. The curve is followed at `nodes` depths
-    between the bounds (metres; the pair's own unless given), even in inverse depth, and the part of it on
-    beta's image is divided evenly. Positions are exact for their depths; the spacing, and where an edge of
-    the image cuts the curve, are to the accuracy of straight pieces between nodes. What a fisheye alpha sees
-    at 90 degrees or more off axis has no depth along the axis and no samples.
+    Needs a calibrated pair; without lenses it is `Epipolar` sampled. The part of each ray that can be on beta's image
+    is clipped in closed form, followed at `nodes` points (even in undistorted pixels, or in angle where beta sees more
+    than 75 degrees off axis), and what is on the image is divided evenly. `near` and `far` (metres) override the
+    pair's own. Positions are exact for their depths; with a lens the spacing, and where an edge of the image cuts the
+    curve, are to the accuracy of straight pieces between nodes. What a fisheye alpha sees at 90 degrees or more off
+    axis has no depth along the axis and no samples.
     """
 
     samples: int = 96
@@ -44,7 +48,7 @@ class Curved:
         curve = _Curve.of(pair, near, far, x)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
         nodes, seen = curve.at(even)
-        pieces = visible_pieces(nodes, seen & curve.ahead[..., None], pair.beta.hw)
+        pieces = visible_pieces(nodes, seen & curve.valid[..., None], pair.beta.hw)
         xy, seen = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x)))
         limits = xy.new_tensor([pair.beta.hw[1] - 0.5, pair.beta.hw[0] - 0.5])
         inside = ((xy > -0.5 - EDGE) & (xy < limits + EDGE)).all(-1)
@@ -103,15 +107,21 @@ EDGE = 0.25
 """How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge."""
 
 
-class _Curve(NamedTuple):
-    """The points a + w t in beta's frame, in units of their depth in alpha, with 1/w from near to far."""
+WIDE = math.tan(math.radians(75))
+"""A lens whose image reaches further than this from the axis, in undistorted focal lengths, is followed by angle."""
 
-    a: Tensor
-    t: Tensor
-    w_near: Tensor
-    w_far: Tensor
-    ahead: Tensor
+
+class _Curve(NamedTuple):
+    """The points from `first` (towards near) to `last` in beta's frame, in units of their depth in alpha.
+
+    Fractions go evenly in undistorted pixels, or in angle if `wide`.
+    """
+
+    first: Float[Tensor, "*n 3"]
+    last: Float[Tensor, "*n 3"]
+    valid: Bool[Tensor, "*n"]
     beta: Camera
+    wide: bool
 
     @classmethod
     def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> _Curve:
@@ -120,18 +130,74 @@ class _Curve(NamedTuple):
         rays, seen = alpha.rays(x)
         ahead = seen & (rays[..., 2] > FRONT)
         rays = rays / torch.where(ahead, rays[..., 2], 1.0)[..., None]
-        beside = (..., *[None] * (x.ndim - pose.t.ndim))
-        R, t = (v.movedim((-2, -1), (0, 1))[beside].movedim((0, 1), (-2, -1)) for v in (pose.R, pose.t[..., None]))
-        w_near, w_far = ((1 / d.to(x.dtype)) for d in (near, far))
-        w_near, w_far = (w[(..., *[None] * (x.ndim - w.ndim))] if w.ndim else w for w in (w_near, w_far))
-        return cls((R * rays[..., None, :]).sum(-1), t[..., 0], w_near, w_far, ahead, beta)
+        points = Track(_each(pose.R, rays), beside(pose.t, x.ndim, trailing=1))
+        limits = None if beta.distortion is None else undistorted_limits(beta)
+        if beta.distortion is None:
+            h, w = beta.hw
+            pixels = Track(_each(beta.K, points.a), _each(beta.K, points.b))
+            part = clipped(pixels, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
+        elif limits is None:
+            part = clipped(points, near, far, None, in_front=beta.distortion.model != KANNALA_BRANDT)
+        else:
+            part = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
+        w_far, w_near = (beside(1 / d.to(x.dtype), x.ndim - 1) for d in (far, near))
+        ends = (w_far + torch.where(part.valid, s, 0.0) * (w_near - w_far) for s in (part.high, part.low))
+        first, last = (points.a + v[..., None] * points.b for v in ends)
+        return cls(first, last, ahead & part.valid, beta, beta.distortion is not None and limits is None)
 
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
-        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way from near to far, and which it can see."""
-        w = self.w_near + fraction * (self.w_far - self.w_near)
-        X = self.a[..., None, :] + w[..., None] * self.t[..., None, :]
+        """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way from first to last, and which it can see."""
+        weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
+        s = (weights[1] / (weights[0] + weights[1]))[..., None]
+        X = torch.lerp(self.first[..., None, :], self.last[..., None, :], s)
         projected = self.beta.project_local(X)
         return projected.x, projected.valid & (X.square().sum(-1) > FRONT**2)
+
+    def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """How much of first and of last there is in the point whose pixel, without the lens, is a fraction u along."""
+        z0, z1 = (torch.where(self.valid, X[..., 2], 1.0)[..., None] for X in (self.first, self.last))
+        return (1 - u) * z1, u * z0
+
+    def _weights_in_angle(self, u: Tensor) -> tuple[Tensor, Tensor]:
+        """The same for the direction that has gone a fraction u of the angle between first and last."""
+        squared = torch.linalg.cross(self.first, self.last).square().sum(-1)
+        opens = squared > TINY
+        sine = torch.where(opens, torch.where(opens, squared, 1.0).sqrt(), 0.0)
+        angle = torch.atan2(sine, torch.where(opens, (self.first * self.last).sum(-1), 1.0))[..., None]
+        r0, r1 = (X.square().sum(-1, keepdim=True).clamp(min=FRONT**2).sqrt() for X in (self.first, self.last))
+        return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
+
+
+TINY = 1e-24
+"""Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction."""
+
+
+@torch.no_grad()
+def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
+    """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 % wider.
+
+    None if it reaches 75 degrees off axis, or over the range of its lens, and where numbers cannot decide (`traced`).
+    """
+    h, w = camera.hw
+    along = torch.linspace(0, 1, 17).to(camera.K)
+    zero, one = torch.zeros_like(along), torch.ones_like(along)
+    edges = torch.cat([torch.stack(e, -1) for e in ((along, zero), (along, one), (zero, along), (one, along))])
+    edges = (edges * edges.new_tensor([w, h]) - 0.5).reshape(*[1] * len(camera.batch_shape), -1, 2)
+    rays, valid = camera.rays(edges)
+    ahead = valid & (rays[..., 2] > 1e-3)
+    xy = rays[..., :2] / torch.where(ahead, rays[..., 2], 1.0)[..., None]
+    if traced() or not bool((ahead & (xy.square().sum(-1) < WIDE**2)).all()):
+        return None
+    low, high = xy.amin(-2), xy.amax(-2)
+    margin = 0.02 * (high - low)
+    return (*(low - margin).unbind(-1), *(high + margin).unbind(-1))  # type: ignore[return-value]
+
+
+def _each(M: Tensor, v: Tensor) -> Tensor:
+    """The product of matrices (*b, 3, 3) with vectors (*b, ..., 3)."""
+    axes = v.ndim - M.ndim + 1
+    M = M.reshape(*M.shape[:-2], *[1] * axes, 3, 3)
+    return (M * v[..., None, :]).sum(-1)
 
 
 class Pieces(NamedTuple):
@@ -143,18 +209,13 @@ class Pieces(NamedTuple):
 
 
 def visible_pieces(nodes: Float[Tensor, "*n k 2"], seen: Tensor, hw: HW) -> Pieces:
-    """The parts of a polyline that lie on the image, between nodes that are both `seen` (*n, k).
+    """The parts of a polyline that lie on the image, of pieces with a node that is `seen` (*n, k).
 
     A visible piece of no length counts as 1e-3 pixels, so that a curve that is a point is somewhere.
     """
-    limits = nodes.new_tensor([hw[1] - 0.5, hw[0] - 0.5])
-    room = torch.minimum(nodes + 0.5, limits - nodes).amin(-1)
-    here, there = room[..., :-1], room[..., 1:]
-    seen = seen[..., :-1] & seen[..., 1:] & ((here >= 0) | (there >= 0))
-    crosses = seen & ((here < 0) | (there < 0))
-    crossing = here / torch.where(crosses, here - there, 1.0)
-    first = torch.where(seen & (here < 0), crossing, 0.0)
-    last = torch.where(seen & (there < 0), crossing, 1.0)
+    first, last = fractions_on_image(nodes[..., :-1, :], nodes[..., 1:, :], hw)
+    seen = (seen[..., :-1] | seen[..., 1:]) & (first <= last)
+    first, last = torch.where(seen, first, 0.0), torch.where(seen, last, 1.0)
     step = torch.where(seen[..., None], nodes.diff(dim=-2), 0.0)
     length = (step.square().sum(-1) + 1e-6).sqrt() * (last - first)
     return Pieces(first, last, torch.where(seen, length, 0.0))

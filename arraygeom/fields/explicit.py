@@ -13,6 +13,7 @@ from ..homography import apply_homography
 from ..pixels import floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions
+from ..tracing import traced
 from .straight import require_straight
 
 
@@ -44,6 +45,8 @@ class NearestVoxels:
 
     def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:
         """Beside the line first; the whole window where that may not hold the nearest `count`."""
+        if traced():
+            return self._choose(self._window(centre), line, centre, pair)[:2]
         beside = 2 + self.count // (2 * self.window + 1)
         xy, mask, distance = self._choose(self._candidates(line, centre, beside), line, centre, pair)
         disparity = (beside + 0.5) * line[:, :2].abs().amax(-1)

@@ -134,7 +134,8 @@ def _widest(pair: Pair) -> Tensor:
                 [_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)], -2
             )
         index = disparity.flatten(-2).argmax(-1)
-        pair.memo["widest"] = grid.reshape(-1, 2)[index][..., None, :].to(pair.cameras[0].K)
+        chosen = grid.reshape(-1, 2).index_select(0, index.reshape(-1)).reshape(*index.shape, 1, 2)
+        pair.memo["widest"] = chosen.to(pair.cameras[0].K)
     return pair.memo["widest"]
 
 

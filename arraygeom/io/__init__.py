@@ -12,8 +12,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from ..atomic import write_text
-from ..camera import Camera
+from ..camera import Camera, LensView
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -29,9 +31,11 @@ from . import (
     multical,
     native,
     nerfstudio,
+    open3d,
     opencv,
     pycalib,
     ros,
+    strecha,
     syntim,
 )
 from .errors import RigFileError
@@ -54,6 +58,8 @@ READERS: dict[str, Any] = {
     "multical": multical,
     "aniposelib": aniposelib,
     "pycalib": pycalib,
+    "strecha": strecha,
+    "open3d": open3d,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {
@@ -66,12 +72,7 @@ WRITERS: dict[str, Any] = {
 
 # Recognised by a word in the file or by its suffix, and what to do instead.
 NOT_READ = {
-    ".camera": ("one camera of Strecha's data", "write K, R^T and -R^T t of all into a native rig file"),
     "<chunk": ("a Metashape project", "export its cameras in COLMAP's format"),
-    "PinholeCamera": (
-        "a file of Open3D",
-        "write intrinsic_matrix and extrinsic (X_camera = R X + t) into a native file",
-    ),
 }
 
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
@@ -99,6 +100,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         cause = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RigFileError(path, None, f"cannot be read as {format} ({cause}); is the file whole?") from error
     rig = rig if scale == 1.0 else _scaled(rig, scale)
+    _check_magnitudes(path, rig)
     if doubt := unit_warning(rig):
         RigSource(path).warn(doubt)
     return rig
@@ -153,6 +155,25 @@ def _left_out(rig: Rig, format: str) -> str:
         "sensors": any(sensor != Sensor() for sensor in sensors),
     }
     return ", ".join(name for name, is_stated in stated.items() if is_stated)
+
+
+SMALLEST_FOCAL, LARGEST_NUMBER = 1e-3, 1e9
+"""Bounds of focal lengths (pixels), of all of K, and of translations (metres). Beyond them pixels lose their digits."""
+
+
+def _check_magnitudes(path: Path, rig: Rig) -> None:
+    """Raise RigFileError for numbers that no camera has, whose squares or inverses are not numbers."""
+    for name, view in rig.cameras.items():
+        if isinstance(view, LensView):
+            size = float(view.K.abs().max())
+            if size > LARGEST_NUMBER or float(torch.linalg.svdvals(view.K[:2, :2]).min()) < SMALLEST_FOCAL:
+                raise RigFileError(
+                    path, name, f"has a K of numbers up to {size:g} or a focal length near 0: use pixels"
+                )
+        if isinstance(view, Camera) and float(view.t.abs().max()) > LARGEST_NUMBER:
+            raise RigFileError(path, name, f"has a translation of {float(view.t.abs().max()):g} m: use metres")
+    if rig.depth is not None and float(rig.depth[0]) < 1 / LARGEST_NUMBER:
+        raise RigFileError(path, "depth", f"begins at {float(rig.depth[0]):g} m: give a near bound in metres")
 
 
 def _scaled(rig: Rig, scale: float) -> Rig:

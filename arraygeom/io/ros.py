@@ -2,7 +2,8 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; metres. `projection_matrix` P = K' [I | t]
 acts on points of the *rectified* frame, which all cameras of a stereo pair share and which is the world here;
-`rectification_matrix` takes the camera's frame into it: X_cam = R_rect^T (X_world + t).
+`rectification_matrix` takes the camera's frame into it: X_cam = R_rect^T (X_world + t). A P of zeros states nothing:
+the camera is then at the world's origin, rotated by R_rect.
 """
 
 from __future__ import annotations
@@ -62,7 +63,8 @@ def _pose(source: RigSource, info: dict[str, Any]) -> Pose:
     rect_from_cam, t = Pose(R, torch.zeros(3, dtype=torch.float64)), torch.zeros(3, dtype=torch.float64)
     if "projection_matrix" in info:
         P = source.numbers(_data(source, info, "projection_matrix"), (3, 4), "projection_matrix")
-        t = torch.linalg.solve(source.intrinsics(P[:, :3], "projection_matrix"), P[:, 3])
+        if P.any():
+            t = torch.linalg.solve(source.intrinsics(P[:, :3], "projection_matrix"), P[:, 3])
     return rect_from_cam.inverse() @ Pose(torch.eye(3, dtype=torch.float64), t)
 
 

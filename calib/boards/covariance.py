@@ -60,8 +60,10 @@ class RigCovariance:
         try:
             document = json.loads(path.read_text(encoding="utf-8"))
             names, matrix = tuple(document["names"]), np.array(document["covariance"], dtype=np.float64)
-        except (ValueError, KeyError, TypeError):
+        except (ValueError, KeyError, OverflowError, RecursionError, TypeError):
             raise ValueError(f"{path}: is not a covariance file of this program") from None
+        if not all(isinstance(name, str) for name in names) or not np.isfinite(matrix).all():
+            raise ValueError(f"{path}: holds names that are no text, or NaN or infinity: calibrate again")
         if matrix.shape != (len(names), len(names)):
             raise ValueError(f"{path}: has {len(names)} names and a matrix of {matrix.shape}; is the file complete?")
         return cls(names, matrix)

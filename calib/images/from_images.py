@@ -24,6 +24,7 @@ class UncalibratedRig(NamedTuple):
 
     points: their number. distance: median distance of held-out points from their lines, pixels of beta. displacement:
     pixels of beta to either side of the rough map that contain the points. by_focal: whether focal lengths were used.
+    matches: the points.
     """
 
     rig: Rig
@@ -31,6 +32,7 @@ class UncalibratedRig(NamedTuple):
     distance: dict[tuple[str, str], float]
     displacement: dict[tuple[str, str], float]
     by_focal: dict[tuple[str, str], bool]
+    matches: dict[tuple[str, str], Matches]
 
     def as_text(self) -> str:
         """One line per link, and one on lenses if there are any."""
@@ -60,8 +62,10 @@ def rig_from_images(
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
-    found = UncalibratedRig(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {})
-    links, matched = {}, match_cameras(images)
+    found = UncalibratedRig(
+        Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, match_cameras(images)
+    )
+    links, matched = {}, found.matches
     for names, matches in matched.items():
         F, distance, by_focal = _fundamental(matches, *(K.get(name) for name in names))
         links[names] = fit_link(matches, F, within=AGREE).link

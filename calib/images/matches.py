@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from itertools import combinations
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from kornia.color import rgb_to_grayscale
 from numpy.typing import NDArray
 from torch import Tensor
@@ -70,14 +71,19 @@ class SiftFeatures(NamedTuple):
 
 def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
     """SIFT features of an image's luminance, its contrast equalised."""
-    grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
-    even = cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    even = contrast_equalised(image)
     sift = cv2.SIFT.create(FEATURES, enable_precise_upscale=True)
     found, descriptors = sift.detectAndCompute(even, np.empty(0, np.uint8))
     points = np.array([p.pt for p in found], np.float64).reshape(-1, 2)
     sizes, angles = (np.array([getattr(p, name) for p in found], np.float64) for name in ("size", "angle"))
     described = np.asarray(descriptors, np.float32) if len(found) else np.zeros((0, 128), np.float32)
     return SiftFeatures(points, sizes, np.radians(angles), described, even)
+
+
+def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
+    """An image's luminance, its contrast equalised (CLAHE)."""
+    grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
+    return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
 
 
 def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:
@@ -118,6 +124,9 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
     features = {name: detect_features(image) for name, image in images.items()}
+    for name, own in features.items():
+        if len(own.points) < ENOUGH:
+            raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
     found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
@@ -238,12 +247,14 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
 
 
 def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
-    """F by MAGSAC++ (Barath et al. 2020) to 1 px. Raises ValueError if none fits."""
+    """F by MAGSAC++ (Barath et al. 2020) to 1 px, or else by RANSAC. Raises ValueError if none fits."""
     x, y = (points.numpy() for points in matches)
-    try:
-        found, _ = cv2.findFundamentalMat(x, y, cv2.USAC_MAGSAC, 1.0, 0.999, 10_000)
-    except cv2.error:
-        found = None
+    found = None
+    for method in (cv2.USAC_MAGSAC, cv2.FM_RANSAC):
+        with suppress(cv2.error):
+            found, _ = cv2.findFundamentalMat(x, y, method, 1.0, 0.999, 10_000)
+        if found is not None and found.shape == (3, 3):
+            break
     if found is None or found.shape != (3, 3):
         raise ValueError("no fundamental matrix fits the points seen in both images")
     return torch.from_numpy(found)

@@ -24,6 +24,7 @@ from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
 from arraygeom.segments import Positions, Segments
+from arraygeom.tracing import transformations
 from pat.attention import reference, torch_op
 from pat.attention.reference import Attended, SamplePositions
 
@@ -206,9 +207,10 @@ def _run(
     measured: bool,
 ) -> Attended:
     chosen = _choose(backend, q.device.type)
-    if chosen != "reference" and _has_tangent(q, k, v, positions.points, bias):
-        if backend != "auto":
-            raise NotImplementedError(f"backend '{backend}' has no forward mode: ask for backend=\"reference\"")
+    missing = "" if chosen == "reference" else _missing(q, k, v, positions.points, bias)
+    if missing and backend != "auto":
+        raise NotImplementedError(f"backend '{backend}' has no {missing}: ask for backend=\"reference\"")
+    if missing:
         chosen = "reference"
     if chosen == "reference":
         return reference.attend(q, k, v, positions, bias, nearest)
@@ -216,11 +218,14 @@ def _run(
     return torch_op.attend(q, k, v, positions, bias, nearest, measured=measured, backend=chosen, strict=strict)
 
 
-def _has_tangent(*tensors: Tensor | None) -> bool:
-    """Whether forward-mode differentiation is under way."""
+def _missing(*tensors: Tensor | None) -> str:
+    """What is under way that compiled backends have not; empty if nothing."""
     if torch.compiler.is_compiling():
-        return False
-    return any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors)
+        return ""
+    under_way = transformations()
+    if "Jvp" in under_way or any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors):
+        return "forward mode"
+    return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 
 
 def _choose(backend: Backend, device: str) -> str:

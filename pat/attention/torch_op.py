@@ -85,6 +85,15 @@ def _(query, key, value, points, mask, bias, samples, straight, nearest, measure
     return out, points.new_empty((b, ha, wa, 4) if measured else 0), points.new_empty(b, ha, wa), best
 
 
+@_attend.register_vmap
+def _(info, in_dims, *inputs):
+    """One call for each element of the axis: the kernels have a batch axis, but of images of one rig."""
+    axes = zip(inputs, in_dims)
+    given = [[t if axis is None else t.select(axis, i) for i in range(info.batch_size)] for t, axis in axes]
+    outputs = [torch.stack(parts) for parts in zip(*(_attend(*one) for one in zip(*given)))]
+    return tuple(outputs), (0,) * len(outputs)
+
+
 @torch.library.custom_op(
     "pat::attend_backward",
     mutates_args=(),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Fixed, Positional, arg
 
 from . import options
-from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say
+from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
 
 if TYPE_CHECKING:
     from ..networks.protocol import FusionNetwork
@@ -63,12 +63,13 @@ class Evaluate:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
+        writable(self.out, folder=True)
         network, bands = load_weights(self.weights), protocols.PROTOCOLS[self.protocol]
         if self.conditions or self.only:
             return self._under_conditions(network, folders)
         wrong = protocols.controls(network, bands=bands) if self.controls else {}
         methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}
-        rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out)
+        rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out, half=self.half)
         every = [row for found in rows.values() for row in found]
         text = stereo.sets_markdown(rows, protocol=self.protocol)
         text += "\n" + stereo.falls(every, names=wrong) if wrong else ""
@@ -81,14 +82,14 @@ class Evaluate:
         from arraygeom.atomic import write_text
 
         from ..evaluation import conditions, stereo
+        from ..evaluation.halves import of_half
 
         names = self.only or tuple(conditions.CONDITIONS)
         unknown = [name for name in names if name not in conditions.CONDITIONS]
         if unknown:
             raise ValueError(f"--only: no condition '{unknown[0]}': there are {', '.join(conditions.CONDITIONS)}")
-        pairs = [
-            p for name, folder in folders.items() for p in conditions.of_half(stereo.DATA_SETS[name](folder), self.half)
-        ]
+        sets = [stereo.DATA_SETS[name](folder) for name, folder in folders.items()]
+        pairs = [pair for found in sets for pair in of_half(found, self.half)]
         if not pairs:
             raise ValueError(f"--half {self.half}: none of the pairs is of that half")
         rows = conditions.evaluate_conditions(pairs, network, names, progress=options.progress("evaluating"))

@@ -43,6 +43,7 @@ class Calibrate:
     def run(self) -> None:
         from calib.boards.run import calibrate_photos
 
+        options.writable(self.out)
         patterns = options.files_by_name(self.camera, "--camera")
         found = calibrate_photos(
             self.photos,
@@ -71,4 +72,4 @@ class PrintBoard:
     def run(self) -> None:
         from calib.boards.run import write_board
 
-        say(f"written: {write_board(self.board, self.out)}")
+        say(f"written: {write_board(self.board, options.writable(self.out))}")

@@ -4,21 +4,26 @@ from __future__ import annotations
 
 import shutil
 import sys
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
+from tyro.conf import Positional, UseAppendAction, arg
+
 from . import options
-from .options import Depth, FieldName, Images, Memory, Numbers, Out, RigFile, Weights, optional, say
+from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from arraygeom import Rig
+    from arraygeom import Camera, Rig
 
+    from ..fusion.report import Facts
     from ..fusion.results import Frame
 
 
@@ -26,30 +31,35 @@ if TYPE_CHECKING:
 class Fuse:
     """Fuse the images of an array into one image at alpha's view: a frame, many frames, or a sequence.
 
-    Example: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
+    Without a rig: pat fuse mono.png colour.png
+    With one: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused one by one:
-    the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised (frame_rate
-    and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
+    Without a rig it is found from the images, and written to rig.yaml beside the result. Cameras are then called as
+    their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused
+    one by one: the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised
+    (frame_rate and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {
+        "--rig": FIRST,
         "--carry": "--propagate",
         "--no-carry": "--no-propagate",
         "--match-levels": "--normalise-radiometry",
         "--no-match-levels": "--no-normalise-radiometry",
     }
 
-    rig: RigFile
-    alpha: Annotated[str, options.arg(metavar="NAME")]
-    """The camera whose view is wanted."""
-    image: Images
-    """An image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
+    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
+    """Rig file of any known format (also: --rig RIG); or, without one, an image, folder or video of each camera."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera whose view is wanted; without a rig by default the largest grey image."""
+    image: Images = ()
+    """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Out = Path("out")
-    """Folder for fused.png, confidence.png, depth.tif, depth.png and view.yaml (the rig of the fused view)."""
-    weights: Weights = "mono-colour"
+    """Folder for fused.png, confidence.png, depth.tif, depth.png, index.html (a page that shows them) and view.yaml
+    (the rig of the fused view)."""
+    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
     """Receptive field in the other cameras; auto takes what the rig allows."""
     max_memory: Memory = None
@@ -60,6 +70,13 @@ class Fuse:
     """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
     align: bool = True
     """Find how far the other cameras lie off their search segments, and put that right."""
+    exposure: Annotated[Literal["auto", "keep"] | None, optional("{auto,keep}")] = None
+    """Brightness of the fused image: auto makes a dark or overexposed one as bright as a photograph; keep leaves it as
+    alpha has it. By default auto without a rig, and keep with one."""
+    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate")]] = ()
+    """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly."""
+    keep_alpha: bool = False
+    """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -78,6 +95,10 @@ class Fuse:
     """Propagate colour along motion between frames of a sequence; else each is fused by itself, and flickers."""
     resume: bool = False
     """Fuse only frames that are not in --out yet, or whose images changed; of one frame, only unfinished tiles."""
+    points: bool = False
+    """Of a single frame, also write points.ply: the pixels of known depth as a coloured point cloud."""
+    report: bool = True
+    """Of a single frame, also write index.html: a page that shows images, confidence, depth and rig."""
     strict: bool = False
     """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
     on_error: Literal["stop", "skip"] = "stop"
@@ -88,9 +109,10 @@ class Fuse:
     """Address of a Dask scheduler whose workers fuse the frames, such as tcp://host:8786."""
     threads: Annotated[int | None, optional("INT")] = None
     """Threads in each process: by default 1 with several, else all cores."""
+    device: Literal["cpu", "cuda", "auto"] = "cpu"
+    """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
-        from ..fusion.batch import find_images
         from ..support.memory import parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
@@ -98,31 +120,97 @@ class Fuse:
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
         options.response_of(self.response)
+        self._notes: list[str] = []
+        with self._judged() as self._warnings:
+            self._with_rig() if self._rig_given() else self._without_rig()
+
+    def _rig_given(self) -> bool:
+        """Whether the first argument is a rig. Raises ValueError for arguments that do not go together.
+
+        Images that follow a rig are of the cameras that their names say.
+        """
+        if self.given and (self.image or is_rig_file(self.given[0])):
+            self.image = (*self.image, *(f"{path.stem}={path}" for path in self.given[1:]))
+            if not self.image:
+                raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
+            return True
+        if self.image or len(self.given) < 2:
+            raise ValueError(
+                "give two images or more, such as `pat fuse mono.png colour.png`; or a rig with "
+                "`--alpha NAME --image NAME=FILE --image NAME=FILE`"
+            )
+        return False
+
+    def _with_rig(self) -> None:
+        from ..fusion.batch import find_images
+        from ..fusion.views import ViewFiles
+
         rig = self._rig()
+        if self.alpha is None:
+            raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
         files = options.files_by_name(self.image)
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-        with self._judged():
-            if self.sequence or max(map(len, found.values())) > 1:
-                self._many(rig, found)
-            else:
-                self._one(rig, {name: paths[0] for name, paths in found.items()})
+        if self.sequence or max(map(len, found.values())) > 1:
+            return self._many(rig, found, self.alpha)
+        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
+        self._one(views.developed, views, self.alpha)
+
+    def _without_rig(self) -> None:
+        from .from_images import camera_names, files_of, frames_of_videos
+
+        only_with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
+        if named := [option for option, value in only_with_rig.items() if value]:
+            raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
+        cameras = camera_names(self.given)
+        videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
+        if videos and len(videos) < len(cameras):
+            others = [path for path in cameras.values() if path not in videos]
+            raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone")
+        if not videos:
+            return self._without_rig_from({name: files_of(path) for name, path in cameras.items()}, {})
+        with TemporaryDirectory() as folder:
+            self._without_rig_from(*frames_of_videos(cameras, Path(folder)))
+
+    def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
+        """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
+        from .from_images import array_of
+
+        first = {name: paths[0] for name, paths in files.items()}
+        options.say_when_compiling()
+        with options.working("finding the rig"):
+            array = array_of(first, alpha=self.alpha, weights=self.weights, say=say)
+        self.weights = array.weights
+        self.normalise_radiometry |= array.match_levels
+        self.exposure = self.exposure or "auto"
+        if max(map(len, files.values())) == 1:
+            return self._one(array.rig, array.images, array.alpha, found=array.notes)
+        rig = array.rig
+        for name, rate in rates.items():
+            if name in rig.names:
+                rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
+        self.sequence, self.video = self.sequence or bool(rates), rates.get(array.alpha, self.video)
+        self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
+        rig.save(self.out / "rig.yaml")
+        say(f"written: {self.out / 'rig.yaml'}")
 
     @contextmanager
-    def _judged(self) -> Iterator[None]:
-        """Exit status 3 if the rig does not fit the images."""
+    def _judged(self) -> Iterator[list[str]]:
+        """Exit status 3 if the rig does not fit the images. Gives the list of the warnings' texts."""
         from ..fusion.checks import LowConfidenceWarning, confidence_checked
 
         categories: list[type[Warning]] = []
+        texts: list[str] = []
         with confidence_checked(strict=self.strict):
             show = warnings.showwarning
 
             def noted(message: Warning | str, category: type[Warning], *further: Any, **options: Any) -> None:
                 categories.append(category)
+                texts.append(str(message))
                 show(message, category, *further, **options)
 
             warnings.showwarning = noted
             try:
-                yield
+                yield texts
             except Exception as error:
                 if not isinstance(error.__cause__ or error, LowConfidenceWarning):
                     raise
@@ -132,55 +220,101 @@ class Fuse:
             sys.exit(LowConfidenceWarning.exit_status)
 
     def _rig(self) -> Rig:
-        rig = options.load_rig(self.rig, self.depth)
+        rig = options.load_rig(self.given[0], self.depth)
         for name, rate in options.numbers_by_name(self.frame_rate, "--frame-rate").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
         for name, offset in options.numbers_by_name(self.time_offset, "--time-offset").items():
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
         return rig
 
-    def _one(self, rig: Rig, files: dict[str, Path]) -> None:
+    def _one(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None) -> None:
+        """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
+        from arraygeom import Camera
         from arraygeom.atomic import sweep
 
+        from ..fusion.report import write_report
         from ..fusion.results import save_frame, view_of
-        from ..fusion.views import ViewFiles
         from ..support.locks import folder_lock
 
-        images = ViewFiles(rig, files, alpha=rig.require(self.alpha))
-        rig = images.developed
-        store = self.out / ".tiles"
+        if self.points and not isinstance(rig[alpha], Camera):
+            raise ValueError("--points: needs a calibrated alpha, and the rig knows it by F alone: leave it out")
+        begin, store = time.monotonic(), self.out / ".tiles"
         with folder_lock(self.out):
             sweep(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
             frame = fuse_with_progress(
-                self.weights,
+                self.weights or "mono-colour",
                 rig,
                 images,
-                alpha=self.alpha,
+                alpha=alpha,
                 field=options.field_named(self.field),
                 max_memory=self.max_memory,
                 match_levels=self.normalise_radiometry,
                 response=options.response_of(self.response),
                 align=self.align,
-                explain=say,
+                explain=self._note,
+                noise=options.noise_of(self.noise),
+                keep_alpha=self.keep_alpha,
                 store=store,
+                device=self.device,
             )
-            view = view_of(rig, self.alpha, bits=self.bits, bands=len(frame.image))
-            written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view)
+            frame = self._exposed(frame)
+            view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
+            found_rig = rig if found is not None else None
+            written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig)
             shutil.rmtree(store, ignore_errors=True)
+            if self.points:
+                written.append(self._write_points(frame, rig[alpha]))
+            page = self.out / "index.html"
+            page.unlink(missing_ok=True)
+            if self.report:
+                facts = self._facts(found, time.monotonic() - begin)
+                written.append(write_report(page, frame, images, rig, alpha, facts))
         say(f"written: {', '.join(map(str, written))}")
 
-    def _many(self, rig: Rig, files: dict[str, list[Path]]) -> None:
+    def _write_points(self, frame: Frame, camera: Camera) -> Path:
+        from ..media.points import write_points
+
+        count = write_points(self.out / "points.ply", camera, frame.depth, frame.image)
+        self._note(f"points.ply: {count} points in alpha's frame")
+        return self.out / "points.ply"
+
+    def _facts(self, found: tuple[str, ...] | None, seconds: float) -> Facts:
+        """What the page says."""
+        from ..fusion.report import Facts
+        from ..support.memory import peak_memory
+
+        notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *(found or ())]
+        unit = "m" if found is None else "baselines"
+        return Facts(notes, self._warnings, seconds, peak_memory(), unit)
+
+    def _note(self, line: str) -> None:
+        """Say a line, and keep it for the page."""
+        say(line)
+        self._notes.append(line)
+
+    def _exposed(self, frame: Frame) -> Frame:
+        from ..media.exposure import exposed, exposure_gain
+
+        gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
+        if gain != 1:
+            what = "dark" if gain > 1 else "overexposed"
+            self._note(f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)")
+        return frame._replace(image=exposed(frame.image, gain))
+
+    def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        if self.noise:
+            raise ValueError("--noise is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,
-            rig.require(self.alpha),
+            rig.require(alpha),
             self.out,
-            weights=self.weights,
+            weights=self.weights or "mono-colour",
             sequence=self.sequence,
             speed=self.speed,
             field=options.field_named(self.field),
@@ -239,10 +373,38 @@ class Demo:
         say(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
 
 
-def fuse_with_progress(weights: str, rig: Rig, images: Mapping[str, Tensor], **further: Any) -> Frame:
-    """`fuse` with weights by name, the plan and a bar on the terminal."""
+def is_rig_file(path: Path) -> bool:
+    """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
+    named = any(c in path.name for c in "*?[") or path.suffix.lower() in options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
+    return not named and not path.is_dir()
+
+
+def fuse_with_progress(
+    weights: str, rig: Rig, images: Mapping[str, Tensor], *, device: str = "cpu", **further: Any
+) -> Frame:
+    """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
     from ..fusion.fuse import fuse
+    from ..fusion.results import Frame
     from ..networks.weights import load_weights
 
+    where = device_of(device)
+    network = load_weights(weights).to(where)
+    if where != "cpu":
+        rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
+    options.say_when_compiling()
     bar: Any = options.progress("fusing")
-    return fuse(load_weights(weights), rig, images, progress=bar, announce=lambda p: say(f"plan: {p}"), **further)
+    frame = fuse(network, rig, images, progress=bar, announce=lambda p: say(f"plan: {p}"), **further)
+    return Frame(*(part.cpu() for part in frame))
+
+
+def device_of(name: str) -> str:
+    """ "cpu" or "cuda". Raises ValueError for a GPU that is not there."""
+    if name == "cpu":
+        return name
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if name == "cuda":
+        raise ValueError("--device cuda: no CUDA device is available: leave it out, or install torch for CUDA")
+    return "cpu"

@@ -75,7 +75,7 @@ def _run(arguments: list[str], *, debug: bool) -> None:
         _fail(error, f"{error}", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
-    except (RuntimeError, LookupError, OverflowError) as error:
+    except (RuntimeError, LookupError, ArithmeticError) as error:
         _fail(error, f"{type(error).__name__}: {error} (--debug shows where)", debug)
 
 

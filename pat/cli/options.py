@@ -5,11 +5,15 @@ Nothing here or in the modules of the commands imports torch before a command ru
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import math
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
@@ -24,8 +28,23 @@ T = TypeVar("T")
 SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
 WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
-FieldName = Literal["auto", "epipolar", "line", "homography", "rectified", "nearest", "local", "dense", "curved"]
-FIELD_NAMES = get_args(FieldName)[1:]
+IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
+VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
+
+def _field_names() -> tuple[str, ...]:
+    """The keys of `arraygeom.fields.default.FIELDS`, from its text: importing it would import torch."""
+    package = importlib.util.find_spec("arraygeom")
+    folder = Path((package and package.origin) or "").parent
+    tree = ast.parse((folder / "fields" / "default.py").read_text(encoding="utf-8"))
+    made = next(n for n in tree.body if isinstance(n, ast.AnnAssign) and ast.unparse(n.target) == "FIELDS")
+    return tuple(ast.literal_eval(key) for key in made.value.keys if key)  # type: ignore[union-attr]
+
+
+FIELD_NAMES = _field_names()
+if TYPE_CHECKING:
+    FieldName = str
+else:
+    FieldName = Literal[("auto", *FIELD_NAMES)]
 
 
 def response_of(text: str) -> Any:
@@ -41,6 +60,30 @@ def response_of(text: str) -> Any:
     return red, green, blue
 
 
+def noise_of(texts: Iterable[str]) -> Any:
+    """The noise of `--noise estimate` or `--noise NAME=ELECTRONS[,READ]`; None without. Raises ValueError else."""
+    from ..sensors import NoiseLevel
+
+    entries = list(texts)
+    if entries == ["estimate"] or not entries:
+        return entries[0] if entries else None
+    levels = []
+    for entry in entries:
+        name, _, numbers = entry.partition("=")
+        try:
+            electrons, *read = (float(number) for number in numbers.split(","))
+        except ValueError:
+            raise ValueError(
+                f"--noise: '{entry}' is neither 'estimate' nor NAME=ELECTRONS[,READ], as mono=200,2"
+            ) from None
+        if len(read) > 1:
+            raise ValueError(
+                f"--noise: '{entry}' has {len(read) + 1} numbers; wanted electrons at white and read noise"
+            )
+        levels.append((name, NoiseLevel.of_electrons(electrons, sum(read))))
+    return dict(_once("--noise", levels))
+
+
 def optional(metavar: str) -> Any:
     """Marks an option that may be left out."""
     return arg(metavar=metavar, help_behavior_hint="")
@@ -54,7 +97,8 @@ MaybeOut = Annotated[Path | None, arg(metavar="PATH", aliases=["-o"], help_behav
 MaybePath = Annotated[Path | None, optional("PATH")]
 Depth = Annotated[tuple[float, float] | None, optional("NEAR FAR")]
 Memory = Annotated[str | None, optional("SIZE")]
-Weights = Annotated[str, arg(metavar="NAME|FILE", help=f"Weights: {', '.join(WEIGHT_NAMES)}, or a file.")]
+WEIGHTS_HELP = f"Weights: {', '.join(WEIGHT_NAMES)}, or a file."
+Weights = Annotated[str, arg(metavar="NAME|FILE", help=WEIGHTS_HELP)]
 
 FIRST, LAST = "first", "last"
 
@@ -82,6 +126,22 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
             raise ValueError(f"{option}: give a file")
         (first if new == FIRST else last).append(value)
     return [*first, *rest, *last]
+
+
+def writable(out: Path, *, folder: bool = False) -> Path:
+    """The path of --out, before the work whose result is to be written there.
+
+    Raises ValueError if it cannot be: a folder where a file is wanted, a file in its way, no permission.
+    """
+    if out.exists() and out.is_dir() != folder:
+        raise ValueError(f"--out: {out} is a {'folder: name a file in it' if out.is_dir() else 'file: name a folder'}")
+    above = out if out.exists() else next(p for p in out.absolute().parents if p.exists())
+    if above != out and not above.is_dir():
+        raise ValueError(f"--out: {above} is a file, so {out} cannot be made: give another path")
+    for place in {above, above if above.is_dir() else above.absolute().parent}:
+        if not os.access(place, os.W_OK):
+            raise ValueError(f"--out: {place} is not to be written to: give another path, or permission")
+    return out
 
 
 def field_named(name: str) -> ReceptiveField | None:
@@ -176,6 +236,35 @@ def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
     from rich.progress import track
 
     return lambda items, total: track(items, title, total=total, console=console())
+
+
+@contextmanager
+def working(title: str) -> Iterator[None]:
+    """A block during which the terminal shows a title and the seconds that have passed."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
+    with Progress(*columns, console=console(), transient=True) as bar:
+        bar.add_task(title, total=None)
+        yield
+
+
+def say_when_compiling() -> None:
+    """Say once, in one line, that numba compiles kernels, before it does: that takes up to a minute."""
+    from numba.core import event
+
+    class Compiling(event.Listener):
+        said = False
+
+        def on_start(self, event: object) -> None:
+            if not self.said:
+                self.said = True
+                say("compiling kernels for this machine, once")
+
+        def on_end(self, event: object) -> None:
+            pass
+
+    event.register("numba:compile", Compiling())
 
 
 def print_json(document: Any) -> None:

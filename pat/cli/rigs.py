@@ -38,6 +38,7 @@ class Show:
 
         from ..media.figures import save_figure
 
+        options.writable(self.out, folder=True)
         rig = load_rig(self.rig)
         alpha = rig.require(self.alpha or rig.names[0])
         images = options.read_images(rig, self.image)
@@ -180,8 +181,11 @@ class Doctor:
         from arraygeom.atomic import write_text
         from calib.images.doctor import diagnose
 
+        if self.out is not None:
+            options.writable(self.out)
         rig = load_rig(self.rig)
-        found = diagnose(rig, options.read_images(rig, self.image))
+        with options.working("matching features and trying mistakes"):
+            found = diagnose(rig, options.read_images(rig, self.image))
         if self.json:
             options.print_json(json.loads(found.as_json()))
         else:
@@ -230,16 +234,19 @@ class Refine:
 
         from ..attention import attend_with_statistics
 
+        options.writable(self.out)
         rig = load_rig(self.rig)
         deviations = options.numbers_by_name(self.sigma, "--sigma")
-        found = refine(
-            rig,
-            options.read_frames(rig, self.image),
-            free=[kind for text in self.free for kind in text.split(",")],
-            sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
-            attend=attend_with_statistics if self.photometric else None,
-            force=self.force,
-        )
+        options.say_when_compiling()
+        with options.working("matching features and refining"):
+            found = refine(
+                rig,
+                options.read_frames(rig, self.image),
+                free=[kind for text in self.free for kind in text.split(",")],
+                sigma={kind: math.radians(s) if kind == "rotation" else s for kind, s in deviations.items()},
+                attend=attend_with_statistics if self.photometric else None,
+                force=self.force,
+            )
         print(found.as_text())
         if not found.accepted:
             return say("no rig written" + (": --force writes it all the same" if found.objections else ""))
@@ -267,8 +274,10 @@ class RigFromImages:
 
         from ..media.images import read_image
 
+        options.writable(self.out)
         images = {name: read_image(path, name=name) for name, path in options.files_by_name(self.image).items()}
-        found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
+        with options.working("matching features and fitting lines"):
+            found = rig_from_images(images, focal=options.numbers_by_name(self.focal, "--focal"))
         print(found.as_text())
         found.rig.save(self.out)
         say(f"written: {self.out}")

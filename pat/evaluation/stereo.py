@@ -21,6 +21,7 @@ from ..data.pairs import (
     middlebury_pairs,
 )
 from ..media.images import write_image
+from .halves import Half, of_half
 from .metrics import bootstrap_interval, disparity_score, score
 from .protocols import PRINTED, MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
 from .tables import markdown_table
@@ -64,13 +65,19 @@ class StereoSummary(NamedTuple):
 
 
 def evaluate_sets(
-    folders: Mapping[str, Path], methods: Mapping[str, StereoMethod], rates: Sequence[int], *, out: Path
+    folders: Mapping[str, Path],
+    methods: Mapping[str, StereoMethod],
+    rates: Sequence[int],
+    *,
+    out: Path,
+    half: Half = "all",
 ) -> dict[str, list[StereoRow]]:
     """`evaluate_pairs` on data sets by name (see `DATA_SETS`): rows by set, a strip of images a pair in out/set.
+    Of the pairs of one half, or all.
 
     All folders are opened before the work begins: a missing one raises FileNotFoundError or ValueError.
     """
-    pairs = {name: DATA_SETS[name](folder) for name, folder in folders.items()}
+    pairs = {name: of_half(DATA_SETS[name](folder), half) for name, folder in folders.items()}
     return {name: evaluate_pairs(found, methods, rates, images=out / name) for name, found in pairs.items()}
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
+import torch
+
 from arraygeom import ReceptiveField, Rig
 
 from ..media.images import Images
@@ -14,6 +16,7 @@ from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
+from .low_light import Noise, denoised_views
 from .response import Given
 from .results import Frame
 from .steps import steps_for
@@ -39,9 +42,12 @@ def fuse(
     align: bool = True,
     corrections: Corrections | None = None,
     explain: Callable[[str], None] | None = None,
+    noise: Noise | None = None,
+    keep_alpha: bool = False,
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
+    differentiable: bool = False,
 ) -> Frame:
     """Fuse one frame at the view of camera `alpha`.
 
@@ -69,21 +75,32 @@ def fuse(
         align: find how far the betas lie across their search segments, and put that right.
         corrections: what is known of both from another frame of the same cameras (`corrections_of`), instead.
         explain: called with a line for each thing that was found and put right.
+        noise: the noise level of each camera that has some, or "estimate": views are denoised before they are matched,
+            and jointly once they are fused.
+        keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak of.
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
+        differentiable: keep gradients with respect to the numbers of the rig, the images and the network's weights
+            (which `requires_grad_(True)` frees). What semi-global matching finds, such as the position along each
+            segment, is a constant: gradients go through the segments and attention around that position. So are
+            `align` and `response`: without `align=False` a rig that is off is put right, and has hardly a gradient.
+            Else the frame is detached, whatever requires gradients.
         announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
         ValueError: a camera that the rig lacks, an image of another size, a rig whose views do not overlap, bands that
-            the network does not make.
+            the network does not make, `differentiable` with `max_memory` or `store`.
 
     Warns:
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error, as
             `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
+    if differentiable and not (max_memory is None and store is None):
+        raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
     limit = None if max_memory is None else parse_bytes(max_memory)
-    views = Views.of(rig, images, alpha=alpha, depth=depth, field=field)
+    quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
+    views = quiet.views
     inputs, undo = _prepared(network, views, match_levels)
     plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
     if announce:
@@ -94,12 +111,17 @@ def fuse(
             explain(line)
     inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
     state = network.prepare(inputs.inputs)
-    frame = fused_in_tiles(network, inputs, state, plan.tiles, progress=progress, store=store)
+    with torch.set_grad_enabled(differentiable):
+        wrapped = quiet.wrapped(network)
+        frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
+        frame, matched = quiet.split(frame, len(inputs.inputs.betas))
     warn_of_confidence(network, frame, inputs)
     frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
-    for back in (found.undone, *undo):
+    steps = steps_for(network, normalise=match_levels)
+    frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+    for back in undo:
         frame = back(frame)
-    return frame
+    return frame if differentiable else Frame(*(part.detach() for part in frame))
 
 
 def corrections_of(

@@ -90,12 +90,12 @@ class Response(NamedTuple):
         shading = ", of beta freed of vignetting" if self.shading else ""
         return f"alpha is {red:.2f} R + {green:.2f} G + {blue:.2f} B{gain}{gamma}{shading}"
 
-    def of_alpha(self, alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
+    def of_alpha(self, alpha: Float[Tensor, "*b 1 h w"]) -> Float[Tensor, "*b 1 h w"]:
         """Alpha on the scale of `of_beta`'s luma."""
         total = float(self.weights.sum())
         return alpha if total == 1 else alpha / total
 
-    def of_beta(self, beta: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    def of_beta(self, beta: Float[Tensor, "*b 3 h w"]) -> Float[Tensor, "*b 3 h w"]:
         """Beta at alpha's exposure, sheared along grey so that its Rec. 601 luma is what alpha sees."""
         even = beta * self._brightening(beta) if self.shading else beta
         scaled = self.gain * (even if self.gamma == 1 else even.clamp(min=0) ** self.gamma)

@@ -27,15 +27,16 @@ def save_frame(
     bits: int = 8,
     kind: ImageFormat = "png",
     view: Rig | None = None,
+    rig: Rig | None = None,
     name: str = "",
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (near is bright).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (red is near).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so. With a `name` the files are name_fused.png and so on. Without any
-    known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on,
-    their mean to fused.png. The image comes last: where it is, the others are of the same frame. After an error all
-    former files are as they were.
+    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml. With a `name` the
+    files are name_fused.png and so on. Without any known depth there are no depth files. Bands that are not one or
+    three go to fused_1.png, fused_2.png and so on, their mean to fused.png. The image comes last: where it is, the
+    others are of the same frame. After an error all former files are as they were.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""
@@ -47,6 +48,8 @@ def save_frame(
             write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth))
         if view is not None:
             view.save(folder / "view.yaml")
+        if rig is not None:
+            rig.save(folder / "rig.yaml")
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         if len(image) not in (1, 3):
             for i, band in enumerate(image, 1):

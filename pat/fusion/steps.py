@@ -299,5 +299,5 @@ def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
-    x, valid = apply_homography(pair.homography.double(), steps)
+    x, valid = apply_homography(pair.homography.detach().double(), steps)
     return x[1:] - x[:1] if bool(valid.all()) else None

@@ -128,6 +128,7 @@ class Probe(NamedTuple):
     fusing: float
 
     @classmethod
+    @torch.no_grad()
     def of(cls, network: FusionNetwork, frame: FrameInputs) -> Probe:
         """Prepare and fuse a small piece, as loops may have to be compiled, and then one to measure."""
         side = min(max(math.sqrt(math.prod(frame.hw) * PROBED), PROBE[0]), PROBE[1])
@@ -170,8 +171,7 @@ def fuse_tile(network: FusionNetwork, frame: FrameInputs, state: State | None, t
 def _fused(network: FusionNetwork, inputs: Inputs, state: State | None, frame: FrameInputs, tile: Tile) -> Frame:
     top, bottom, left, right = tile.outer
     hw = bottom - top, right - left
-    with torch.no_grad():
-        output = network(inputs, state)
+    output = network(inputs, state)
     depth, confidence = depth_and_confidence(output, inputs, frame.placements, hw, (left, top))
     rows = slice(tile.inner[0] - top, tile.inner[1] - top)
     columns = slice(tile.inner[2] - left, tile.inner[3] - left)
@@ -180,9 +180,11 @@ def _fused(network: FusionNetwork, inputs: Inputs, state: State | None, frame: F
 
 
 def assembled(hw: HW, parts: Iterable[tuple[Tile, Frame]]) -> Frame:
-    """The frame from its tiles."""
+    """The frame from its tiles; a single one as it is, with its gradients."""
     frame: list[Tensor] = []
     for tile, found in parts:
+        if tile == whole(hw):
+            return found
         frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in found]
         top, bottom, left, right = tile.inner
         for target, part in zip(frame, found):

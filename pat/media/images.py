@@ -32,6 +32,9 @@ MOST_PIXELS = 2**28
 _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 
 
+_HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
+
+
 @runtime_checkable
 class Images(Protocol):
     """Images (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`)."""
@@ -65,8 +68,9 @@ def read_image(
     hw: HW | None = None,
     orientation: Literal["apply", "ignore"] = "apply",
 ) -> Float[Tensor, "c h w"]:
-    """The image in a PNG, TIFF, JPEG, PNM, BMP or WebP file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
+    """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
+    HEIC, which needs the extra `heic`, has 8 bits here.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
     must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
@@ -83,6 +87,8 @@ def read_image(
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = path.read_bytes()
+    if content[4:12] in _HEIF:
+        content = _png_of_heif(path, label)
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
@@ -128,6 +134,21 @@ def write_image(
         temporary.write_bytes(content)
 
 
+def _png_of_heif(path: Path, label: str) -> bytes:
+    """The image of a HEIC or HEIF file, upright, as a PNG file."""
+    try:
+        import pillow_heif
+    except ImportError:
+        raise ValueError(
+            f"{label}: reading HEIC needs the package pillow-heif: pip install 'arraygeom-pat[heic]', or save it as PNG"
+        ) from None
+    try:
+        image = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=True))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"{label}: not a HEIC image that can be read ({error}): save it as PNG") from None
+    return cv2.imencode(".png", image if image.ndim == 2 else image[..., [2, 1, 0]])[1].tobytes()
+
+
 def _applied(header: ImageHeader, orientation: str, label: str) -> int:
     """The orientation to apply, 1 for none; a tag is reported either way."""
     if header.orientation == 1:
@@ -169,7 +190,7 @@ def _decode(content: bytes, header: ImageHeader, label: str) -> tuple[NDArray, i
 
     OpenCV shifts packed values up to 16 bits.
     """
-    values = _decode_bytes(np.frombuffer(_without_orientation(content, header), np.uint8))
+    values = decoded(_without_orientation(content, header))
     if values is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF or JPEG file")
     if values.shape[:2] != header.hw:
@@ -194,10 +215,11 @@ def _log_level(level: int) -> int:
     return int(logging.setLogLevel(level))
 
 
-def _decode_bytes(content: NDArray) -> NDArray | None:
+def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
+    """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
     level = _log_level(0)
     try:
-        return cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     except cv2.error:
         return None
     finally:

@@ -1,12 +1,15 @@
-"""Frames to a video file."""
+"""Frames to a video file, and from one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import NamedTuple
 
+import cv2
 import numpy as np
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -42,3 +45,30 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
         if stream is None:
             raise ValueError(f"{path}: a video needs at least one frame")
         file.mux(stream.encode())
+
+
+class Video(NamedTuple):
+    """The frames of a video file, (3, H, W), 0..1, read as they are asked for, and how many there are a second."""
+
+    frames: Iterator[Float[Tensor, "3 h w"]]
+    rate: float
+
+
+def read_video(path: str | Path) -> Video:
+    """A video of any format that OpenCV reads. Raises FileNotFoundError, or ValueError for no video."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such video: check the path")
+    video = cv2.VideoCapture(str(path))
+    rate = video.get(cv2.CAP_PROP_FPS)
+    if not video.isOpened() or not rate > 0:
+        raise ValueError(f"{path}: not a video that can be read: convert it to .mp4, or save images from it")
+    return Video(_frames(video), rate)
+
+
+def _frames(video: cv2.VideoCapture) -> Iterator[Float[Tensor, "3 h w"]]:
+    done, frame = video.read()
+    while done:
+        yield torch.from_numpy(np.ascontiguousarray(frame[..., ::-1].transpose(2, 0, 1))).float() / 255
+        done, frame = video.read()
+    video.release()

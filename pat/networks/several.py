@@ -28,7 +28,7 @@ FARTHEST = 8.0
 """A difference of disparities of this many half-size pixels is 1 in the facts, as in semi-global matching."""
 
 
-class View(NamedTuple):
+class MatchedBeta(NamedTuple):
     """One beta at the centres of alpha's blocks, (h, w): segments, tracks, matches and their facts."""
 
     segments: Segments
@@ -38,7 +38,7 @@ class View(NamedTuple):
     hw: tuple[int, int]
 
     @classmethod
-    def of(cls, beta: Beta, found: SemiGlobalMatches) -> View:
+    def of(cls, beta: Beta, found: SemiGlobalMatches) -> MatchedBeta:
         """Of a beta with a track, and its own matches."""
         blocks, disparity = beta.field.of_blocks(FINE), found.disparity[0, 0]
         segments = Segments(blocks.start[0], blocks.end[0], blocks.valid[0])
@@ -89,7 +89,7 @@ def can_agree(inputs: Inputs) -> bool:
 
 def agreed(inputs: Inputs, found: tuple[SemiGlobalMatches, ...]) -> list[tuple[Tensor, Tensor]]:
     """`disparity` and `facts` of each beta, from the inverse depths on which the matches agree."""
-    views = [View.of(beta, matches) for beta, matches in zip(inputs.betas, found)]
+    views = [MatchedBeta.of(beta, matches) for beta, matches in zip(inputs.betas, found)]
     inverse_depth, facts, known = _chosen(views)
     guide = to_bytes(torch.nn.functional.avg_pool2d(inputs.alpha, FINE)[0, 0])
     scale = max(float(inverse_depth.max()), 1e-9)
@@ -101,7 +101,7 @@ def agreed(inputs: Inputs, found: tuple[SemiGlobalMatches, ...]) -> list[tuple[T
 
 
 def _of_view(
-    view: View, inverse_depth: Tensor, facts: Tensor, known: Tensor, like: Tensor
+    view: MatchedBeta, inverse_depth: Tensor, facts: Tensor, known: Tensor, like: Tensor
 ) -> tuple[Float[Tensor, "1 1 h w"], Float[Tensor, "1 3 h w"]]:
     disparity = view.disparity_of(inverse_depth).clamp(min=0).minimum(view.segments.length)
     unlike = (view.hidden(inverse_depth) / (FINE * FARTHEST)).clamp(0, 1)
@@ -109,7 +109,7 @@ def _of_view(
     return disparity[None, None].to(like), torch.cat([unlike[None], facts])[None].to(like)
 
 
-def _chosen(views: list[View]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "2 h w"], Bool[Tensor, "h w"]]:
+def _chosen(views: list[MatchedBeta]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "2 h w"], Bool[Tensor, "h w"]]:
     """The inverse depth that is supported best, margin and cost of its matches, and where any match is consistent."""
     proposals = [view.inverse_depth for view in views]
     weights = torch.stack([known * (0.1 + view.facts[1]) for view, (_, known) in zip(views, proposals)])
@@ -126,6 +126,6 @@ def _chosen(views: list[View]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "2 h
     return inverse_depth, torch.stack([margin, cost]), taken.any(0)
 
 
-def _supported(views: list[View], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:
+def _supported(views: list[MatchedBeta], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:
     """The weights of the betas whose matches are near a proposed inverse depth."""
     return torch.stack([w * (view.differs(inverse_depth) < SUPPORT) for view, w in zip(views, weights)])

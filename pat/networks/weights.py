@@ -13,18 +13,21 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from ..support.schema import from_document
-from ..support.tensor_files import write_tensors
+from ..support.tensor_files import undamaged, write_tensors
 from .bandwise import BandwisePAT, BandwisePATConfig
+from .denoiser import DenoiserConfig, LowLightNetwork
 from .guided import GuidedPAT, GuidedPATConfig
 from .paper import PAT, PATConfig
 
 SHIPPED = Path(__file__).parent / "shipped"
+DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
 NETWORKS = {
     "PAT": (PAT, PATConfig),
     "GuidedPAT": (GuidedPAT, GuidedPATConfig),
     "BandwisePAT": (BandwisePAT, BandwisePATConfig),
 }
+DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
 LARGEST, MOST_ENTRIES = 1024, 16
 """Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
@@ -33,7 +36,9 @@ MAY_BE_ZERO = ("head_dim",)
 Network = PAT | GuidedPAT | BandwisePAT
 
 
-def save_weights(network: Network, path: str | Path, *, facts: Mapping[str, str] | None = None) -> None:
+def save_weights(
+    network: Network | LowLightNetwork, path: str | Path, *, facts: Mapping[str, str] | None = None
+) -> None:
     """Write a network's weights and configuration; the file is written atomically.
 
     `facts` (recipe, seed, figures) are kept beside them, as text.
@@ -52,17 +57,29 @@ def load_weights(name: str | Path) -> Network:
 
     Raises FileNotFoundError for neither, ValueError for a file that is not of this format or does not fit.
     """
-    path = find_weights(name)
+    return _load(find_weights(name), NETWORKS)
+
+
+def load_denoiser(path: str | Path = DENOISER) -> LowLightNetwork:
+    """The network that removes noise: the shipped one, or that of a weights file. Raises as `load_weights`."""
+    return _load(Path(path), DENOISERS)
+
+
+def _load(path: Path, networks: Mapping[str, tuple[Any, Any]]) -> Any:
+    """The network of a file, of one of these kinds, in use."""
     try:
         with safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             keys = {renamed(key): key for key in file.keys()}  # noqa: SIM118
-            network, config = _described(path, metadata)
+            network, config = _described(path, metadata, networks)
             shapes = {name: tuple(file.get_slice(key).get_shape()) for name, key in keys.items()}
             _check_shapes(path, network, config, shapes)
-            state = {name: file.get_tensor(key) for name, key in keys.items()}
+            stored = {key: file.get_tensor(key) for key in keys.values()}
     except (SafetensorError, OSError) as error:
         raise ValueError(f"{path}: not a safetensors file ({error}); was it copied whole?") from None
+    if not undamaged(stored, metadata):
+        raise ValueError(f"{path}: its numbers are not those that were written: copy it again")
+    state = {name: stored[key] for name, key in keys.items()}
     for name, tensor in state.items():
         if not tensor.is_floating_point() or not tensor.float().isfinite().all():
             raise ValueError(
@@ -110,14 +127,16 @@ def find_weights(name: str | Path) -> Path:
     raise FileNotFoundError(f"no weights '{name}': neither a file nor one of {', '.join(shipped())}")
 
 
-def _described(path: Path, metadata: Mapping[str, str]) -> tuple[Callable[..., Network], Any]:
+def _described(
+    path: Path, metadata: Mapping[str, str], networks: Mapping[str, tuple[Any, Any]]
+) -> tuple[Callable[..., nn.Module], Any]:
     """The class of the network that a file describes, and its configuration, of plausible numbers."""
     if metadata.get("format", "").startswith("pat-checkpoint"):
         raise ValueError(f"{path}: a checkpoint of training: the weights are in best.safetensors, a folder above")
-    if metadata.get("format") != FORMAT or metadata.get("network") not in NETWORKS:
+    if metadata.get("format") != FORMAT or metadata.get("network") not in networks:
         found = f"it is '{metadata.get('format')}' of a {metadata.get('network')}" if metadata else "it says nothing"
         raise ValueError(f"{path}: not weights of this package ('{FORMAT}' is wanted in the file's metadata, {found})")
-    network, kind = NETWORKS[metadata["network"]]
+    network, kind = networks[metadata["network"]]
     try:
         values = json.loads(metadata["config"])
         document = {renamed(key): value for key, value in values.items()} if isinstance(values, dict) else values
@@ -140,13 +159,14 @@ def _check_numbers(name: str, value: object) -> None:
 
 
 def _check_shapes(
-    path: Path, network: Callable[..., Network], config: object, shapes: Mapping[str, tuple[int, ...]]
+    path: Path, network: Callable[..., nn.Module], config: object, shapes: Mapping[str, tuple[int, ...]]
 ) -> None:
     """Compare the shapes with the network's before it, or any tensor, takes memory."""
     try:
         with torch.device("meta"):
-            wrong = _misfit(network(config), shapes)
+            made = network(config)
+            wrong = _misfit(made, shapes)
     except Exception as error:  # whatever a constructor runs into, the cause is the configuration
         raise ValueError(f"{path}: its configuration makes no network ({' '.join(str(error).split())[:200]})") from None
     if wrong:
-        raise ValueError(f"{path}: the weights do not fit the {network.__name__} that the file describes: {wrong}")
+        raise ValueError(f"{path}: the weights do not fit the {type(made).__name__} that the file describes: {wrong}")

@@ -14,6 +14,7 @@ from .cases import DegradationCase, Pairs, augment, paper_cases
 from .chain import LitStep, OpticalImage, Recorded, RecordedArray, Step, generator_for, record, record_array, seed_for
 from .electronics import Clip, Exposure, Jitter, Noise, Quantise
 from .grids import Crop, Demosaic, Mosaic, Resample
+from .noise_level import NoiseLevel
 from .optics import BoxBlur, Defocus, DiscBlur, GaussianBlur, MotionBlur, Vignetting, circle_of_confusion
 from .recipe import STEPS, read_cases, read_chain, read_chains
 from .spectral import DecodeSRGB, EncodeSRGB, Gamma, Spectral, band_weights, curve_weights
@@ -37,6 +38,7 @@ __all__ = [
     "Mosaic",
     "MotionBlur",
     "Noise",
+    "NoiseLevel",
     "OpticalImage",
     "Pairs",
     "Quantise",

@@ -37,11 +37,11 @@ def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
 
     `wait4` would count what the parent had resident when it started the process.
     """
-    status, found = Path(f"/proc/{pid}/status"), [0.0]
+    found = [0.0]
 
     def watch() -> None:
-        while (line := re.search(r"VmHWM:\s+(\d+) kB", _text(status))) is not None:
-            found[0] = float(line[1]) * 2**10
+        while (resident := peak_memory(pid)) is not None:
+            found[0] = resident
             time.sleep(every)
 
     watching = Thread(target=watch, daemon=True)
@@ -52,6 +52,12 @@ def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:
         return found[0]
 
     return peak
+
+
+def peak_memory(pid: int | str = "self") -> float | None:
+    """Peak resident bytes of a process, by default of this one; None where the system does not say (Linux does)."""
+    line = re.search(r"VmHWM:\s+(\d+) kB", _text(Path(f"/proc/{pid}/status")))
+    return None if line is None else float(line[1]) * 2**10
 
 
 def _text(path: Path) -> str:

@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ..media.headers import image_header
+from ..media.images import MOST_PIXELS, decoded
 from .patterns import patterns, recoloured
 
 LEVELS = 6
@@ -56,7 +58,7 @@ class PhotoBank:
         on later ones; it is not checked against the folders. `choose` selects images by number, to hold
         some out. Raises ValueError where no image is found.
         """
-        images = _cached(cache) if cache and Path(cache).exists() else _read(folders, max_edge)
+        images = _cached(cache) if cache and Path(cache).exists() else read_photographs(folders, max_edge)
         if cache and not Path(cache).exists():
             np.savez(cache, *images)
         images = [p for i, p in enumerate(images) if choose(i)]
@@ -92,6 +94,12 @@ class PhotoBank:
         high = self._bilinear(index + 1, half_pixel * (0.5 * scale) - 0.5)
         return torch.lerp(low, high, weight)
 
+    def window(self, texture: int, level: int, xy: tuple[int, int], side: int) -> Float[Tensor, "3 side side"]:
+        """A square of a texture at one level, its first pixel at (x, y), repeated by mirroring."""
+        w, h = self.wh[texture, level].tolist()
+        x, y = (_mirrored(start + torch.arange(side), torch.tensor(n)) for start, n in zip(xy, (w, h)))
+        return self._fetch(int(self.starts[texture, level]) + w * y[:, None] + x)
+
     def _bilinear(self, index: Tensor, xy: Tensor) -> Tensor:
         """Colours at positions (2, n) of the level with flat index."""
         start = self.starts.view(-1)[index]
@@ -118,7 +126,8 @@ def _mirrored(i: Tensor, n: Tensor) -> Tensor:
     return torch.minimum(i.clamp_(min=0), n - 1)
 
 
-def _read(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
+def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.ndarray]:
+    """RGB bytes of all images under the folders, reduced to `max_edge` pixels. Raises ValueError if there is none."""
     paths = sorted(p for f in folders for p in Path(f).rglob("*") if p.suffix.lower() in _SUFFIXES)
     images = [_reduced(p, max_edge) for p in map(_decoded, paths) if p is not None]
     if not images:
@@ -132,8 +141,12 @@ def _cached(path: str | Path) -> list[np.ndarray]:
 
 
 def _decoded(path: Path) -> np.ndarray | None:
-    """RGB bytes, or None for a file that is no image or is too small to be a texture."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    """RGB bytes, or None for a file that is no image, or one too small or too large to be a texture."""
+    content = path.read_bytes()
+    header = image_header(content)
+    if header is None or not (min(header.hw) >= _MULTIPLE and header.hw[0] * header.hw[1] <= MOST_PIXELS):
+        return None
+    image = decoded(content, cv2.IMREAD_COLOR)
     if image is None or min(image.shape[:2]) < _MULTIPLE:
         return None
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

@@ -19,7 +19,7 @@ def save_demo_figure(sample: SampleArray, baseline: Tensor, frame: Frame, path: 
         "ground truth": sample.ground_truth,
         "classical": baseline,
         "fusion": frame.image,
-        "depth (bright is near)": colour_depth(frame.depth),
+        "depth (red is near)": colour_depth(frame.depth),
         "confidence": frame.confidence[None],
         "fusion's error x 5": (frame.image.clamp(0, 1) - sample.ground_truth).abs() * 5,
     }

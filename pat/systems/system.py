@@ -233,7 +233,7 @@ def _still(
     white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
     panels |= {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
-    panels |= {"depth (bright is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
+    panels |= {"depth (red is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
     return [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth), *extra, *memory], panels
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shutil
 from collections.abc import Mapping
@@ -15,12 +16,18 @@ from torch.optim import Optimizer
 from torch.optim.swa_utils import AveragedModel
 
 from pat.networks.weights import misfit
-from pat.support.tensor_files import write_tensors
+from pat.support.tensor_files import undamaged, write_tensors
 
 FORMAT = "pat-checkpoint 1"
 RETAINED = 2
-FACTS = {"step", "best", "minutes", "done", "recipe"}
-"""What a checkpoint says beside its tensors."""
+FACTS: Mapping[str, tuple[type, ...]] = {
+    "step": (int,),
+    "best": (float, int),
+    "minutes": (float, int),
+    "done": (bool,),
+    "recipe": (str,),
+}
+"""What a checkpoint says beside its tensors, and the types of it."""
 
 
 class Checkpoint(NamedTuple):
@@ -44,17 +51,26 @@ def restore(checkpoint: Checkpoint, network: nn.Module, optimiser: Optimizer, av
     parts: dict[str, dict[str, Tensor]] = {"network": {}, "average": {}, "optimiser": {}}
     for name, tensor in checkpoint.tensors.items():
         part, _, rest = name.partition("/")
-        parts[part][rest] = tensor
-    wrong = misfit(network, parts["network"])
+        parts.setdefault(part, {})[rest] = tensor
+    wrong = misfit(network, parts["network"]) or misfit(average, parts["average"])
     if wrong:
         raise ValueError(f"the checkpoint is of another network ({wrong}): give its own recipe, or another --out")
     network.load_state_dict(parts["network"])
     average.load_state_dict(parts["average"])
+    optimiser.load_state_dict(optimiser.state_dict() | {"state": _state(parts["optimiser"], optimiser)})
+
+
+def _state(tensors: Mapping[str, Tensor], optimiser: Optimizer) -> dict[int, dict[str, Tensor]]:
+    """An optimiser's state by the number of its parameter. Raises ValueError if it is not of such parameters."""
+    shapes = [tuple(p.shape) for group in optimiser.param_groups for p in group["params"]]
     state: dict[int, dict[str, Tensor]] = {}
-    for name, tensor in parts["optimiser"].items():
+    for name, tensor in tensors.items():
         i, _, key = name.partition("/")
-        state.setdefault(int(i), {})[key] = tensor
-    optimiser.load_state_dict(optimiser.state_dict() | {"state": state})
+        number = int(i) if i.isdecimal() else len(shapes)
+        if number >= len(shapes) or tuple(tensor.shape) not in ((), shapes[number]):
+            raise ValueError(f"the checkpoint is of another optimiser ({name}): give its own recipe, or another --out")
+        state.setdefault(number, {})[key] = tensor
+    return state
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> Path:
@@ -96,10 +112,16 @@ def read_checkpoint(path: Path) -> Checkpoint | None:
             metadata = file.metadata() or {}
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
         facts = json.loads(metadata.get("facts", "null"))
-    except (SafetensorError, OSError, ValueError):
+    except (SafetensorError, OSError, RecursionError, ValueError):
         return None
-    whole = metadata.get("format") == FORMAT and isinstance(facts, dict) and facts.keys() >= FACTS
+    whole = metadata.get("format") == FORMAT and _are_facts(facts) and undamaged(tensors, metadata)
     return Checkpoint(tensors, facts) if whole else None
+
+
+def _are_facts(facts: object) -> bool:
+    if not isinstance(facts, dict) or not all(type(facts.get(name)) in kinds for name, kinds in FACTS.items()):
+        return False
+    return facts["step"] >= 0 and 0 <= facts["minutes"] < math.inf and not math.isnan(facts["best"])
 
 
 def _files(folder: Path) -> list[Path]:

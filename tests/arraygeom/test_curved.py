@@ -1,5 +1,6 @@
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 
@@ -24,6 +25,7 @@ from arraygeom import (
     sampling_locations,
 )
 from arraygeom.pixels import pixel_grid
+from tests.arraygeom import explicit
 from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
 
 FISHEYE = Distortion("kannala-brandt", torch.tensor([0.1, -0.05, 0.02, -0.004], dtype=torch.float64))
@@ -238,3 +240,51 @@ def test_fields_of_links_refuse_lenses(field):
         field(rig.pair("alpha", "beta"), torch.tensor([[30.0, 20.0]]))
     plain = rig.with_camera("beta", View(hw=rig["beta"].hw))
     field(plain.pair("alpha", "beta"), torch.tensor([[30.0, 20.0]]))
+
+
+def moving_forward(lens: Distortion | None, *, focal: float = 400.0, centre=(0.05, -0.03, 0.8)) -> Rig:
+    """Beta ahead of alpha, within the depth range: many rays pass the plane of beta's centre."""
+    beta = Pose.from_centre(
+        rotation_from_vector(torch.tensor([0.02, 0.1, -0.05]).double()), torch.tensor(centre).double()
+    )
+    cameras = {
+        "alpha": Camera(K=intrinsics(focal, (360, 480)), cam_from_world=Pose.identity(), hw=(360, 480)),
+        "beta": Camera(K=intrinsics(focal, (300, 440)), cam_from_world=beta, hw=(300, 440), distortion=lens),
+    }
+    return Rig(cameras, depth=(0.3, 20.0))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_without_lenses_rays_that_pass_beta_keep_their_near_end(seed):
+    g = torch.Generator().manual_seed(seed)
+    centre = [float(uniform(g, -0.3, 0.3)), float(uniform(g, -0.3, 0.3)), float(uniform(g, 0.4, 1.5))]
+    pair = moving_forward(None, centre=centre).pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[3::9, 2::9]
+    curved, straight = Curved(32)(pair, x), Epipolar()(pair, x)
+    assert torch.equal(curved.mask.any(-1), straight.valid)
+    off = (curved.xy - straight.positions(32).xy).norm(dim=-1)[straight.valid]
+    assert off.max() < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("lens", "focal"),
+    [(None, 400.0), (BARREL, 330.0), (FISHEYE, 400.0), (FISHEYE, 150.0)],
+    ids=["none", "barrel", "narrow", "wide"],
+)
+def test_everything_that_beta_sees_of_a_ray_is_near_a_sample(lens, focal):
+    """Forward motion: 4,000 points of each ray, projected in numpy, against the polyline of the samples."""
+    pair = moving_forward(lens, focal=focal).pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[5::40, 4::40].reshape(-1, 2)
+    rays = explicit.rays_of(pair.alpha, x.numpy())
+    X = explicit.beta_points(pair, rays, 1 / np.geomspace(0.3, 20.0, 4000))
+    xy, seen = explicit.pixels_of(pair.beta, X.reshape(-1, 3))
+    seen &= (X[..., 2] > 2e-3).reshape(-1) | (lens is FISHEYE)
+    on = (seen & explicit.on_image(pair.beta, xy, 0.01)).reshape(len(x), -1)
+    p = Curved(200)(pair, x)
+    assert torch.equal(p.mask.any(-1), torch.from_numpy(on.any(-1)))
+    assert explicit.on_image(pair.beta, p.xy[p.mask].numpy(), -1e-9).all()
+    for i in np.flatnonzero(on.any(-1)):
+        points, line = torch.from_numpy(xy.reshape(*on.shape, 2)[i][on[i]]), p.xy[i][p.mask[i]]
+        step = line.diff(dim=0).norm(dim=-1)
+        off = torch.cdist(points, line).amin(-1).max()
+        assert off < 0.6 * step.median() + 0.5

@@ -82,9 +82,7 @@ def test_mat_files_of_other_versions_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("name", "text", "advice"),
     [
-        ("0000.png.camera", "2759.48 0 1520.69\n0 2764.16 1006.81\n0 0 1\n", "native rig file"),
         ("a.xml", '<?xml version="1.0"?>\n<document version="2.0.0">\n<chunk label="a">', "COLMAP"),
-        ("a.json", '{"class_name": "PinholeCameraParameters", "extrinsic": []}', "Open3D.*native file"),
         ("a.yaml", "cam0:\n  camera_model: ds\n  intrinsics: [1]\n  resolution: [4, 4]\n", "pinhole-equi"),
     ],
 )

@@ -109,6 +109,37 @@ def test_syntim():
         assert rig["right"].project(POINT).x.tolist() == pytest.approx([390.25, 204.35], abs=1e-11)
 
 
+@pytest.mark.parametrize(
+    ("file", "format", "names"),
+    [("strecha", "strecha", ("a.png", "b.png")), ("open3d.json", "open3d", ("cam0", "cam1"))],
+)
+def test_pinhole_pairs(file, format, names):
+    """The pair without b's lens."""
+    assert recognise(FIXTURES / file) == format
+    rig = read_rig(FIXTURES / file)
+    assert rig.names == names
+    assert rig[names[0]].project(POINT).x.tolist() == pytest.approx(PIXEL_A, abs=1e-11)
+    assert rig[names[1]].project(POINT).x.tolist() == pytest.approx([390.25, 204.35], abs=1e-11)
+    assert rig[names[1]].centre.tolist() == pytest.approx([0.098, -0.02, 0.036], abs=1e-14)
+
+
+def test_a_strecha_camera_with_a_lens_is_refused(tmp_path):
+    text = (FIXTURES / "strecha" / "b.png.camera").read_text()
+    (tmp_path / "b.camera").write_text(text.replace("\n0 0 0\n", "\n-0.1 0 0\n", 1))
+    with pytest.raises(RigFileError, match=r"line 4: is .*undistort the images"):
+        read_rig(tmp_path / "b.camera")
+
+
+def test_a_ros_camera_whose_projection_is_zero_stands_at_the_origin(tmp_path):
+    text = (FIXTURES / "ros" / "right.yaml").read_text()
+    head, _, tail = text.partition("projection_matrix:")
+    zeros = re.sub(r"data: \[.*?\]", f"data: {[0.0] * 12}", tail, count=1, flags=re.S)
+    (tmp_path / "right.yaml").write_text(f"{head}projection_matrix:{zeros}")
+    camera = read_rig(tmp_path / "right.yaml")["b"]
+    assert camera.t.tolist() == [0, 0, 0]
+    assert camera.R.tolist() == read_rig(FIXTURES / "ros" / "right.yaml")["b"].R.tolist()
+
+
 def test_colmap_binary(tmp_path):
     q = [0.9486832980505138, 0, 0.31622776601683794, 0, -0.1, 0.02, 0.03]
     cameras = struct.pack("<QIiQQ4d", 2, 1, 1, 640, 480, 500, 510, 320, 240)
@@ -375,7 +406,14 @@ def refusal_of_folder(folder: Path) -> str:
 
 # In every file: camera b's focal length, its name in the messages, and its rotation's or quaternion's first number.
 FOCAL = {"cam_syntim_g": "500.000000", "kitti_calib.txt": "7.000000000000e+02", "middlebury.txt": "1000"}
-FOCAL |= {"extrinsics.yml": "", "images.txt": "", "rigs.txt": "", "left.yaml": "500.0", "opencv_stereo": "400."}
+FOCAL |= {
+    "extrinsics.yml": "",
+    "images.txt": "",
+    "rigs.txt": "",
+    "left.yaml": "500.0",
+    "a.png.camera": "500",
+    "opencv_stereo": "400.",
+}
 WITH_FOCAL = [f for f in TEXTS if FOCAL.get(f.name, "400")]
 
 

@@ -61,6 +61,7 @@ def test_fuse_writes_everything(small):
         "depth.png",
         "depth.tif",
         "fused.png",
+        "index.html",
         "view.yaml",
     ]
     view = Rig.load(small / "out" / "view.yaml")
@@ -429,3 +430,26 @@ runpy.run_module("pat", run_name="__main__")
 """
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (130, "pat: interrupted\n")
+
+
+@pytest.mark.parametrize(
+    ("command", "out", "text"),
+    [
+        (["rig", "refine", "rig.yaml", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
+        (["rig", "start", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
+        (["calibrate", "photos", "--board", "charuco:8x6:30mm"], "file/rig.yaml", "file is a file, so"),
+        (["evaluate", "--kitti", "kitti"], "file", "is a file: name a folder"),
+        (["rig", "doctor", "rig.yaml", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
+        (["rig", "show", "rig.yaml"], "file", "is a file: name a folder"),
+        (["board", "charuco:8x6:30mm"], "folder", "is a folder: name a file"),
+    ],
+)
+def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkeypatch, capsys):
+    """Neither rigs nor images nor folders of them exist: they are not looked for before."""
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "file").write_text("")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as ended:
+        main([*command, "--out", out])
+    assert ended.value.code == 2
+    assert text in " ".join(capsys.readouterr().err.split())

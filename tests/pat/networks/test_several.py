@@ -11,7 +11,7 @@ from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.media.colour import luminance
 from pat.networks.pieces import tiles_of
-from pat.networks.several import SUPPORT, View
+from pat.networks.several import SUPPORT, MatchedBeta
 from pat.networks.weights import load_weights
 
 H, W = 96, 192
@@ -124,7 +124,7 @@ def test_the_depth_buffer_finds_what_is_hidden():
     near = torch.full(hw, 1 / NEAR, dtype=torch.float64)
     far = torch.full(hw, 1 / FAR, dtype=torch.float64)
     segments = Segments(track.at(near), track.at(far), torch.ones(hw, dtype=torch.bool))
-    view = View(segments, track, torch.zeros(hw).double(), torch.zeros(3, *hw).double(), (H, W))
+    view = MatchedBeta(segments, track, torch.zeros(hw).double(), torch.zeros(3, *hw).double(), (H, W))
     depths = far.clone()
     depths[1, 7] = 1 / NEAR
     found = view.hidden(depths)

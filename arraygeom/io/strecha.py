@@ -1,0 +1,55 @@
+"""The `.camera` files of Strecha's multi-view data: one camera a file, or a folder of them as one rig.
+
+Source convention: K (3 lines), a line of zeros, R (3 lines), C, and the image's size; x ~ K R^T (X - C), so R's columns
+are the camera's axes in the world and C is its centre. Pixels with the first centre at 0 (shift 0); the unit is the
+scene's, taken as metres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from ..camera import Camera
+from ..pose import Pose
+from ..rig import Rig
+from .source import RigSource
+
+CONVENTION = "first pixel's centre at 0 (shift 0); world_from_camera R and the centre; scale as in the file"
+
+
+def recognises(path: Path, head: str) -> bool:
+    return bool(_files(path)) if path.is_dir() else path.suffix == ".camera"
+
+
+def read(source: RigSource) -> Rig:
+    """The cameras, under the names of their images."""
+    files = _files(source.path) if source.path.is_dir() else [source.path]
+    if not files:
+        raise source.fail(None, "holds no .camera file")
+    return source.rig((file.name.removesuffix(".camera"), _camera(RigSource(file))) for file in files)
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.camera"))
+
+
+def _camera(source: RigSource) -> Camera:
+    rows = [line.split() for line in source.text().splitlines() if line.strip()]
+    numbers = source.numbers([_number(source, word) for row in rows for word in row], (26,), "the file")
+    K, skipped, R, centre, wh = numbers.split([9, 3, 9, 3, 2])
+    if skipped.any():
+        raise source.fail("line 4", f"is {skipped.tolist()}: a lens, which is not read: undistort the images first")
+    world_from_cam = source.rotation(R, "lines 5 to 7")
+    width, height = wh.tolist()
+    return Camera(
+        K=source.intrinsics(K, "lines 1 to 3"),
+        cam_from_world=Pose.from_centre(world_from_cam.mT, centre),
+        hw=source.size(width, height, "line 9"),
+    )
+
+
+def _number(source: RigSource, word: str) -> float:
+    try:
+        return float(word)
+    except ValueError:
+        raise source.fail(None, f"holds '{word[:40]}', which is no number") from None

@@ -1,0 +1,39 @@
+"""What torch is doing around a call: transformations in which numbers cannot decide what is computed next."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+def traced() -> bool:
+    """Whether within `torch.compile` or `torch.func.vmap`: all branches are computed there, and loops to their end."""
+    return torch.compiler.is_compiling() or "Vmap" in transformations()
+
+
+def needs_numbers(what: str, *given: Tensor) -> None:
+    """Say why a call cannot be traced: it breaks the graph of `torch.compile`, which is an error with `fullgraph`.
+
+    Raises NotImplementedError for tensors that `torch.func.vmap` has batched.
+    """
+    if torch.compiler.is_compiling():
+        torch._dynamo.graph_break(msg=f"{what} depends on numbers: compute it before compiling")
+    elif any(_is_batched(t) for t in given):
+        raise NotImplementedError(f"{what} depends on numbers, which vmap does not know: use a loop")
+
+
+def transformations() -> tuple[str, ...]:
+    """The transformations of `torch.func` that are under way, outermost first, such as ("Vmap", "Grad")."""
+    if torch.compiler.is_compiling():
+        return ()
+    stack = torch._C._functorch.get_interpreter_stack()
+    return tuple(level.key().name for level in stack or ())
+
+
+def _is_batched(t: Tensor) -> bool:
+    functorch = torch._C._functorch
+    while functorch.is_functorch_wrapped_tensor(t):
+        if functorch.is_batchedtensor(t):
+            return True
+        t = functorch.get_unwrapped(t)
+    return False

@@ -1,0 +1,244 @@
+"""Calibrated pairs from images alone: focal lengths as given or assumed, poses and the rest from matched points.
+
+Points determine the epipolar lines, and those are as good as with a calibration. They do not determine the scale of the
+scene, and focal lengths only poorly: depths are multiples of the baseline, and proportional to what is assumed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
+from arraygeom.pixels import map_homogeneous
+
+from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_lines
+from .patch_matching import refine_points
+from .refinement import line_distances, refine_matches
+
+FOCAL_SHARE = 1.2
+"""The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
+SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
+CENTRE_SHARE = 0.05
+"""Standard deviations of what is assumed: radians, a share of the baseline, of the focal length; of the principal
+point, as a share of the longer side."""
+NEAR_LINE = 2.0
+"""Points this near to their lines, in pixels, are used."""
+AS_GOOD = 1.5
+SLACK = 0.1
+"""A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of F alone,
+and `SLACK` pixels more."""
+ALIKE = 1.25
+ALIKE_SLACK = 0.03
+"""Poses whose points are so much farther from their lines than those of the best, in pixels too, are alike: points do
+not distinguish a rotation from a translation where they are few or far. The smallest rotation is taken."""
+OUTLYING = 8.0
+"""Inverse depths this many times their median deviation from the median are of wrong matches."""
+MARGIN, LEAST_MARGIN = 1.0, 0.12
+"""Depth bounds extend the range of the inverse depths of points by this share of it, and by at least this share of
+beta's longer side, as a disparity: points may all be on one surface, and too wide a range hardly costs quality."""
+DENSE_POINTS = 2000
+SPACING = 4
+"""Dense points at most, and their least distance, pixels."""
+LEAST_CONFIDENCE = 0.5
+WELL_LOCALISED = 0.3
+"""Largest standard deviation of a dense point, pixels."""
+
+
+class RefinedPair(NamedTuple):
+    """A calibrated pair as a rig of two cameras, with the depth range of the points that determine it.
+
+    points: their number. distance: their median distance from their lines, pixels of beta.
+    """
+
+    rig: Rig
+    points: int
+    distance: float
+
+
+def self_calibrated(
+    views: Mapping[str, View], link: Link, matches: Matches, *, focal: Mapping[str, float]
+) -> RefinedPair | None:
+    """Two cameras (alpha, beta) whose epipolar lines are those of `link`; None where points do not determine them.
+
+    Alpha is at the origin with the principal point in the middle, and the baseline is 1. `focal` has focal lengths in
+    pixels, by camera; others are assumed.
+    """
+    alpha, beta = views
+    K = {name: intrinsics(length, views[name].hw) for name, length in _focal_lengths(views, link, focal).items()}
+    near = near_lines(matches, link.F, within=NEAR_LINE)
+    best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
+    upright = _upright(link)
+    trials = []
+    for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
+        cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
+        rig = _unit_baseline(_refined(Rig(cameras), matches))
+        distance, bounds = _distance(rig, near), depth_bounds(rig, near)
+        if bounds is not None and distance <= best:
+            trials.append(RefinedPair(rig.replace(depth=bounds), len(near.alpha), distance))
+    if not trials:
+        return None
+    least = min(trial.distance for trial in trials)
+    fitting = [trial for trial in trials if trial.distance <= ALIKE * least + ALIKE_SLACK]
+    return min(fitting, key=lambda trial: _angle(_pair(trial.rig).beta_from_alpha.R, upright))
+
+
+def refined_by_depth(
+    pair: RefinedPair,
+    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    depth: Float[Tensor, "h w"],
+    confidence: Float[Tensor, "h w"],
+) -> RefinedPair:
+    """The pair refined by dense matches: where a fusion found alpha's pixels, improved by least squares.
+
+    `images`, `depth` and `confidence` are of the sizes of the pair's cameras. The same pair if there are too few.
+    """
+    matches = dense_matches(pair.rig, images, depth, confidence)
+    if len(matches.alpha) < 5 * ENOUGH:
+        return pair
+    rig = _unit_baseline(_refined(pair.rig, matches))
+    bounds = depth_bounds(rig, matches)
+    if bounds is None:
+        return pair
+    return RefinedPair(rig.replace(depth=bounds), len(matches.alpha), _distance(rig, matches))
+
+
+def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
+    """One rig of pairs with the same alpha, by beta; each pair's lengths times its scale.
+
+    The depth range is that of all pairs.
+    """
+    first = next(iter(pairs.values())).rig
+    rig = Rig({first.names[0]: first[first.names[0]]})
+    for name, pair in pairs.items():
+        camera = _pair(pair.rig).cameras[1]
+        pose = camera.cam_from_world
+        rig = rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t * scales[name])))
+    bounds = [[float(bound) * scales[name] for bound in pair.rig.depth or ()] for name, pair in pairs.items()]
+    near, far = zip(*bounds)
+    return rig.replace(depth=(min(near), max(far)))
+
+
+def dense_matches(
+    rig: Rig,
+    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    depth: Float[Tensor, "h w"],
+    confidence: Float[Tensor, "h w"],
+) -> Matches:
+    """Points of texture in alpha with their positions in beta, from a depth map, refined by least squares."""
+    alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)
+    own, other = (contrast_equalised(images[name]) for name in rig.names)
+    corners = cv2.goodFeaturesToTrack(own, DENSE_POINTS, 1e-4, SPACING)
+    x = torch.from_numpy(np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64))
+    column, row = x.round().long().unbind(-1)
+    z = depth[row, column].double()
+    known = z.isfinite() & (confidence[row, column] > LEAST_CONFIDENCE)
+    x, z = x[known], z[known]
+
+    def in_beta(x: Tensor) -> Tensor:
+        return beta.project(alpha.unproject(x, z)).x
+
+    y, step = in_beta(x), torch.eye(2, dtype=torch.float64)
+    maps = torch.stack([in_beta(x + step[0]) - y, in_beta(x + step[1]) - y], -1)
+    refined, deviation = refine_points(own, other, x.numpy(), y.numpy(), maps.numpy())
+    return Matches(x, torch.from_numpy(refined)).only(torch.from_numpy(deviation < WELL_LOCALISED))
+
+
+def depth_bounds(rig: Rig, matches: Matches) -> tuple[float, float] | None:
+    """Near and far of the matched points of a rig of two cameras, extended; far may be infinite.
+
+    None for points without parallax.
+    """
+    pair = _pair(rig)
+    near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
+    cameras = [camera.to(torch.float64) for camera in pair.cameras]
+    found = triangulate(cameras, torch.stack(near))
+    if int(found.valid.sum()) < ENOUGH:
+        return None
+    inverse = 1 / cameras[0].cam_from_world.apply(found.X[found.valid])[:, 2]
+    off = (inverse - inverse.median()).abs()
+    inverse = inverse[off <= OUTLYING * off.median() + 1e-9]
+    low, high = inverse.quantile(inverse.new_tensor([0.01, 0.99])).tolist()
+    baseline = float(pair.beta_from_alpha.t.norm())
+    least = LEAST_MARGIN * max(pair.beta.hw) / (float(cameras[1].K[0, 0]) * baseline)
+    more = max(MARGIN * (high - low), least)
+    return 1 / (high + more), math.inf if low <= more else 1 / (low - more)
+
+
+def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, float]) -> dict[str, float]:
+    """Focal lengths in pixels: as given, or by the ratio of the image scales to the other's, or assumed."""
+    alpha, beta = views
+    ratio = 1.0 if link.H is None else float(torch.linalg.det(link.H[:2, :2]).abs().sqrt() / link.H[2, 2].abs())
+    assumed = focal[beta] / ratio if beta in focal else FOCAL_SHARE * max(views[alpha].hw)
+    own = focal.get(alpha, assumed)
+    return {alpha: own, beta: focal.get(beta, own * ratio)}
+
+
+def _poses(matches: Matches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
+    """Poses of beta by F and by an essential matrix fitted to the points."""
+    x, y = (
+        map_homogeneous(torch.linalg.inv(K), matches.alpha)[..., :2].numpy(),
+        map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2].numpy(),
+    )
+    threshold = 1 / float(K_beta[0, 0])
+    fitted, _ = cv2.findEssentialMat(x, y, np.eye(3), method=cv2.RANSAC, threshold=threshold)
+    found = []
+    for E in ((K_beta.T @ F @ K).numpy(), fitted):
+        if E is not None and E.shape == (3, 3):
+            _, R, t, _ = cv2.recoverPose(E, x, y, np.eye(3))
+            found.append(Pose(torch.from_numpy(R), torch.from_numpy(t[:, 0])))
+    return found
+
+
+def _upright(link: Link) -> Float[Tensor, "3 3"]:
+    """The rotation about the axis, in steps of 90 degrees, by which beta's image is rotated against alpha's."""
+    H = torch.eye(3) if link.H is None else link.H
+    steps = round(math.atan2(float(H[1, 0] / H[2, 2]), float(H[0, 0] / H[2, 2])) / (math.pi / 2))
+    return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
+
+
+def _lateral_poses(matches: Matches, R: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
+    """Poses of parallel axes, beta to either side along the direction in which most points differ."""
+    x = map_homogeneous(R @ torch.linalg.inv(K), matches.alpha)[..., :2]
+    flow = map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2] - x
+    _, _, axes = torch.linalg.svd(flow - flow.median(0).values)
+    t = torch.cat([axes[0], axes.new_zeros(1)])
+    return [Pose(R, t), Pose(R, -t)]
+
+
+def _angle(R: Tensor, other: Tensor) -> float:
+    """The angle between two rotations, radians."""
+    return math.acos(min(max((float((R.T @ other).trace()) - 1) / 2, -1.0), 1.0))
+
+
+def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
+    return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
+
+
+def _refined(rig: Rig, matches: Matches) -> Rig:
+    alpha, beta = rig.names
+    free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]
+    sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
+    return refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma).rig
+
+
+def _unit_baseline(rig: Rig) -> Rig:
+    name = rig.names[1]
+    camera = _pair(rig).cameras[1]
+    pose = camera.cam_from_world
+    return rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t / pose.t.norm())))
+
+
+def _distance(rig: Rig, matches: Matches) -> float:
+    return float(line_distances(rig, {(rig.names[0], rig.names[1]): matches}).abs().median())
+
+
+def _pair(rig: Rig) -> Pair:
+    return rig.pair(*rig.names)

@@ -1,0 +1,273 @@
+"""`pat fuse` without a rig: which image is alpha, what the betas give, and the rig, all from the images.
+
+Imported when such a command runs, as it imports torch.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Rig
+from calib.images.from_images import UncalibratedRig, rig_from_images
+from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
+
+from ..fusion.batch import find_images
+from ..fusion.checks import equal_bands
+from ..fusion.fuse import fuse
+from ..fusion.results import Frame
+from ..media.exif import focal_length
+from ..media.images import read_image, write_image
+from ..media.video import read_video
+from ..networks.weights import Network, load_weights
+
+MATCHED = 1600
+"""Images are reduced to this many pixels along their longer side to match features."""
+COARSE = 640
+"""And to this many of alpha for the first, coarse fusion."""
+EVEN = 0.004
+"""The standard deviation below which an image is of one colour: a count of 8 bits."""
+WAVELENGTHS = {"red": 620, "green": 540, "blue": 460}
+LONGEST_VISIBLE = 760
+"""Nanometres; bands beyond are not taken for a colour."""
+
+Images = Mapping[str, Float[Tensor, "_ h w"]]
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class ImageArray:
+    """What images of an array say of it: the rig, which camera is alpha, with which weights to fuse, and how.
+
+    images: alpha's and those of the betas that are fused. notes: what was found, a line each.
+    """
+
+    rig: Rig
+    images: dict[str, Tensor]
+    alpha: str
+    weights: str
+    match_levels: bool
+    notes: tuple[str, ...]
+
+
+def array_of(
+    files: Mapping[str, Path], *, alpha: str | None = None, weights: str | None = None, say: Say = lambda line: None
+) -> ImageArray:
+    """The array of one image file a camera. `say` is called with each line of what is found, as it is found.
+
+    Raises ValueError, one line: fewer than two images, an image of one colour, one image twice, images that do not
+    show the same things.
+    """
+    notes: list[str] = []
+
+    def note(line: str) -> None:
+        notes.append(line)
+        say(line)
+
+    images = {name: _read(name, path) for name, path in files.items()}
+    alpha = _chosen_alpha(images, alpha, note)
+    names = _ordered_betas(images, alpha, note)
+    bands = [len(images[name]) for name in names]
+    weights = weights or ("mono-colour" if 3 in (*bands, sum(bands)) else "mono-spectral")
+    images = {name: images[name] for name in (alpha, *names)}
+    focal = {name: length for name in images if (length := focal_length(files[name]))}
+    for name, length in focal.items():
+        note(f"{name}: focal length {length:.0f} pixels, by EXIF")
+    rig, names = found_rig(images, alpha, focal, load_weights(weights), note)
+    images = {name: images[name] for name in names}
+    several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
+    if several:
+        note("radiometry: each band is brought to alpha's mean and contrast, as for a grey world")
+    return ImageArray(rig, images, alpha, weights, several, tuple(notes))
+
+
+def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
+    """Names of cameras for their files: the files' own without suffix, or the folders', or numbers."""
+    for names in ([p.stem for p in paths], [p.resolve().parent.name for p in paths]):
+        plain = [re.sub(r"[^\w.-]+", "_", name).strip("_") for name in names]
+        if len(set(plain)) == len(plain) and all(plain):
+            return dict(zip(plain, paths))
+    return {f"camera{i}": path for i, path in enumerate(paths, 1)}
+
+
+def files_of(path: Path) -> list[Path]:
+    """The image files of a camera, of a file, a folder or a pattern. Raises FileNotFoundError if there are none."""
+    if not path.is_dir() and not path.exists() and not any(c in path.name for c in "*?["):
+        raise FileNotFoundError(f"{path}: no such image: check the path")
+    return find_images(path)
+
+
+def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
+    """The frames of videos as image files in a folder, and the frames a second, by camera."""
+    files: dict[str, list[Path]] = {}
+    rates: dict[str, float] = {}
+    for name, path in videos.items():
+        frames, rates[name] = read_video(path)
+        files[name] = []
+        for i, image in enumerate(frames):
+            files[name].append(folder / name / f"{i:06d}.png")
+            write_image(files[name][-1], image)
+        if not files[name]:
+            raise ValueError(f"{path}: a video without frames")
+    return files, rates
+
+
+def found_rig(
+    images: Images, alpha: str, focal: Mapping[str, float], network: Network, note: Say
+) -> tuple[Rig, list[str]]:
+    """The rig of the cameras of images, and which of them it relates to alpha; alpha comes first in both.
+
+    Calibrated, up to a scale, where points matched between alpha and every beta allow it; else known by F alone.
+    """
+    factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
+    reduced = {name: _scaled(image, factors[name]) for name, image in images.items()}
+    found = rig_from_images(reduced, focal={name: length * factors[name] for name, length in focal.items()})
+    betas = [name for name in images if (alpha, name) in found.rig.links]
+    if not betas:
+        raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME")
+    for name in images.keys() - {alpha, *betas}:
+        note(f"{name}: left out, too little in common with {alpha}")
+    rig = _calibrated(found, reduced, alpha, betas, focal, network, note)
+    if rig is None:
+        note("\n".join(line for line in found.as_text().splitlines() if line.startswith((f"{alpha} >", "F "))))
+        rig = _without(found.rig, images.keys() - {alpha, *betas})
+    for name in rig.names:
+        rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
+    return rig, [alpha, *betas]
+
+
+def _calibrated(
+    found: UncalibratedRig,
+    images: Images,
+    alpha: str,
+    betas: Sequence[str],
+    focal: Mapping[str, float],
+    network: Network,
+    note: Say,
+) -> Rig | None:
+    """The calibrated rig, each pair refined by what a coarse fusion of it matches; None if one cannot be calibrated."""
+    pairs: dict[str, RefinedPair] = {}
+    depths: dict[str, Frame] = {}
+    for name in betas:
+        link, matches = found.rig.links[alpha, name], found.matches[alpha, name]
+        views = {n: found.rig[n] for n in (alpha, name)}
+        pair = None if _distorted(found.rig) else self_calibrated(views, link, matches, focal=focal)
+        if pair is None:
+            return None
+        note(f"{alpha} > {name}: {pair.points} points, {pair.distance:.2f} px from their lines; refining")
+        pairs[name], depths[name] = _refined(pair, images, network)
+        if pairs[name] is not pair:
+            note(f"{alpha} > {name}: {pairs[name].points} points, {pairs[name].distance:.2f} px from their lines")
+    assumed = [name for name in (alpha, *betas) if name not in focal]
+    note(
+        "depths are multiples of the baseline"
+        + (f" {alpha} to {betas[0]}" if len(betas) > 1 else "")
+        + (f"; focal lengths assumed of {', '.join(assumed)}: depths are only proportional" if assumed else "")
+    )
+    scales = {name: _relative_scale(depths[betas[0]], depths[name]) for name in betas}
+    return joined(pairs, scales)
+
+
+def _refined(pair: RefinedPair, images: Images, network: Network) -> tuple[RefinedPair, Frame]:
+    """The pair refined by the matches of a fusion at reduced size, and that."""
+    alpha, beta = pair.rig.names
+    factor = min(COARSE / max(images[alpha].shape[-2:]), 1.0)
+    small = {name: _scaled(images[name], factor) for name in (alpha, beta)}
+    rig = _resized(pair.rig, small)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        network = _for_bands(network, len(small[beta]))
+        frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
+    refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
+    if refined.rig is rig:
+        return pair, frame
+    return refined._replace(rig=_resized(refined.rig, images), distance=refined.distance / factor), frame
+
+
+def _for_bands(network: Network, bands: int) -> Network:
+    wanted = getattr(network.config, "bands", None)
+    return network if wanted in (None, bands) else load_weights("mono-colour" if bands == 3 else "mono-spectral")
+
+
+def _relative_scale(first: Frame, other: Frame) -> float:
+    """The factor that brings another pair's depths to those of the first."""
+    both = (first.confidence > 0.5) & (other.confidence > 0.5) & first.depth.isfinite() & other.depth.isfinite()
+    return float((first.depth[both] / other.depth[both]).median()) if both.any() else 1.0
+
+
+def _distorted(rig: Rig) -> bool:
+    return any(getattr(view, "distortion", None) is not None for view in rig.cameras.values())
+
+
+def _without(rig: Rig, names: set[str]) -> Rig:
+    cameras = {name: view for name, view in rig.cameras.items() if name not in names}
+    return rig.replace(cameras=cameras, links={pair: v for pair, v in rig.links.items() if not names & {*pair}})
+
+
+def _resized(rig: Rig, images: Images) -> Rig:
+    for name in rig.names:
+        rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
+    return rig
+
+
+def _scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2 w2"]:
+    if factor >= 1:
+        return image
+    hw = [max(round(n * factor), 16) for n in image.shape[-2:]]
+    return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
+
+
+def _read(name: str, path: Path) -> Float[Tensor, "c h w"]:
+    image = read_image(path, name=name)
+    if float(image.flatten(1).std(-1).amax()) < EVEN:
+        raise ValueError(f"{name}: {path}: is of one colour: there is nothing to match or to fuse")
+    return image[:1] if len(image) == 3 and equal_bands(image) else image
+
+
+def _chosen_alpha(images: Images, alpha: str | None, note: Say) -> str:
+    """Alpha: as asked, or the largest grey image, or the largest of all."""
+    if alpha is not None:
+        if alpha not in images:
+            raise ValueError(f"--alpha: no camera '{alpha}'; the images' names are {', '.join(images)}")
+        return alpha
+    grey = [name for name, image in images.items() if len(image) == 1]
+    chosen = max(grey or images, key=lambda name: math.prod(images[name].shape[-2:]))
+    h, w = images[chosen].shape[-2:]
+    why = "the only grey image" if len(grey) == 1 else "the largest grey image" if grey else "the largest image"
+    equal = [name for name in grey or images if images[name].shape[-2:] == (h, w)]
+    why = "the first of images of one size" if len(equal) > 1 else why
+    note(f"alpha, whose view and detail the result has: {chosen} ({w}x{h}, {why}; --alpha NAME takes another)")
+    return chosen
+
+
+def _ordered_betas(images: Images, alpha: str, note: Say) -> list[str]:
+    """The betas in the order of their bands: as given where one is in colour, else from red to blue."""
+    betas = [name for name in images if name != alpha]
+    if any(len(images[name]) == 3 for name in betas):
+        return betas
+    waves = {name: _wavelength(name) for name in betas}
+    known = all(waves.values())
+    if known:
+        betas = sorted(betas, key=lambda name: -waves[name])
+    if len(betas) == 3:
+        said = "by their names" if known else "in the order given, which is a guess: give them in that order"
+        note(f"bands: {', '.join(betas)} are shown as red, green, blue, {said}")
+    else:
+        note(f"bands: {', '.join(betas)}, each at alpha's view")
+    return betas
+
+
+def _wavelength(name: str) -> float:
+    """Nanometres by a camera's name, such as cam_550nm or green; 0 if it does not say."""
+    if found := re.search(r"(?<!\d)([3-9]\d\d)(?:\s*nm)?(?!\d)", name):
+        return float(found[1]) if float(found[1]) <= LONGEST_VISIBLE else 0.0
+    words = re.split(r"[^a-z]+", name.lower())
+    return next((float(w) for colour, w in WAVELENGTHS.items() if colour in words), 0.0)

@@ -1,0 +1,346 @@
+"""Fusion under what real cameras do: other responses, exposures, noise, misalignment; by region, with depth.
+
+Each rectified colour pair is recorded under each condition: left as the mono alpha, right, reduced, as the colour
+beta. The ground truth is left in colour.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Generator, Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom.sampling import sample
+
+from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair
+from ..fusion.fuse import corrections_of
+from ..media.colour import from_luma_chroma, luminance, to_luma_chroma
+from ..media.figures import save_curves
+from ..networks.protocol import FusionNetwork
+from ..sensors.noise_level import NoiseLevel
+from .baseline import classical_fusion, sgbm_disparity
+from .low_light import non_local_means
+from .metrics import bootstrap_interval, disparity_score, score
+from .protocols import (
+    MonoColourTask,
+    StereoMethod,
+    StereoResult,
+    mono_colour_task,
+    rectified_field,
+    rectified_fusion,
+    rectified_rig,
+)
+from .tables import markdown_table
+
+LEFT_CROP = 64
+"""Columns at the left that stereo super-resolution leaves out of its scores."""
+READ_NOISE = 2.0
+"""Electrons, in the low-light conditions."""
+Region = Literal["whole", "seen", "occluded", "beyond", "cropped"]
+REGIONS: tuple[Region, ...] = ("whole", "seen", "occluded", "beyond", "cropped")
+
+
+class Recording(NamedTuple):
+    """What is fused, and the noise level of alpha and beta where there is noise."""
+
+    task: MonoColourTask
+    noise: NoiseLevel | None = None
+
+
+@dataclass(frozen=True)
+class Condition:
+    """How a pair is recorded, with beta reduced `rate` times.
+
+    right: applied to the right image (C, H, W) before it is reduced; alpha: weights of red, green and blue in alpha;
+    beta: applied to beta; noise: of both cameras.
+    """
+
+    rate: int = 2
+    right: Callable[[Tensor], Tensor] = lambda image: image
+    alpha: Callable[[Generator], Sequence[float]] | None = None
+    beta: Callable[[Tensor], Tensor] = lambda image: image
+    noise: NoiseLevel | None = None
+
+    def recorded(self, pair: StereoPair) -> Recording:
+        """The pair under this condition; what is drawn at random depends on the pair's name alone."""
+        g = Generator().manual_seed(int(hashlib.sha256(pair.name.encode()).hexdigest()[:8], 16))
+        moved = StereoPair(pair.name, pair.left, self.right(pair.right), pair.max_disparity, pair.disparity)
+        alpha, beta, truth = mono_colour_task(moved, self.rate)
+        if self.alpha is not None:
+            alpha = luminance(truth, tuple(self.alpha(g)))  # type: ignore[arg-type]
+        beta = self.beta(beta)
+        if self.noise is not None:
+            alpha, beta = (self.noise.recorded(image[None], g)[0] for image in (alpha, beta))
+        return Recording(MonoColourTask(alpha, beta, truth), self.noise)
+
+
+def _weights(*weights: float) -> Callable[[Generator], Sequence[float]]:
+    return lambda g: weights
+
+
+def _random_weights(g: Generator) -> Sequence[float]:
+    drawn = torch.rand(3, generator=g) + 0.1
+    return (drawn / drawn.sum()).tolist()
+
+
+def _moved(rows: float = 0.0, degrees: float = 0.0) -> Callable[[Tensor], Tensor]:
+    """The image with its content `rows` lower and rotated about its middle."""
+
+    def moved(image: Tensor) -> Tensor:
+        h, w = image.shape[-2:]
+        c, s = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        y, x = torch.meshgrid(torch.arange(h) - (h - 1) / 2 - rows, torch.arange(w) - (w - 1) / 2, indexing="ij")
+        columns = (c * x + s * y + (w - 1) / 2).clamp(0, w - 1)
+        lines = (c * y - s * x + (h - 1) / 2).clamp(0, h - 1)
+        where = torch.stack([columns, lines], -1).reshape(1, -1, 2)
+        found = sample(image[None], where, interpolation="bicubic").values
+        return found.reshape(image.shape).clamp(0, 1)
+
+    return moved
+
+
+def _vignetted(image: Tensor) -> Tensor:
+    """Cos^4 of up to 30 degrees in the corners."""
+    h, w = image.shape[-2:]
+    y, x = torch.meshgrid(torch.linspace(-1, 1, h) * h / w, torch.linspace(-1, 1, w), indexing="ij")
+    tangent = math.tan(math.radians(30)) * (x.square() + y.square()).sqrt() / math.hypot(1, h / w)
+    return image * (1 + tangent.square()) ** (-2 / 2.2)
+
+
+def _low_light(electrons: float) -> Condition:
+    return Condition(noise=NoiseLevel.of_electrons(electrons, READ_NOISE))
+
+
+CONDITIONS: dict[str, Condition] = {
+    "ideal": Condition(),
+    "x4": Condition(rate=4),
+    "x8": Condition(rate=8),
+    "alpha = mean": Condition(alpha=_weights(1 / 3, 1 / 3, 1 / 3)),
+    "alpha = .2/.4/.4": Condition(alpha=_weights(0.2, 0.4, 0.4)),
+    "alpha = .6/.3/.1": Condition(alpha=_weights(0.6, 0.3, 0.1)),
+    "alpha random": Condition(alpha=_random_weights),
+    "beta x .6": Condition(beta=lambda beta: 0.6 * beta),
+    "beta x .6, gamma 1.3": Condition(beta=lambda beta: 0.6 * beta**1.3),
+    "beta vignetted": Condition(beta=_vignetted),
+    "rows off 1 px": Condition(right=_moved(rows=1)),
+    "rows off 3 px": Condition(right=_moved(rows=3)),
+    "rotated .3 degrees": Condition(right=_moved(degrees=0.3)),
+    "1000 electrons": _low_light(1000),
+    "200 electrons": _low_light(200),
+    "50 electrons": _low_light(50),
+}
+"""By name. Rows, degrees in pixels and angles of the right image before it is reduced."""
+
+
+class ConditionRow(NamedTuple):
+    """One method on one pair under one condition: PSNR by region (None: no such pixels), SSIM, and depth.
+
+    `end_point_error` (pixels) and `within_one` (shares of pixels whose truth is known: of all, of seen ones) are None
+    without a true disparity, or where the method gives none.
+    """
+
+    pair: str
+    condition: str
+    method: str
+    ssim: float
+    psnr: Mapping[str, float | None]
+    end_point_error: float | None = None
+    within_one: tuple[float, float] | None = None
+
+
+def methods_of(network: FusionNetwork, recording: Recording) -> dict[str, StereoMethod]:
+    """Those compared: classical, denoised first where there is noise, ours as it is and without corrections."""
+    found: dict[str, StereoMethod] = {"classical": classical}
+    level = recording.noise
+    if level is None:
+        found["classical, corrected"] = lambda a, b, d: corrected_classical(network, a, b, d)
+    else:
+        found["denoised, classical"] = lambda a, b, d: classical(_non_local(a, level), _non_local(b, level), d)
+    found["uncorrected"] = rectified_fusion(network, response="rec601", align=False)
+    noisy: dict[str, Any] = {} if level is None else {"noise": {"alpha": level, "beta": level}}
+    found["fusion"] = rectified_fusion(network, **noisy)
+    return found
+
+
+def _non_local(image: Tensor, level: NoiseLevel) -> Tensor:
+    """Non-local means with the true noise level, in the mean."""
+    return non_local_means(image, float(level.deviation(image[None]).mean())).clamp(0, 1)
+
+
+def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
+    """The classical baseline with alpha's response as the fusion finds it."""
+    rig = rectified_rig(_hw(alpha), {"beta": _hw(beta)}, max_disparity)
+    images, field = {"alpha": alpha, "beta": beta}, rectified_field(max_disparity)
+    response = corrections_of(network, rig, images, alpha="alpha", field=field, align=False).response
+    image = classical_fusion(response.of_alpha(alpha), response.of_beta(beta), max_disparity)
+    return response.undone(image)
+
+
+def classical(alpha: Tensor, beta: Tensor, max_disparity: float) -> StereoResult:
+    """The classical baseline, with the disparity of OpenCV's semi-global matching where that is consistent."""
+    image = classical_fusion(alpha, beta, max_disparity)
+    enlarged = interpolate(beta[None], alpha.shape[1:], mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    return StereoResult(image, sgbm_disparity(alpha, luminance(enlarged), max_disparity))
+
+
+def regions_of(pair: StereoPair, hw: tuple[int, int]) -> dict[str, Bool[Tensor, "h w"]]:
+    """Where left's pixels are seen in right, occluded there, beyond its left edge; and all but the left columns."""
+    h, w = hw
+    found = {"whole": torch.ones(h, w, dtype=torch.bool)}
+    found["cropped"] = torch.arange(w).expand(h, w) >= LEFT_CROP
+    if pair.disparity is None:
+        return found
+    value, known = (t[:h, :w] for t in pair.disparity)
+    column = torch.arange(w) - value
+    beyond = known & (column < -0.5)
+    nearest = torch.zeros(h, w).scatter_reduce(1, column.round().long().clamp(0, w - 1), value * known, "amax")
+    hidden = nearest.gather(1, column.round().long().clamp(0, w - 1)) > value + 1
+    return found | {"seen": known & ~beyond & ~hidden, "occluded": known & ~beyond & hidden, "beyond": beyond}
+
+
+def chroma_bound(task: MonoColourTask, rate: int) -> Float[Tensor, "3 h w"]:
+    """Left's own colours reduced and enlarged: what beta's resolution would allow if it stood where alpha stands."""
+    luma, chroma = to_luma_chroma(task.ground_truth)
+    small = interpolate(chroma[None], scale_factor=1 / rate, mode="area")
+    return from_luma_chroma(luma, interpolate(small, luma.shape[1:], mode="bicubic", align_corners=False)[0])
+
+
+def evaluate_conditions(
+    pairs: Sequence[StereoPair],
+    network: FusionNetwork,
+    conditions: Iterable[str] = tuple(CONDITIONS),
+    *,
+    max_disparity: float = PAPER_DISPARITY,
+    progress: Callable[[Iterable[StereoPair], int], Iterable[StereoPair]] = lambda pairs, total: pairs,
+) -> list[ConditionRow]:
+    """Every method on every colour pair under every condition (see `CONDITIONS`). Raises KeyError for another name."""
+    chosen = {name: CONDITIONS[name] for name in conditions}
+    rows = []
+    for pair in progress(pairs, len(pairs)):
+        for name, condition in chosen.items():
+            recording = condition.recorded(pair)
+            truth, regions = recording.task.ground_truth, regions_of(pair, _hw(recording.task.ground_truth))
+            if condition == CONDITIONS["ideal"]:
+                bound = StereoResult(chroma_bound(recording.task, condition.rate))
+                rows.append(_row(pair, name, "bound of beta's resolution", bound, truth, regions))
+            for method, run in methods_of(network, recording).items():
+                found = run(recording.task.alpha, recording.task.beta, max_disparity)
+                result = found if isinstance(found, StereoResult) else StereoResult(found)
+                rows.append(_row(pair, name, method, result, truth, regions))
+    return rows
+
+
+def _row(
+    pair: StereoPair, condition: str, method: str, result: StereoResult, truth: Tensor, regions: Mapping[str, Tensor]
+) -> ConditionRow:
+    image = result.image.clamp(0, 1)
+    error = (image - truth).square().mean(0)
+    psnr = {n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None for n, at in regions.items()}
+    depth = _depth_errors(result.disparity, pair.disparity, regions)
+    return ConditionRow(pair.name, condition, method, score(image, truth).ssim, psnr, *depth)
+
+
+def _depth_errors(
+    found: Tensor | None, truth: Disparity | None, regions: Mapping[str, Tensor]
+) -> tuple[float | None, tuple[float, float] | None]:
+    """A pixel of unknown disparity is not within one pixel, and is left out of the end-point error."""
+    if found is None or truth is None:
+        return None, None
+    h, w = found.shape
+    value, valid = (t[:h, :w] for t in truth)
+    known = valid & found.isfinite()
+    right = known & ((found.nan_to_num(0) - value).abs() <= 1)
+    seen = regions["seen"]
+    shares = tuple(float((right & at).sum() / at.sum().clamp(min=1)) for at in (valid, seen))
+    return disparity_score(found.nan_to_num(0), value, known).end_point_error, (shares[0], shares[1])
+
+
+def _hw(image: Tensor) -> tuple[int, int]:
+    return image.shape[-2], image.shape[-1]
+
+
+def conditions_markdown(rows: Sequence[ConditionRow]) -> str:
+    """PSNR / SSIM by condition and method with intervals of the gain over classical; regions; depth."""
+    return "\n".join(
+        [_by_condition(rows), "By region, ideal:", "", _by_region(rows), "Depth, ideal:", "", _depth(rows)]
+    )
+
+
+def _by_condition(rows: Sequence[ConditionRow]) -> str:
+    methods = [m for m in _unique(r.method for r in rows) if m != "bound of beta's resolution"]
+    lines = []
+    for name in _unique(r.condition for r in rows):
+        cells = [_mean_cell([r for r in rows if (r.condition, r.method) == (name, m)]) for m in methods]
+        gains = _gains(rows, name)
+        low, high = bootstrap_interval(gains)
+        lines.append([name, *cells, f"{np.mean(gains):+.2f} ({low:+.2f} to {high:+.2f})"])
+    return markdown_table(["condition", *methods, "fusion over classical, 95 %"], lines)
+
+
+def _gains(rows: Sequence[ConditionRow], condition: str) -> list[float]:
+    psnr = {(r.method, r.pair): r.psnr["whole"] or 0.0 for r in rows if r.condition == condition}
+    return [value - psnr["classical", pair] for (method, pair), value in psnr.items() if method == "fusion"]
+
+
+def _mean_cell(rows: Sequence[ConditionRow]) -> str:
+    if not rows:
+        return ""
+    return f"{np.mean([r.psnr['whole'] or 0.0 for r in rows]):.2f} / {np.mean([r.ssim for r in rows]):.4f}"
+
+
+def _by_region(rows: Sequence[ConditionRow]) -> str:
+    ideal = [r for r in rows if r.condition == "ideal"]
+    lines = []
+    for method in _unique(r.method for r in ideal):
+        found = [r for r in ideal if r.method == method]
+        values = [[v for r in found if (v := r.psnr.get(region)) is not None] for region in REGIONS]
+        lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
+    names = ["whole", "seen by beta", "occluded", "beyond beta's edge", f"without the left {LEFT_CROP} columns"]
+    return markdown_table(["PSNR", *names], lines)
+
+
+def _depth(rows: Sequence[ConditionRow]) -> str:
+    lines = []
+    for method in _unique(r.method for r in rows):
+        found = [r for r in rows if (r.condition, r.method) == ("ideal", method) and r.within_one is not None]
+        if found:
+            shares = [100 * float(np.mean([r.within_one[i] for r in found if r.within_one])) for i in range(2)]
+            errors = [r.end_point_error for r in found if r.end_point_error is not None]
+            name = "OpenCV's SGBM" if method == "classical" else method
+            lines.append([name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
+    return markdown_table(["", "end-point error", "within 1 px, of all", "of those that beta sees"], lines)
+
+
+def _unique(names: Iterable[str]) -> list[str]:
+    return list(dict.fromkeys(names))
+
+
+def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
+    """A figure: mean PSNR against electrons at white, and against rows off, as far as these were evaluated."""
+    known = {row.condition for row in rows}
+    axes = {
+        "electrons at white": {50: "50 electrons", 200: "200 electrons", 1000: "1000 electrons"},
+        "rows off (px)": {0: "ideal", 1: "rows off 1 px", 3: "rows off 3 px"},
+    }
+    plots = {title: _curve(rows, points) for title, points in axes.items() if set(points.values()) <= known}
+    if plots:
+        save_curves(plots, path, ylabel="PSNR (dB)")
+
+
+def _curve(rows: Sequence[ConditionRow], points: Mapping[int, str]) -> dict[str, list[tuple[float, float]]]:
+    found: dict[str, list[tuple[float, float]]] = {}
+    for x, name in points.items():
+        for method in _unique(r.method for r in rows if r.condition == name):
+            if method != "bound of beta's resolution":
+                values = [r.psnr["whole"] or 0.0 for r in rows if (r.condition, r.method) == (name, method)]
+                found.setdefault(method, []).append((x, float(np.mean(values))))
+    return found

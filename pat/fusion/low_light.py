@@ -1,0 +1,195 @@
+"""Fusion of noisy views: denoised one by one before they are matched, and jointly once they are fused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from arraygeom import sample
+
+from ..media.colour import luminance
+from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
+from ..networks.pieces import tiles_of
+from ..networks.protocol import FusionNetwork, FusionOutput, Inputs
+from ..networks.weights import load_denoiser
+from ..sensors import NoiseLevel
+from .results import Frame
+from .steps import FusionStep, Radiometry
+from .views import Views
+
+Noise = Literal["estimate"] | Mapping[str, NoiseLevel]
+"""The noise level of each camera that has noise, or that they are to be estimated from the images."""
+
+LEAST_DEVIATION = 1.5 / 255
+"""Images whose noise has a smaller standard deviation, in the mean, are left as they are."""
+PIECE, HALO = 1024, 96
+"""Sides of the pieces in which an image is denoised, and of what is seen around them, pixels."""
+
+
+@cache
+def shipped_denoiser() -> LowLightNetwork:
+    """The network that ships with the package."""
+    return load_denoiser()
+
+
+class Found(NamedTuple):
+    """Where alpha's pixels are in a beta, (H, W, 2), and with what confidence, (H, W)."""
+
+    position: Tensor
+    confidence: Tensor
+
+
+@dataclass(frozen=True)
+class DenoisedViews:
+    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but unbiased."""
+
+    given: Views
+    views: Views
+    noisy: Mapping[str, NoisyView]
+
+    def wrapped(self, network: FusionNetwork) -> FusionNetwork:
+        """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""
+        return WithPositions(network) if self.noisy else network
+
+    def split(self, frame: Frame, betas: int) -> tuple[Frame, list[Found]]:
+        """The frame that a `wrapped` network made of so many betas, and what its further bands say of each of them."""
+        if not self.noisy:
+            return frame, []
+        bands = len(frame.image) - 3 * betas
+        further = frame.image[bands:].split(3)
+        return frame._replace(image=frame.image[:bands]), [Found(f[:2].movedim(0, -1), f[2]) for f in further]
+
+    def corrected(
+        self, frame: Frame, found: Sequence[Found], steps: Sequence[FusionStep], *, keep_alpha: bool = False
+    ) -> Frame:
+        """A frame fused from the denoised views, corrected by what all of them recorded.
+
+        `steps` were taken before it was fused and are not undone yet. With `keep_alpha`, or if alpha has no noise, the
+        luma is alpha's as recorded. Betas that are not all RGB are denoised one by one alone.
+        """
+        if not self.noisy:
+            return frame
+        (h, w), alpha, image = frame.image.shape[-2:], self.views.alpha, frame.image
+        views = self.prepared(steps)
+        own = NoisyView(*(part[..., :h, :w] for part in views[alpha]))
+        if all(len(self.views.images[name]) == 3 for name in self.views.betas) and len(found) == len(views) - 1:
+            betas = [view for name, view in views.items() if name != alpha]
+            image = jointly_denoised(image, own, betas, found)
+            if keep_alpha or alpha not in self.noisy:
+                image = image - luminance(image - frame.image)
+        if keep_alpha:
+            recorded = self._stepped(self.given.images, steps)[alpha]
+            image = image + recorded - own.denoised[0]
+        return frame._replace(image=image)
+
+    def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
+        """Every view, alpha first, as recorded, denoised, and its deviation, after the steps before it is fused.
+
+        Except for `Radiometry`: values keep their scale.
+        """
+        views = {name: self._noisy(name) for name in self.views.images}
+        parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
+        return {
+            name: NoisyView(*(part[name][None] for part in parts)) for name in (self.views.alpha, *self.views.betas)
+        }
+
+    def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
+        views = self.views.replace(images)
+        for step in steps:
+            views = views if isinstance(step, Radiometry) else step.do(views).views
+        return views.images
+
+    def _noisy(self, name: str) -> NoisyView:
+        image = self.views.images[name][None]
+        return self.noisy.get(name) or NoisyView(image, image, torch.zeros_like(image))
+
+
+def denoised_views(views: Views, noise: Noise | None) -> DenoisedViews:
+    """Every view with noticeable noise without it; without `noise` all as they are.
+
+    Raises ValueError for a camera that is not among the views.
+    """
+    levels = {} if noise is None else noise
+    if isinstance(levels, str):
+        levels = {name: NoiseLevel.estimated(image[None]) for name, image in views.images.items()}
+    noisy: dict[str, NoisyView] = {}
+    for name, level in levels.items():
+        if name not in views.images:
+            raise ValueError(f"noise of '{name}': there is no image of it, only of {', '.join(views.images)}")
+        image = views.images[name][None]
+        deviation = level.deviation(image)
+        if float(deviation.mean()) > LEAST_DEVIATION:
+            recorded = level.unbiased(image)
+            noisy[name] = NoisyView(recorded, denoised(recorded, deviation), deviation)
+    return DenoisedViews(views, views.replace({name: view.denoised[0] for name, view in noisy.items()}), noisy)
+
+
+@torch.no_grad()
+def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+    """An image without noise of this standard deviation; bands other than three are denoised one by one."""
+    network = shipped_denoiser()
+    if image.shape[1] == 3:
+        return _in_pieces(network.colour, image, deviation)
+    bands = zip(image.split(1, 1), deviation.split(1, 1))
+    return torch.cat([_in_pieces(network.band, *band) for band in bands], 1)
+
+
+@torch.no_grad()
+def jointly_denoised(
+    image: Float[Tensor, "3 h w"], alpha: NoisyView, betas: Sequence[NoisyView], found: Sequence[Found]
+) -> Float[Tensor, "3 h w"]:
+    """The image fused from denoised views, corrected by alpha and the RGB betas as they were recorded."""
+    beta, confidence = warped(betas, found)
+    network = shipped_denoiser()
+
+    def work(part: Tensor, *seen: Tensor) -> Tensor:
+        return network(part, NoisyView(*seen[:3]), NoisyView(*seen[3:6]), seen[6])
+
+    return _in_pieces(work, image[None], *alpha, *beta, confidence)[0]
+
+
+def warped(betas: Sequence[NoisyView], found: Sequence[Found]) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
+    """All betas at alpha's pixels, mixed by their confidences; and the confidence of the mixture."""
+    images = [torch.cat([sample(part, at.position[None]).values for part in beta]) for beta, at in zip(betas, found)]
+    confidence = torch.stack([at.confidence for at in found])
+    weight = (confidence + 1e-6) / (confidence + 1e-6).sum(0)
+    mixed = torch.stack([w * image for w, image in zip(weight, images)]).sum(0)
+    return NoisyView(*mixed.split(1)), confidence.amax(0)[None, None]
+
+
+def _in_pieces(work: Callable[..., Tensor], *images: Tensor) -> Tensor:
+    """A network on images of one size, computed piece by piece."""
+    whole = torch.empty_like(images[0])
+    h, w = whole.shape[-2:]
+    for (top, bottom, left, right), (y0, y1, x0, x1) in tiles_of((h, w), PIECE, HALO):
+        part = over_flips(work, *(image[..., y0:y1, x0:x1] for image in images))
+        whole[..., top:bottom, left:right] = part[..., top - y0 : bottom - y0, left - x0 : right - x0]
+    return whole
+
+
+class WithPositions(nn.Module):
+    """A network whose image has further bands: the position (x, y) in each whole beta, and its confidence."""
+
+    def __init__(self, network: FusionNetwork) -> None:
+        super().__init__()
+        self.network = network
+
+    def __getattr__(self, name: str) -> Any:
+        """What the fusion asks of networks is that of the network inside."""
+        inside = self.__dict__["_modules"].get("network") or self.__dict__.get("network")
+        return inside if name == "network" else getattr(inside, name)
+
+    def forward(self, inputs: Inputs, state: Any = None) -> FusionOutput:
+        """Fuse; the image must be of alpha's size."""
+        found = self.network(inputs, state)
+        further = [found.image]
+        for beta, position, confidence in zip(inputs.betas, found.position, found.confidence):
+            corner = position.new_tensor(beta.offset)[:, None, None]
+            further += [(position + corner).to(found.image), confidence[:, None].to(found.image)]
+        return found._replace(image=torch.cat(further, 1))

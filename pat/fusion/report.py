@@ -1,0 +1,184 @@
+"""A page that shows a fused frame: one HTML file with everything in it."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import Camera, Rig
+from arraygeom.atomic import write_text
+from arraygeom.viz import COLOURS, frustum, frustum_size
+
+from ..media.colour import to_bytes
+from ..media.figures import colour_depth
+from .results import Frame
+
+LONGEST = 1600
+"""Images in the page have at most this many pixels along their longer side."""
+QUALITY = 90
+"""Of JPEG."""
+UNCONFIDENT = (230, 30, 120)
+"""The colour that covers pixels without confidence."""
+PAGE = Path(__file__).with_name("report.html")
+
+
+class Facts(NamedTuple):
+    """What the page says beside the images.
+
+    notes: what was found or normalised. warnings: with what to do. seconds, memory (bytes): of the fusion, if known.
+    unit: of depths.
+    """
+
+    notes: Sequence[str] = ()
+    warnings: Sequence[str] = ()
+    seconds: float | None = None
+    memory: float | None = None
+    unit: str = "m"
+
+
+def write_report(
+    path: Path, frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts
+) -> Path:
+    """Write the page atomically: images side by side under a slider, overlays, the rig, figures. Returns the path.
+
+    `images` are alpha's and the betas'; the page needs no other file and no network.
+    """
+    write_text(path, report_page(frame, images, rig, alpha, facts))
+    return path
+
+
+def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig: Rig, alpha: str, facts: Facts) -> str:
+    """The page as text."""
+    shown = {f"alpha: {alpha}": images[alpha]}
+    shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
+    shown["fused"] = _shown(frame.image)
+    overlays = {"confidence": _confidence_layer(frame.confidence)}
+    known = frame.depth[frame.depth.isfinite()]
+    if len(known):
+        overlays["depth"] = _data_url(_reduced(colour_depth(frame.depth)))
+    h, w = frame.depth.shape
+    parts = {
+        "TITLE": html.escape(f"{' + '.join(name for name in rig.names if name in images)}, fused"),
+        "RATIO": f"{w} / {h}",
+        "LAYERS": "\n".join(_layer(name, _data_url(_reduced(_shown(image)))) for name, image in shown.items()),
+        "OVERLAYS": "\n".join(
+            f'<img class="overlay" id="{name}" alt="{name}" src="{url}" hidden>' for name, url in overlays.items()
+        ),
+        "SWITCHES": "\n".join(_switch(name) for name in overlays),
+        "FACTS": "\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
+        "NOTES": _listed("What was found", facts.notes),
+        "WARNINGS": _listed("Warnings", facts.warnings, kind="warnings"),
+        "RIG": rig_drawing(rig, alpha),
+        "LEGEND": _depth_legend(known, facts.unit),
+    }
+    page = PAGE.read_text(encoding="utf-8")
+    for name, text in parts.items():
+        page = page.replace(f"{{{{{name}}}}}", text)
+    return page
+
+
+def rig_drawing(rig: Rig, alpha: str) -> str:
+    """The calibrated cameras from above as an inline SVG: x to the right, z upwards; empty if there are none."""
+    cameras = {name: camera for name, camera in rig.cameras.items() if isinstance(camera, Camera)}
+    if not cameras:
+        return ""
+    size = frustum_size(cameras)
+    lines = {name: [line[:, [0, 2]] * (1, -1) for line in frustum(camera, size)] for name, camera in cameras.items()}
+    points = np.concatenate([line for some in lines.values() for line in some])
+    low, extent = points.min(0), float(np.ptp(points, axis=0).max()) or 1.0
+    drawn = []
+    for i, name in enumerate(cameras):
+        colour = COLOURS[i % len(COLOURS)]
+        drawn += [_polyline((line - low) / extent * 300 + 30, colour) for line in lines[name]]
+        x, y = (lines[name][0][0] - low) / extent * 300 + 30
+        label = html.escape(name) + (" (alpha)" if name == alpha else "")
+        drawn.append(f'<text x="{x:.1f}" y="{y + 18:.1f}" fill="{colour}" text-anchor="middle">{label}</text>')
+    wide, high = np.ptp(points, axis=0) / extent * 300 + 60
+    return (
+        f'<svg viewBox="0 0 {wide:.0f} {high:.0f}" role="img" aria-label="the rig from above">{"".join(drawn)}</svg>'
+        "<p>The cameras from above, each with the field of view that it has.</p>"
+    )
+
+
+def _polyline(points: Float[np.ndarray, "n 2"], colour: str) -> str:
+    text = " ".join(f"{x:.1f},{y:.1f}" for x, y in points)
+    return f'<polyline points="{text}" fill="none" stroke="{colour}" stroke-width="1.5"/>'
+
+
+def _figures(frame: Frame, known: Tensor, facts: Facts) -> dict[str, str]:
+    h, w = frame.depth.shape
+    figures = {"size": f"{w} x {h} pixels", "mean confidence": f"{float(frame.confidence.mean()):.2f}"}
+    figures["confidence above 0.5"] = f"{float((frame.confidence > 0.5).float().mean()):.0%} of the pixels"
+    if len(known):
+        near, far = _range(known)
+        figures["depth"] = f"{near:.3g} to {far:.3g} {facts.unit}, for 98% of the pixels"
+    if facts.seconds is not None:
+        figures["time"] = f"{facts.seconds:.0f} s"
+    if facts.memory is not None:
+        figures["memory"] = f"{facts.memory / 2**30:.1f} GiB at most"
+    return figures
+
+
+def _range(known: Float[Tensor, " n"]) -> tuple[float, float]:
+    near, far = np.percentile(known.cpu().numpy(), (1, 99))
+    return float(near), float(far)
+
+
+def _depth_legend(known: Float[Tensor, " n"], unit: str) -> str:
+    if not len(known):
+        return ""
+    near, far = _range(known)
+    return (
+        f'<p class="legend" hidden>depth: near, {near:.3g} {unit} <i></i> far, {far:.3g} {unit}; unknown is black</p>'
+    )
+
+
+def _shown(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
+    """An image of one channel or three: the mean of any other number of bands."""
+    return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
+
+
+def _reduced(image: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
+    factor = LONGEST / max(image.shape[-2:])
+    if factor >= 1:
+        return image
+    return interpolate(image[None], scale_factor=factor, mode="bicubic", antialias=True)[0]
+
+
+def _data_url(image: Float[Tensor, "c h w"]) -> str:
+    pixels = to_bytes(image.detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
+    _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
+
+
+def _confidence_layer(confidence: Float[Tensor, "h w"]) -> str:
+    """A PNG that covers pixels the more, the less their confidence."""
+    cover = 1 - _reduced(confidence[None].detach().cpu())
+    colour = torch.tensor(UNCONFIDENT[::-1])[:, None, None] / 255
+    layers = torch.cat([colour.expand(3, *cover.shape[1:]), 0.85 * cover])
+    _, content = cv2.imencode(".png", to_bytes(layers).transpose(1, 2, 0))
+    return f"data:image/png;base64,{base64.b64encode(content.tobytes()).decode()}"
+
+
+def _layer(name: str, url: str) -> str:
+    return f'<img class="layer" data-name="{html.escape(name)}" alt="{html.escape(name)}" src="{url}">'
+
+
+def _switch(name: str) -> str:
+    said = {"confidence": "confidence (covered where it is low)", "depth": "depth"}[name]
+    return f'<label><input type="checkbox" data-overlay="{name}"> {said}</label>'
+
+
+def _listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
+    items = "".join(f"<li>{html.escape(line)}" for line in lines)
+    return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

@@ -1,0 +1,133 @@
+"""Networks that remove noise of a known level: from one image, and from a fused image with the help of every view."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, pixel_unshuffle
+
+from .guided import UNet
+
+MULTIPLE = 8
+"""Images are padded to multiples of this."""
+SCALE = 4.0
+"""Deviations and differences are given to networks this many times larger: then they are about as large as values."""
+
+OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
+"""Brightness and two colour differences, orthogonal and of unit length, of red, green and blue."""
+BLUR, COLOUR_NOISE = 2, 0.02
+"""Radius of the blur of colour differences, pixels, and the deviation at which half of it is taken."""
+
+
+@dataclass(frozen=True)
+class DenoiserConfig:
+    """Widths at 1/2, 1/4 and 1/8 of the size: of the network for one band, for three, and for the fused image."""
+
+    band: tuple[int, int, int] = (24, 32, 32)
+    colour: tuple[int, int, int] = (32, 32, 32)
+    fused: tuple[int, int, int] = (32, 40, 48)
+
+
+class NoisyView(NamedTuple):
+    """A view as recorded, without its noise, and the noise's standard deviation; each (B, C, H, W)."""
+
+    recorded: Tensor
+    denoised: Tensor
+    deviation: Tensor
+
+    @property
+    def removed(self) -> Tensor:
+        """What was taken for noise."""
+        return self.recorded - self.denoised
+
+
+class Denoising(nn.Module):
+    """An image minus its noise, estimated in units of a standard deviation: where that is 0 it stays as it is."""
+
+    def __init__(self, bands: int, widths: tuple[int, int, int], *, further: int = 0) -> None:
+        super().__init__()
+        self.network = UNet(4 * (2 * bands + further), widths, 4 * bands)
+        nn.init.zeros_(self.network.last.weight)
+
+    def forward(
+        self, image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"], *further: Float[Tensor, "b _ h w"]
+    ) -> Float[Tensor, "b c h w"]:
+        """Of any size; `further` are other images of the same pixels."""
+        h, w = image.shape[-2:]
+        given = torch.cat([image - 0.5, SCALE * deviation, *further], 1)
+        given = pad(given, (0, -w % MULTIPLE, 0, -h % MULTIPLE), mode="replicate")
+        noise = pixel_shuffle(self.network(pixel_unshuffle(given, 2)).float(), 2)[..., :h, :w]
+        return image - deviation * noise
+
+
+class ColourDenoising(nn.Module):
+    """A colour image minus its noise, by brightness and two colour differences, on orthogonal axes.
+
+    Brightness loses noise that the network estimates, as in `Denoising`. Colour differences are first blurred, the more
+    the noisier they are, and the network adds what that took: most of it is known from brightness, and a network
+    this small need not hold the noise of every band.
+    """
+
+    def __init__(self, widths: tuple[int, int, int]) -> None:
+        super().__init__()
+        self.network = UNet(4 * 3 + 3 + 2, widths, 4 * 3)
+        nn.init.zeros_(self.network.last.weight)
+
+    def forward(self, image: Float[Tensor, "b 3 h w"], deviation: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+        """Of any size."""
+        h, w = image.shape[-2:]
+        enough = (0, -w % MULTIPLE, 0, -h % MULTIPLE)
+        axes = image.new_tensor(OPPONENT)
+        bands = pad(torch.einsum("ij,bjhw->bihw", axes, image - 0.5), enough, mode="replicate")
+        noise = torch.einsum("ij,bjhw->bihw", axes.square(), deviation.square()).sqrt()
+        noise = pad(noise, enough, mode="replicate")
+        blurred = avg_pool2d(pad(bands, (BLUR,) * 4, mode="replicate"), 2 * BLUR + 1, 1)
+        share = noise.square() / (noise.square() + COLOUR_NOISE**2)
+        share = torch.cat([torch.zeros_like(share[:, :1]), share[:, 1:]], 1)
+        base = torch.lerp(bands, blurred, share)
+        given = [pixel_unshuffle(bands, 2), SCALE * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)]
+        found = pixel_shuffle(self.network(torch.cat(given, 1)).float(), 2)
+        return 0.5 + torch.einsum("ji,bjhw->bihw", axes, base - noise * found)[..., :h, :w]
+
+
+class LowLightNetwork(nn.Module):
+    """Denoisers of one band, of a colour image, and of a fused image."""
+
+    def __init__(self, config: DenoiserConfig = DenoiserConfig()) -> None:
+        super().__init__()
+        self.config = config
+        self.band = Denoising(1, config.band)
+        self.colour = ColourDenoising(config.colour)
+        self.fused = Denoising(3, config.fused, further=9)
+
+    def forward(
+        self, image: Float[Tensor, "b 3 h w"], alpha: NoisyView, beta: NoisyView, confidence: Float[Tensor, "b 1 h w"]
+    ) -> Float[Tensor, "b 3 h w"]:
+        """The image fused from denoised views, corrected by both views as they were recorded.
+
+        `beta` is warped to alpha's pixels: right where the confidence is high.
+        """
+        gain = _gain(beta.denoised, image, confidence)
+        difference, removed = gain * beta.denoised - image, gain * beta.removed
+        deviation = (alpha.deviation + gain * beta.deviation) / 2
+        seen = [SCALE * x for x in (alpha.removed, alpha.deviation, difference, removed)]
+        return self.fused(image, deviation, *seen, confidence)
+
+
+def over_flips(network: Callable[..., Tensor], *images: Float[Tensor, "b _ h w"]) -> Tensor:
+    """The mean of a network's results on the images as they are and flipped: its own errors differ, and average out."""
+    total: Tensor | float = 0.0
+    for axes in ((), (-1,), (-2,), (-2, -1)):
+        total = total + network(*(image.flip(axes) for image in images)).flip(axes)
+    return torch.as_tensor(total) / 4
+
+
+def _gain(image: Tensor, like: Tensor, weight: Tensor) -> Tensor:
+    """The factor (B, 1, 1, 1) that makes an image about as bright as another."""
+    product, square = ((weight * image * other).flatten(1).sum(1) for other in (like, image))
+    return ((product + 1e-3) / (square + 1e-3)).clamp(0.2, 5.0)[:, None, None, None]

@@ -1,0 +1,149 @@
+"""How noisy a camera's image is: stated, or estimated from the image."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from scipy.optimize import nnls
+from torch import Generator, Tensor
+from torch.nn.functional import avg_pool2d, conv2d, pad
+
+from ..media.colour import linear_from_srgb, srgb_from_linear
+from .chain import normal
+
+AddedTo = Literal["light", "values"]
+"""What noise was added to: linear light, encoded as sRGB afterwards, or the values themselves."""
+
+CURVE = 65
+"""Values, and quantiles of the noise, by which the mean and the deviation of what is recorded are known."""
+SMOOTHED = 7
+"""Side of the window over which the signal is averaged, pixels."""
+SIDE, GROUPS, FEWEST = 12, 16, 40
+"""Of blocks in which noise is estimated: their side in pixels, the groups of about equal value, and the least size of
+these."""
+SMOOTHEST, SHARE = 0.05, 0.677
+"""The quantile of the variances in a group that is taken, and what that is of the variance of white noise (from
+40,000 blocks of it)."""
+
+
+@dataclass(frozen=True)
+class NoiseLevel:
+    """Variance of a pixel: `shot` times its value plus `read` squared; values 0..1.
+
+    added_to: linear light, encoded as sRGB afterwards, or the values themselves.
+    Numbers, or tensors (B, 1, 1, 1) of a batch.
+    """
+
+    shot: float | Tensor = 0.0
+    read: float | Tensor = 0.0
+    added_to: AddedTo = "light"
+
+    def __post_init__(self) -> None:
+        if self.added_to not in get_args(AddedTo):
+            raise ValueError(f"noise: added_to is light or values, got '{self.added_to}'")
+        for name in ("shot", "read"):
+            value = torch.as_tensor(getattr(self, name))
+            if not bool(((value >= 0) & value.isfinite()).all()):
+                raise ValueError(f"noise: {name} must be 0 or more, got {getattr(self, name)}")
+
+    @classmethod
+    def of_electrons(cls, electrons: float, read: float = 0.0, added_to: AddedTo = "light") -> NoiseLevel:
+        """The noise of a camera that counts so many electrons at white, with a read noise in electrons."""
+        if not electrons > 0:
+            raise ValueError(f"noise: electrons at white must be more than 0, got {electrons:g}")
+        return cls(1 / electrons, read / electrons, added_to)
+
+    @classmethod
+    def estimated(cls, image: Float[Tensor, "1 c h w"]) -> NoiseLevel:
+        """The noise level of an sRGB image with white noise, from its smoothest parts, by brightness.
+
+        Blocks in which a second difference varies least hold noise alone; noise of light or of values is taken, as
+        it fits. Noise that a demosaicing, a resampling or a codec has smoothed is underestimated; an image that has
+        fine texture everywhere seems noisier than it is.
+        """
+        if min(image.shape[-2:]) < SIDE + 2:
+            return cls()
+        value, variance = _smoothest(image.double())
+        if not len(value) or not float(variance.max()) > 0:
+            return cls()
+        fits = [_fitted(added_to, value, variance) for added_to in ("light", "values")]
+        return min(fits, key=lambda fit: fit[1])[0]
+
+    def recorded(self, image: Float[Tensor, "b c h w"], generator: Generator) -> Float[Tensor, "b c h w"]:
+        """An ideal sRGB image with noise: electrons counted, read noise added, light clipped to 0..1."""
+        linear = self.added_to == "light"
+        light = linear_from_srgb(image) if linear else image
+        shot = torch.as_tensor(self.shot).to(light)
+        counted = torch.poisson((light.clamp(min=0) / shot.clamp(min=1e-9)).clamp(max=1e7), generator=generator) * shot
+        light = torch.where(shot > 1e-7, counted, light) + self.read * normal(light.shape, light, generator)
+        return srgb_from_linear(light.clamp(0, 1)) if linear else light.clamp(0, 1)
+
+    def deviation(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The standard deviation of a noisy sRGB image's values, by the mean of the image around each pixel."""
+        _, mean, deviation = self._curves(image)
+        return _interpolated(_smoothed(image), mean, deviation)
+
+    def unbiased(self, image: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """A noisy image whose mean around each pixel is that of the ideal image.
+
+        Light clipped at black is too bright in the mean, and encoded light that is not clipped too dark: with 50
+        electrons at white by up to 0.05 and 0.03. No denoiser that averages values sees that.
+        """
+        value, mean, _ = self._curves(image)
+        return image + _interpolated(_smoothed(_smoothed(image)), mean, value - mean)
+
+    def _curves(self, like: Tensor) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n"], Float[Tensor, "b n"]]:
+        """Ideal values, and the mean and the deviation of what is recorded of each; noise taken as normal."""
+        value = torch.linspace(0, 1, CURVE, device=like.device).to(like)
+        normal = torch.special.ndtri((torch.arange(CURVE, device=like.device).to(like) + 0.5) / CURVE)
+        shot, read = (torch.as_tensor(x).to(like).reshape(-1, 1, 1) for x in (self.shot, self.read))
+        light = (linear_from_srgb(value) if self.added_to == "light" else value)[:, None]
+        noisy = (light + (shot * light + read**2).sqrt() * normal).clamp(0, 1)
+        recorded = srgb_from_linear(noisy) if self.added_to == "light" else noisy
+        curves = value.expand(len(shot), -1), recorded.mean(-1), recorded.std(-1, correction=0)
+        return tuple(curve.expand(len(like), -1) for curve in curves)  # type: ignore[return-value]
+
+
+def _interpolated(x: Tensor, at: Float[Tensor, "b n"], values: Float[Tensor, "b n"]) -> Tensor:
+    """Values known at increasing positions, at those of x (B, ...); beyond the ends those of the ends."""
+    flat = x.flatten(1).clamp(at[:, :1], at[:, -1:])
+    i = torch.searchsorted(at.contiguous(), flat.contiguous()).clamp(1, at.shape[1] - 1)
+    low, high = at.gather(1, i - 1), at.gather(1, i)
+    share = (flat - low) / (high - low).clamp(min=1e-9)
+    return torch.lerp(values.gather(1, i - 1), values.gather(1, i), share.clamp(0, 1)).reshape(x.shape)
+
+
+def _smoothed(image: Tensor) -> Tensor:
+    r = SMOOTHED // 2
+    return avg_pool2d(pad(image, (r, r, r, r), mode="replicate"), SMOOTHED, 1)
+
+
+def _smoothest(image: Float[Tensor, "1 c h w"]) -> tuple[Float[Tensor, " n"], Float[Tensor, " n"]]:
+    """Values, and the variance of the noise there: of the blocks of about each value those that vary least."""
+    c = image.shape[1]
+    kernel = image.new_tensor([[1, -2, 1], [-2, 4, -2], [1, -2, 1]]).expand(c, 1, 3, 3) / 6
+    inner = image[..., 1:-1, 1:-1]
+    rough = avg_pool2d(conv2d(image, kernel, groups=c).square(), SIDE)
+    mean, empty = avg_pool2d(inner, SIDE), avg_pool2d((inner <= 0).double(), SIDE)
+    unclipped = (empty < 0.02) & (mean < 0.95)
+    mean, rough = mean[unclipped], rough[unclipped]
+    groups = mean.argsort().split(max(-(-len(mean) // GROUPS), FEWEST)) if len(mean) else ()
+    values = [mean[group].median() for group in groups]
+    variances = [rough[group].quantile(SMOOTHEST) / SHARE for group in groups]
+    return torch.stack([*values, mean.new_zeros(())])[:-1], torch.stack([*variances, mean.new_zeros(())])[:-1]
+
+
+def _fitted(added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tensor, " n"]) -> tuple[NoiseLevel, float]:
+    """The level by least squares of relative errors, and its mean squared logarithmic error."""
+    signal = linear_from_srgb(value) if added_to == "light" else value
+    slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4) if added_to == "light" else 1.0
+    design = torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
+    (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))
+    predicted = design @ torch.tensor([shot, read]).to(design)
+    error = float(predicted.clamp(min=1e-6).log().square().mean())
+    return NoiseLevel(float(shot), math.sqrt(read), added_to), error

@@ -1,0 +1,73 @@
+"""Calibrated pairs from matched points alone."""
+
+import math
+
+import pytest
+import torch
+
+from arraygeom import Rig
+from calib.images.matches import Matches, with_map
+from calib.images.refinement import line_distances
+from calib.images.self_calibration import RefinedPair, dense_matches, joined, refined_by_depth, self_calibrated
+from tests.calib.scenes import HW, rectified_images, rectified_pair, seen_points, unlike_pair
+
+
+def calibrated_from(rig: Rig, matches: Matches, **focal: float) -> RefinedPair | None:
+    names = rig.names
+    link = with_map(rig.pair(*names), matches).link
+    return self_calibrated(rig.cameras, link, matches, focal=focal)
+
+
+@pytest.mark.parametrize(("make", "focal"), [(rectified_pair, {}), (unlike_pair, {"first": 305.0, "second": 332.0})])
+def test_lines_are_as_good_as_with_the_calibration(make, focal):
+    rig = make()
+    names = rig.names
+    (matches,) = seen_points(rig, noise=0.1, near=1.6, far=7.0).values()
+    found = calibrated_from(rig, matches, **focal)
+    exact = seen_points(rig, noise=0.0, near=1.6, far=7.0, seed=1)
+    assert float(line_distances(found.rig, exact).abs().median()) < 0.15
+    assert found.rig.names == names
+    assert float(found.rig.pair(*names).beta_from_alpha.t.norm()) == pytest.approx(1)
+
+
+def test_pose_and_bounds_are_found_with_the_focal_lengths():
+    rig = rectified_pair()
+    (matches,) = seen_points(rig, noise=0.1, near=2.0, far=6.0).values()
+    found = calibrated_from(rig, matches, left=300.0, right=300.0)
+    pose = found.rig.pair(*rig.names).beta_from_alpha
+    assert pose.t.tolist() == pytest.approx([-1, 0, 0], abs=0.1)
+    assert math.degrees(float((pose.R - torch.eye(3)).norm())) < 1.5
+    near, far = (float(bound) for bound in found.rig.depth)
+    assert near < 2.0 / 0.2
+    assert far > 6.0 / 0.2
+
+
+def test_focal_lengths_that_the_points_contradict_give_no_calibration():
+    rig = unlike_pair()
+    (matches,) = seen_points(rig, noise=0.05, near=1.6, far=7.0).values()
+    assert calibrated_from(rig, matches, first=3000.0, second=60.0) is None
+
+
+def test_dense_matches_follow_from_a_depth_map():
+    rig, images = rectified_pair(), rectified_images()
+    depth = torch.full(HW, 60 / 11)
+    depth[HW[0] // 2 :] = 3.0
+    matches = dense_matches(rig, images, depth, torch.ones(HW))
+    disparity = matches.alpha[:, 0] - matches.beta[:, 0]
+    wanted = torch.where(matches.alpha[:, 1] < HW[0] // 2, 11.0, 20.0).double()
+    inner = (matches.alpha[:, 1] - HW[0] / 2).abs() > 12
+    assert len(matches.alpha) > 500
+    assert float((disparity - wanted)[inner].abs().median()) < 0.05
+    assert not len(dense_matches(rig, images, depth, torch.zeros(HW)).alpha)
+    pair = RefinedPair(rig, 30, 0.5)
+    assert refined_by_depth(pair, images, depth, torch.zeros(HW)) is pair
+    assert refined_by_depth(pair, images, depth, torch.ones(HW)).points > 500
+
+
+def test_pairs_are_joined_at_their_scales():
+    pair = rectified_pair()
+    other = Rig({"left": pair["left"], "up": pair["right"]}, depth=(3.0, 9.0))
+    rig = joined({"right": RefinedPair(pair, 1, 0.0), "up": RefinedPair(other, 1, 0.0)}, {"right": 1.0, "up": 0.5})
+    assert rig.names == ("left", "right", "up")
+    assert torch.allclose(rig["up"].t, 0.5 * rig["right"].t)
+    assert [float(bound) for bound in rig.depth] == [1.5, 8.0]

@@ -1,0 +1,257 @@
+"""What is damaged, and what is asked of it: rigs of all formats, images, weights, checkpoints, covariance files."""
+
+from __future__ import annotations
+
+import random
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from torch import nn
+
+from arraygeom import Rig
+from arraygeom.io import read_rig, write_rig
+from calib.boards.covariance import RigCovariance
+from pat.cli.main import main
+from pat.media.images import read_image, write_image
+from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.weights import load_weights, save_weights
+from pat.synthesis.photos import read_photographs
+from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint
+
+from .mutations import mutated
+
+FIXTURES = Path(__file__).parents[1] / "arraygeom" / "fixtures"
+
+
+class Seed(NamedTuple):
+    """A good file: its kind and format, where it is, and what is read, the file itself or its folder."""
+
+    kind: str
+    format: str
+    file: Path
+    whole_folder: bool = False
+
+
+Check = Callable[[Path, random.Random], str]
+
+
+def damaged(seed: Seed, number: int, folder: Path) -> Path:
+    """A copy of a seed's file (with its folder, where files belong together) with damage of this number."""
+    source = random.Random(f"{seed.kind} {seed.format} {seed.file.name} {number}")
+    home = folder / "case"
+    shutil.rmtree(home, ignore_errors=True)
+    if seed.whole_folder:
+        shutil.copytree(seed.file.parent, home)
+    else:
+        home.mkdir(parents=True)
+    text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind != "image"
+    path = home / seed.file.name
+    path.write_bytes(mutated(seed.file.read_bytes(), source, text=text, suffix=seed.file.suffix))
+    return home if seed.whole_folder and seed.kind == "rig" else path
+
+
+# Rigs -------------------------------------------------------------------------------------------------------
+
+
+def rig_seeds(folder: Path) -> Iterator[Seed]:
+    """The fixtures of the tests, and what the writers write, binary COLMAP and .mat files among it."""
+    for file in sorted(FIXTURES.rglob("*")):
+        if file.is_file() and file.suffix != ".md":
+            own = file.parent != FIXTURES
+            yield Seed("rig", file.parent.name if own else file.stem, file, own)
+    rich = Rig.load(Path(__file__).parent / "native.yaml")
+    plain = read_rig(FIXTURES / "kalibr.yaml")
+    for format, name in (
+        ("native", "rig.yaml"),
+        ("colmap", ""),
+        ("kalibr", "c.yaml"),
+        ("nerfstudio", "t.json"),
+        ("opencv", ""),
+    ):
+        target = folder / f"written_{format}" / name if name else folder / f"written_{format}"
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            write_rig(rich if format == "native" else plain, target, format=format)
+        for file in sorted(target.iterdir()) if target.is_dir() else [target]:
+            yield Seed("rig", f"{format} (written)", file, target.is_dir())
+    yield _matlab(folder / "matlab")
+    yield from _colmap_binary(folder / "colmap_binary")
+
+
+def _matlab(folder: Path) -> Seed:
+    from scipy.io import savemat
+
+    camera = {"IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]), "ImageSize": [400.0, 640.0]}
+    camera["RadialDistortion"] = np.array([0.1, 0.01])
+    pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
+    pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
+    folder.mkdir(parents=True, exist_ok=True)
+    savemat(folder / "pair.mat", {"s": pair})
+    return Seed("rig", "matlab .mat", folder / "pair.mat")
+
+
+def _colmap_binary(folder: Path) -> Iterator[Seed]:
+    import struct
+
+    q = [0.9486832980505138, 0, 0.31622776601683794, 0, -0.1, 0.02, 0.03]
+    cameras = struct.pack("<QIiQQ4d", 2, 1, 1, 640, 480, 500, 510, 320, 240)
+    cameras += struct.pack("<IiQQ8d", 7, 4, 640, 480, 400, 404, 310.75, 245.25, -0.2, 0.1, 0.001, -0.002)
+    images = (
+        struct.pack("<QI7dI", 2, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a/0001.png\0" + struct.pack("<QddQ", 1, 111.5, 180.2, 1)
+    )
+    images += struct.pack("<I7dI", 2, *q, 7) + b"b/0001.png\0" + struct.pack("<Q", 0)
+    folder.mkdir(parents=True, exist_ok=True)
+    rigs = struct.pack("<QIIiIiIB7d", 1, 1, 2, 0, 1, 0, 7, 1, *q)
+    for name, content in (("cameras.bin", cameras), ("images.bin", images), ("rigs.bin", rigs)):
+        (folder / name).write_bytes(content)
+        yield Seed("rig", "colmap binary", folder / name, whole_folder=True)
+
+
+def convert_and_inspect(path: Path, source: random.Random) -> str:
+    """`pat rig convert` to the native format, and of some `pat rig info`."""
+    target = path.parent / "out.yaml"
+    target.unlink(missing_ok=True)
+    converted = command("rig", "convert", str(path), str(target))
+    left = [p.name for p in target.parent.glob(".*")]
+    if left:
+        return f"left behind: {left}"
+    if target.exists():
+        Rig.load(target)  # a file that is there is whole
+    if (converted == "read") != target.exists():
+        return f"{converted}, and the file is {'there' if target.exists() else 'missing'}"
+    further = source.choice([["info"], ["info", "--json"], ["info", "--depth", "1", "inf"], *[[]] * 21])
+    if converted not in ("read", "refused") or not further:
+        return converted
+    found = command("rig", further[0], str(path), *further[1:])
+    return converted if found in ("read", "refused") else found
+
+
+def command(*arguments: str) -> str:
+    """How a command ends: read for status 0, refused for one line and status 2; else what it was."""
+    try:
+        main(list(arguments))
+    except SystemExit as ended:
+        return {0: "read", None: "read", 2: "refused"}.get(ended.code, f"status {ended.code}")  # type: ignore[call-overload]
+    return "read"
+
+
+# Images -----------------------------------------------------------------------------------------------------
+
+
+def image_seeds(folder: Path) -> Iterator[Seed]:
+    """Small images of every format that is read, 8 and 16 bits and floats, grey and colour."""
+    folder.mkdir(parents=True, exist_ok=True)
+    rng = np.random.default_rng(0)
+    smooth = cv2.resize(rng.integers(0, 256, (6, 8, 3), dtype=np.uint8), (80, 60))
+    kinds = {"png": ".png", "jpeg": ".jpg", "tiff": ".tif", "webp": ".webp", "bmp": ".bmp", "pnm": ".ppm"}
+    for name, suffix in kinds.items():
+        for label, values in (("colour", smooth), ("grey", smooth[..., 0])):
+            file = folder / f"{label}{suffix if label == 'colour' else suffix.replace('ppm', 'pgm')}"
+            cv2.imwrite(str(file), values)
+            yield Seed("image", name, file)
+    for name, values in (("16.png", smooth.astype(np.uint16) * 257), ("32.tif", (smooth / 255).astype(np.float32))):
+        cv2.imwrite(str(folder / name), values)
+        yield Seed("image", "png 16" if name.endswith("png") else "tiff 32", folder / name)
+
+
+def read_and_write(path: Path, source: random.Random) -> str:
+    """`read_image`, what it gives written again, and the bank of photographs of a folder that holds it."""
+    try:
+        image = read_image(path, hw=source.choice([None, None, (60, 80)]))
+    except ValueError as error:
+        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+    if not (image.isfinite().all() and image.min() >= 0 and image.max() <= 1):
+        return "values outside 0..1"
+    write_image(path.with_name("again.png"), image)
+    with_photos(path.parent)
+    return "read"
+
+
+def with_photos(folder: Path) -> None:
+    """The bank of a folder's photographs: files that are none are passed over."""
+    try:
+        read_photographs((folder,), max_edge=64)
+    except ValueError as error:
+        if "no image" not in str(error):
+            raise
+
+
+# Weights, checkpoints, documents ----------------------------------------------------------------------------
+
+
+def small_network() -> GuidedPAT:
+    torch.manual_seed(0)
+    return GuidedPAT(GuidedPATConfig())
+
+
+def weight_seeds(folder: Path) -> Iterator[Seed]:
+    save_weights(small_network(), folder / "weights" / "small.safetensors")
+    yield Seed("weights", "guided", folder / "weights" / "small.safetensors")
+
+
+def use_weights(path: Path, _: random.Random) -> str:
+    try:
+        load_weights(path)
+    except (ValueError, FileNotFoundError) as error:
+        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+    return "read"
+
+
+def training() -> tuple[nn.Module, torch.optim.Optimizer, torch.optim.swa_utils.AveragedModel]:
+    """A run of a small network: itself, its optimiser after one step, its average."""
+    network = nn.Sequential(nn.Linear(4, 4), nn.Linear(4, 2))
+    optimiser = torch.optim.Adam(network.parameters())
+    network(torch.ones(1, 4)).sum().backward()
+    optimiser.step()
+    return network, optimiser, torch.optim.swa_utils.AveragedModel(network)
+
+
+def checkpoint_seeds(folder: Path) -> Iterator[Seed]:
+    facts = {"step": 7, "best": 30.0, "minutes": 1.5, "done": False, "recipe": "steps: 10"}
+    (folder / "run").mkdir(parents=True, exist_ok=True)
+    path = write_checkpoint(folder / "run", collect(*training(), facts))
+    yield Seed("checkpoint", "training", path)
+
+
+def use_checkpoint(path: Path, _: random.Random) -> str:
+    try:
+        found = newest_checkpoint(path.parent)
+        if found is None:
+            return "no checkpoint, and none was named"
+        restore(found, *training())
+    except ValueError as error:
+        return "refused" if "\n" not in str(error) else f"message: {error}"
+    facts = found.facts
+    whole = isinstance(facts["step"], int) and isinstance(facts["minutes"], float) and isinstance(facts["done"], bool)
+    return "read" if whole else f"facts of other types: {facts}"
+
+
+def covariance_seeds(folder: Path) -> Iterator[Seed]:
+    folder.mkdir(parents=True, exist_ok=True)
+    RigCovariance(("a.focal.0", "a.focal.1"), np.eye(2)).save(folder / "covariance.json")
+    yield Seed("covariance", "json", folder / "covariance.json")
+
+
+def use_covariance(path: Path, _: random.Random) -> str:
+    try:
+        found = RigCovariance.load(path)
+    except ValueError as error:
+        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+    whole = np.isfinite(found.matrix).all() and all(isinstance(name, str) for name in found.names)
+    return "read" if whole else f"{found.names} {found.matrix}"
+
+
+KINDS: dict[str, tuple[Callable[[Path], Iterator[Seed]], Check, int]] = {
+    "rig": (rig_seeds, convert_and_inspect, 5000),
+    "image": (image_seeds, read_and_write, 500),
+    "weights": (weight_seeds, use_weights, 200),
+    "checkpoint": (checkpoint_seeds, use_checkpoint, 150),
+    "covariance": (covariance_seeds, use_covariance, 150),
+}
+"""Good files, the question asked of a damaged one, and how many are made."""

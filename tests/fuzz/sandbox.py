@@ -1,0 +1,90 @@
+"""One case in a process of its own, forked: limits of memory and time, and what came of it."""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import resource
+import signal
+import sys
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+MEMORY = 4 << 30
+SECONDS = 10
+"""Of a core's time. A case that sleeps is ended after `WAITING` times as long by the clock."""
+WAITING = 12
+
+
+class Outcome(NamedTuple):
+    """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident bytes."""
+
+    verdict: str
+    message: str
+    seconds: float
+    peak: int
+
+
+def ended(case: Callable[[], str], log: Path) -> Outcome:
+    """Run a case that returns "read" or "refused" (or anything else: a fault) in a child with 4 GiB and 10 s of a core.
+
+    A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
+    """
+    begin = time.monotonic()
+    child = os.fork()
+    if child == 0:
+        _child(case, log)
+    status, usage = _wait(child, begin)
+    seconds, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
+    lines = log.read_text(errors="replace").splitlines() if log.exists() else []
+    last = lines[-1] if lines else ""
+    if os.WIFSIGNALED(status):
+        if os.WTERMSIG(status) in (signal.SIGKILL, signal.SIGXCPU):
+            return Outcome("hang", last, seconds, peak)
+        return Outcome(f"signal {os.WTERMSIG(status)}", last, seconds, peak)
+    verdict = {0: "read", 1: "refused"}.get(os.WEXITSTATUS(status), "fault")
+    traced = any(line.startswith("Traceback") for line in lines)
+    return Outcome("traceback" if traced else verdict, last, seconds, peak)
+
+
+def _wait(child: int, begin: float) -> tuple[int, resource.struct_rusage]:
+    pause = 0.001
+    while True:
+        found, status, usage = os.wait4(child, os.WNOHANG)
+        if found:
+            return status, usage
+        if time.monotonic() - begin > SECONDS * WAITING:
+            os.kill(child, signal.SIGKILL)
+            _, status, usage = os.wait4(child, 0)
+            return status, usage
+        time.sleep(pause)
+        pause = min(pause * 1.5, 0.05)
+
+
+def _child(case: Callable[[], str], log: Path) -> None:
+    """Does not return."""
+    code = 2
+    try:
+        handle = os.open(log, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
+        os.dup2(handle, 1)
+        os.dup2(handle, 2)
+        sys.stdout, sys.stderr = (open(n, "w", closefd=False) for n in (1, 2))  # noqa: SIM115
+        faulthandler.disable()
+        resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+        spent = resource.getrusage(resource.RUSAGE_SELF)
+        limit = int(spent.ru_utime + spent.ru_stime) + SECONDS
+        resource.setrlimit(resource.RLIMIT_CPU, (limit, limit + 1))
+        verdict = case()
+        code = {"read": 0, "refused": 1}.get(verdict, 2)
+        if code == 2:
+            print(verdict)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)

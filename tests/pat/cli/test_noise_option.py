@@ -1,0 +1,29 @@
+"""What --noise may be."""
+
+import pytest
+
+from pat.cli.options import noise_of
+from pat.sensors import NoiseLevel
+
+
+def test_levels_by_camera_or_estimated():
+    assert noise_of([]) is None
+    assert noise_of(["estimate"]) == "estimate"
+    levels = {"mono": NoiseLevel.of_electrons(200, 2), "colour": NoiseLevel.of_electrons(50)}
+    assert noise_of(["mono=200,2", "colour=50"]) == levels
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        (["mono"], "neither 'estimate' nor NAME=ELECTRONS"),
+        (["mono=dark"], "neither 'estimate' nor NAME=ELECTRONS"),
+        (["mono=200,2,1"], "has 3 numbers"),
+        (["mono=-200"], "electrons at white must be more than 0"),
+        (["mono=200,-2"], "read must be 0 or more"),
+        (["mono=200", "mono=50"], "given twice"),
+    ],
+)
+def test_what_is_no_level_is_named(given, said):
+    with pytest.raises(ValueError, match=said):
+        noise_of(given)

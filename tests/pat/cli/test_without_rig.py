@@ -1,0 +1,159 @@
+"""`pat fuse` of images alone: which is alpha, the rig, the page, and one line for what cannot be fused."""
+
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import Camera, Rig
+from pat import fuse, load_weights
+from pat.cli.from_images import camera_names
+from pat.cli.main import main
+from pat.data.sample_array import load_sample
+from pat.evaluation.metrics import score
+from pat.media.images import read_image, write_image
+from pat.media.video import read_video, write_video
+
+ALL = ["confidence.png", "depth.png", "depth.tif", "fused.png", "index.html", "rig.yaml", "view.yaml"]
+
+
+@pytest.fixture(scope="module")
+def halved():
+    """The sample array at half its size, and its ground truth."""
+    sample = load_sample()
+    rig = sample.rig.resize("mono", (200, 320)).resize("colour", (180, 280))
+    return (
+        rig,
+        {name: avg_pool2d(image, 2) for name, image in sample.images.items()},
+        avg_pool2d(sample.ground_truth, 2),
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(halved, tmp_path_factory):
+    """The images as files, and what `pat fuse mono.png colour.png` makes of them."""
+    folder = tmp_path_factory.mktemp("without_rig")
+    for name, image in halved[1].items():
+        write_image(folder / f"{name}.png", image)
+    main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
+    return folder
+
+
+def fails(arguments, capsys) -> str:
+    with pytest.raises(SystemExit) as stop:
+        main(["fuse", *map(str, arguments)])
+    assert stop.value.code == 2
+    return capsys.readouterr().err.splitlines()[-1]
+
+
+def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
+    rig, images, ground_truth = halved
+    assert sorted(path.name for path in (folder / "out").iterdir()) == ALL
+    known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
+    with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
+    assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
+
+
+def test_the_rig_that_was_found_serves_the_next_command(folder):
+    rig = Rig.load(folder / "out" / "rig.yaml")
+    assert rig.names == ("mono", "colour")
+    assert all(isinstance(camera, Camera) for camera in rig.cameras.values())
+    images = [str(folder / f"{name}.png") for name in rig.names]
+    main(
+        [
+            "fuse",
+            str(folder / "out" / "rig.yaml"),
+            *images,
+            "--alpha",
+            "mono",
+            "-o",
+            str(folder / "next"),
+            "--no-report",
+        ]
+    )
+    again, first = (read_image(folder / out / "fused.png") for out in ("next", "out"))
+    assert float((again - first).abs().max()) <= 2 / 255
+    assert not (folder / "next" / "index.html").exists()
+    assert not (folder / "next" / "rig.yaml").exists()
+
+
+def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, capsys):
+    mono, colour = folder / "mono.png", folder / "colour.png"
+    noise = np.random.default_rng(0).integers(0, 255, (200, 320, 3), np.uint8)
+    ramp = np.tile(np.linspace(0, 255, 320, dtype=np.uint8), (200, 1))
+    files = {"other": cv2.GaussianBlur(noise, (0, 0), 2), "flat": np.full((200, 320, 3), 90, np.uint8), "ramp": ramp}
+    for name, values in files.items():
+        cv2.imwrite(str(tmp_path / f"{name}.png"), values)
+    write_video(tmp_path / "clip.mp4", [torch.rand(3, 32, 32)])
+    (tmp_path / "x.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    shutil.copy(mono, tmp_path / "copy.png")
+    out = ["-o", tmp_path / "out"]
+    cases = {
+        ("other.png",): "points seen in both 'mono' and 'other' agree",
+        ("flat.png",): "flat.png: is of one colour",
+        ("ramp.png",): "hardly any texture",
+        ("copy.png",): "are the same image",
+        ("clip.mp4",): "clip.mp4 is a video and",
+        ("x.heic",): "x.heic: ",
+        ("none.png",): "none.png: no such image",
+        (): "give two images or more",
+    }
+    for names, message in cases.items():
+        assert message in fails([mono, *(tmp_path / name for name in names), *out], capsys)
+        assert not (tmp_path / "out").exists()
+    assert "no camera 'tele'; the images' names are mono, colour" in fails([mono, colour, "--alpha", "tele"], capsys)
+    assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
+
+
+def test_names_of_cameras_are_those_of_files_or_folders(tmp_path):
+    names = [tmp_path / "a" / "1.png", tmp_path / "b" / "1.png"]
+    assert list(camera_names(names)) == ["a", "b"]
+    assert list(camera_names([tmp_path / "left eye.png", tmp_path / "b.png"])) == ["left_eye", "b"]
+    assert list(camera_names([names[0], names[0]])) == ["camera1", "camera2"]
+
+
+def test_videos_are_read_as_they_were_written(tmp_path):
+    frames = [torch.full((3, 32, 48), value) for value in (0.2, 0.6)]
+    write_video(tmp_path / "clip.mp4", frames, rate=10)
+    video = read_video(tmp_path / "clip.mp4")
+    found = list(video.frames)
+    assert video.rate == pytest.approx(10)
+    assert [float(frame.mean()) for frame in found] == pytest.approx([0.2, 0.6], abs=0.02)
+    (tmp_path / "no.mp4").write_text("no video")
+    with pytest.raises(ValueError, match="not a video that can be read"):
+        read_video(tmp_path / "no.mp4")
+
+
+def test_focal_lengths_come_from_exif(tmp_path):
+    from pat.media.exif import focal_length
+
+    def saved(width=400, height=300, **tags):
+        image, exif = Image.new("L", (width, height)), Image.Exif()
+        exif.get_ifd(0x8769).update({int(tag[1:], 16): value for tag, value in tags.items()})
+        image.save(tmp_path / "x.jpg", exif=exif)
+        return focal_length(tmp_path / "x.jpg")
+
+    assert saved() is None
+    assert saved(xA405=43) == pytest.approx(43 * 500 / 43.267)
+    sensor = {"x920A": 4.0, "xA20E": 500.0, "xA210": 4}
+    assert saved(**sensor) == pytest.approx(2000)
+    assert saved(**sensor, xA002=800) == pytest.approx(1000)
+    (tmp_path / "x.jpg").write_text("no image")
+    assert focal_length(tmp_path / "x.jpg") is None
+
+
+def test_a_dark_image_is_brought_to_an_ordinary_brightness():
+    from pat.media.colour import linear_from_srgb, srgb_from_linear
+    from pat.media.exposure import exposed, exposure_gain
+
+    light = torch.linspace(0, 1, 400).reshape(1, 20, 20).expand(3, -1, -1)
+    ordinary, dark, bright = (srgb_from_linear(factor * light) for factor in (0.9, 0.05, 3.0))
+    assert exposure_gain(ordinary) == 1
+    assert exposure_gain(torch.zeros(3, 8, 8)) == 1
+    for image in (dark, bright):
+        corrected = linear_from_srgb(exposed(image, exposure_gain(image)))
+        assert float(corrected.quantile(0.99)) == pytest.approx(0.8, abs=0.02)

@@ -1,0 +1,102 @@
+"""Conditions: how pairs are recorded, regions, methods, tables; and which pairs may be tuned on."""
+
+import dataclasses
+
+import pytest
+import torch
+
+from pat.data.pairs import Disparity, StereoPair
+from pat.evaluation import conditions
+from pat.evaluation.conditions import CONDITIONS, ConditionRow, conditions_markdown, evaluate_conditions, regions_of
+from pat.evaluation.halves import of_half
+from pat.media.colour import luminance
+from pat.networks.weights import load_weights
+
+
+def pair(name="pair", hw=(64, 96), disparity=8):
+    """A wall at a constant disparity."""
+    g = torch.Generator().manual_seed(0)
+    wide = torch.rand(1, 3, hw[0] // 4, hw[1] // 4 + 8, generator=g)
+    wide = torch.nn.functional.interpolate(wide, size=(hw[0], hw[1] + 32), mode="bicubic")[0].clamp(0, 1)
+    truth = Disparity(torch.full(hw, float(disparity)), torch.ones(hw, dtype=torch.bool))
+    left, right = wide[:, :, : hw[1]], wide[:, :, disparity : hw[1] + disparity]
+    return StereoPair(name, left, right, 16.0, truth)
+
+
+def test_halves_are_told_apart_by_whole_parts_of_names():
+    names = ["2006_third/Wood1", "2006_third/Wood2", "2005_half/Bowling1x", "train/0001", "x/2006_third/Cloth1"]
+    pairs = [pair(name) for name in names]
+    assert [p.name for p in of_half(pairs, "tune")] == ["2006_third/Wood1", "train/0001", "x/2006_third/Cloth1"]
+    assert [p.name for p in of_half(pairs, "report")] == ["2006_third/Wood2", "2005_half/Bowling1x"]
+    assert len(list(of_half(pairs, "all"))) == 5
+
+
+def test_rows_are_moved_down():
+    moved = CONDITIONS["rows off 3 px"].right(pair().right)
+    torch.testing.assert_close(moved[:, 10:60], pair().right[:, 7:57], atol=1e-5, rtol=0)
+
+
+def test_alpha_weighs_the_truth_and_the_truth_is_as_it_was():
+    p = pair()
+    task, noise = CONDITIONS["alpha = .2/.4/.4"].recorded(p)
+    torch.testing.assert_close(task.alpha, luminance(p.left, (0.2, 0.4, 0.4)))
+    torch.testing.assert_close(task.ground_truth, p.left)
+    assert noise is None
+
+
+def test_random_conditions_depend_on_the_pair_alone():
+    random = CONDITIONS["alpha random"]
+    one, same, other = (random.recorded(pair(name)).task.alpha for name in ("a", "a", "b"))
+    assert torch.equal(one, same)
+    assert not torch.equal(one, other)
+
+
+def test_fewer_electrons_are_noisier():
+    p = pair()
+    errors = [(CONDITIONS[f"{n} electrons"].recorded(p).task.alpha - luminance(p.left)).std() for n in (1000, 200, 50)]
+    assert errors[0] < errors[1] < errors[2]
+
+
+def test_regions_of_a_square_before_a_wall():
+    p = pair(disparity=0)
+    disparity = torch.full((64, 96), 2.0)
+    disparity[20:40, 50:70] = 12.0
+    found = regions_of(dataclasses.replace(p, disparity=Disparity(disparity, disparity > 0)), (64, 96))
+    assert found["beyond"][:, :2].all() and not found["beyond"][:, 2:].any()  # noqa: PT018
+    occluded = found["occluded"][30].nonzero().flatten().tolist()
+    assert occluded == list(range(40, 50))
+    assert not (found["seen"] & (found["occluded"] | found["beyond"])).any()
+
+
+def test_every_method_is_scored_under_every_condition(tmp_path):
+    rows = evaluate_conditions(
+        [pair()], load_weights("mono-colour-small"), ["ideal", "rows off 1 px", "rows off 3 px"], max_disparity=16.0
+    )
+    ours = [row for row in rows if row.method == "fusion"]
+    assert [row.condition for row in ours] == ["ideal", "rows off 1 px", "rows off 3 px"]
+    as_it_is = [row for row in rows if row.method == "uncorrected"]
+    assert ours[1].psnr["whole"] > as_it_is[1].psnr["whole"] + 1.0
+    assert ours[0].within_one[1] > 0.9
+    text = conditions_markdown(rows)
+    assert "| rows off 3 px |" in text
+    assert "OpenCV's SGBM" in text
+    conditions.save_condition_curves(rows, tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_gains_are_of_the_same_pairs():
+    rows = [
+        ConditionRow(name, "ideal", method, 0.9, {"whole": value})
+        for name, method, value in (
+            ("a", "classical", 30.0),
+            ("a", "fusion", 31.0),
+            ("b", "fusion", 25.0),
+            ("b", "classical", 22.0),
+        )
+    ]
+    assert "+2.00" in conditions_markdown(rows)
+
+
+def test_an_unknown_condition_is_refused():
+    with pytest.raises(KeyError):
+        evaluate_conditions([pair()], load_weights("mono-colour-small"), ["fog"])

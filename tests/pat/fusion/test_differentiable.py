@@ -1,0 +1,69 @@
+"""Gradients through a whole fusion: to the rig, the images and the weights."""
+
+import math
+
+import pytest
+import torch
+
+from arraygeom import Rig
+from pat import fuse, load_weights
+from pat.data.sample_array import load_sample
+
+HW = (192, 256)
+TOP, LEFT = 104, 192
+
+
+@pytest.fixture(scope="module")
+def cropped():
+    """The sample array with a window of alpha; its rig, images and ground truth."""
+    sample = load_sample()
+    window = (slice(None), slice(TOP, TOP + HW[0]), slice(LEFT, LEFT + HW[1]))
+    images = sample.images | {"mono": sample.images["mono"][window]}
+    return sample.rig.crop("mono", TOP, LEFT, HW), images, sample.ground_truth[window]
+
+
+def rotated(rig: Rig, angle: torch.Tensor) -> Rig:
+    """The rig, colour rotated about its x axis, across the baseline."""
+    return rig.perturbed({"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)})
+
+
+def test_a_rotation_is_recovered_through_the_fused_image(cropped):
+    rig, images, ground_truth = cropped
+    network = load_weights("mono-colour")
+    angle = torch.tensor(math.radians(0.3), dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
+    for _ in range(10):
+        optimiser.zero_grad()
+        frame = fuse(network, rotated(rig, angle), images, alpha="mono", align=False, differentiable=True)
+        (frame.image - ground_truth).square().mean().backward()
+        optimiser.step()
+    assert abs(math.degrees(angle.item())) < 0.02
+
+
+def test_gradients_reach_rig_images_and_weights(cropped):
+    rig, images, _ = cropped
+    network = load_weights("mono-colour-small").requires_grad_(True)
+    angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    images = {name: image.clone().requires_grad_() for name, image in images.items()}
+    frame = fuse(network, rotated(rig, angle), images, alpha="mono", align=False, differentiable=True)
+    frame.image.square().mean().backward()
+    for tensor in (angle, *images.values(), *network.parameters()):
+        assert tensor.grad is not None
+        assert tensor.grad.isfinite().all()
+    assert all(float(t.grad.abs().max()) > 0 for t in (angle, *images.values()))
+
+
+def test_without_differentiable_everything_is_detached(cropped):
+    rig, images, _ = cropped
+    angle = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    images = images | {"colour": images["colour"].clone().requires_grad_()}
+    frame = fuse(load_weights("mono-colour-small"), rotated(rig, angle), images, alpha="mono")
+    assert [part.requires_grad for part in frame] == [False, False, False]
+
+
+def test_a_differentiable_fusion_is_of_the_whole_frame(cropped, tmp_path):
+    rig, images, _ = cropped
+    network = load_weights("mono-colour-small")
+    for more in ({"max_memory": "2GiB"}, {"store": tmp_path}):
+        with pytest.raises(ValueError, match="leave out max_memory and store"):
+            fuse(network, rig, images, alpha="mono", differentiable=True, **more)

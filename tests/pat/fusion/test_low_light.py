@@ -1,0 +1,138 @@
+"""Fusion of noisy views."""
+
+import pytest
+import torch
+
+from arraygeom.distortion import Distortion
+from pat.data.sample_array import ALPHA, BETA, load_sample
+from pat.evaluation.baseline import classical
+from pat.evaluation.low_light import non_local_means
+from pat.evaluation.metrics import score
+from pat.fusion.fuse import fuse
+from pat.fusion.low_light import Found, denoised, denoised_views, warped
+from pat.fusion.views import Views
+from pat.media.colour import luminance
+from pat.networks import denoiser
+from pat.networks.denoiser import NoisyView
+from pat.networks.weights import load_weights
+from pat.sensors import NoiseLevel, generator_for
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_weights("mono-colour-small")
+
+
+def in_low_light(electrons):
+    sample, level = load_sample(), NoiseLevel.of_electrons(electrons, 2)
+    images = {n: level.recorded(i[None], generator_for(0, n))[0] for n, i in sample.images.items()}
+    return sample, images, dict.fromkeys(images, level)
+
+
+def psnr(image, sample):
+    return score(image.clamp(0, 1), sample.ground_truth).psnr
+
+
+@pytest.mark.parametrize("noise", [{}, {ALPHA: NoiseLevel.of_electrons(1e6)}])
+def test_views_without_noticeable_noise_are_fused_as_ever(network, noise):
+    sample = load_sample()
+    plain, same = (fuse(network, sample.rig, sample.images, alpha=ALPHA, noise=n) for n in (None, noise))
+    assert torch.equal(plain.image, same.image)
+    assert torch.equal(plain.confidence, same.confidence)
+
+
+@pytest.mark.parametrize(("electrons", "gain", "margin"), [(200, 2.5, -0.2), (50, 5.0, 0.7)])
+def test_low_light_against_the_classical_baseline_and_denoising_before_it(network, electrons, gain, margin):
+    """At 200 electrons non-local means do as well here: the scene has thin lines of equal brightness."""
+    sample, images, noise = in_low_light(electrons)
+    ours = psnr(fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image, sample)
+    assert ours > psnr(classical(sample.rig, images, ALPHA, BETA), sample) + gain
+    quiet = {n: non_local_means(i, float((i - sample.images[n]).std())) for n, i in images.items()}
+    assert ours > psnr(classical(sample.rig, quiet, ALPHA, BETA), sample) + margin
+
+
+def test_an_estimated_level_does_about_as_well_as_a_stated_one(network):
+    sample, images, noise = in_low_light(50)
+    stated, found = (
+        psnr(fuse(network, sample.rig, images, alpha=ALPHA, noise=n).image, sample) for n in (noise, "estimate")
+    )
+    assert found > stated - 0.5
+
+
+def test_the_joint_correction_improves_on_denoising_alone(network, monkeypatch):
+    sample, images, noise = in_low_light(50)
+    joint = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    monkeypatch.setattr(denoiser.LowLightNetwork, "forward", lambda self, image, *_: image)
+    alone = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise).image
+    assert psnr(joint, sample) > psnr(alone, sample) + 0.1
+
+
+@pytest.mark.parametrize("given", [(ALPHA, BETA), (BETA,)])
+def test_alphas_values_are_kept(network, given):
+    """Asked for, or because no noise of alpha is stated."""
+    sample, images, noise = in_low_light(200)
+    noise = {name: noise[name] for name in given}
+    frame = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, keep_alpha=ALPHA in given)
+    torch.testing.assert_close(luminance(frame.image), images[ALPHA], atol=1e-4, rtol=0)
+
+
+def test_tiles_are_fused_as_the_whole(network):
+    sample, images, noise = in_low_light(200)
+    whole = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    monkey = pytest.MonkeyPatch()
+    monkey.setattr("pat.fusion.low_light.PIECE", 192)
+    tiles = fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    monkey.undo()
+    torch.testing.assert_close(tiles.image, whole.image, atol=2e-3, rtol=0)
+    assert not torch.equal(tiles.image, whole.image)
+
+
+def test_a_distorted_alpha_is_denoised_too(network):
+    sample, images, noise = in_low_light(50)
+    lens = Distortion("brown-conrady", torch.tensor([-0.05, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64))
+    rig = sample.rig.with_camera(ALPHA, sample.rig[ALPHA].replace(distortion=lens))
+    frame = fuse(network, rig, images, alpha=ALPHA, noise=noise)
+    recorded, found = (float((x - x.roll(1, -1)).square().mean()) for x in (images[ALPHA], luminance(frame.image)))
+    assert frame.image.shape == sample.ground_truth.shape
+    assert found < 0.5 * recorded
+
+
+def test_bands_other_than_three_are_denoised_one_by_one():
+    image, deviation = torch.rand(1, 2, 40, 40), torch.full((1, 2, 40, 40), 0.05)
+    both = denoised(image, deviation)
+    torch.testing.assert_close(both[:, 1:], denoised(image[:, 1:], deviation[:, 1:]))
+
+
+def test_a_camera_without_an_image_is_named():
+    sample = load_sample()
+    views = Views.of(sample.rig, sample.images, alpha=ALPHA)
+    with pytest.raises(ValueError, match="noise of 'nir'"):
+        denoised_views(views, {"nir": NoiseLevel(0.01)})
+
+
+def test_betas_are_mixed_by_confidence():
+    one, other = (NoisyView(*torch.full((3, 1, 3, 4, 5), value).unbind()) for value in (0.2, 0.8))
+    where = torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="xy"), -1)
+    seen = torch.zeros(4, 5)
+    seen[:, 2:] = 0.9
+    mixed, confidence = warped([one, other], [Found(where, seen), Found(where, 0.9 - seen)])
+    torch.testing.assert_close(mixed.recorded[0, 0, :, 2:], torch.full((4, 3), 0.2), atol=1e-4, rtol=0)
+    torch.testing.assert_close(mixed.recorded[0, 0, :, :2], torch.full((4, 2), 0.8), atol=1e-4, rtol=0)
+    assert float(confidence.min()) == pytest.approx(0.9)
+
+
+def test_positions_are_those_of_the_matched_colours(network):
+    """Beta's own colours at the positions that are found resemble the fused image."""
+    sample, images, noise = in_low_light(200)
+    seen = {}
+
+    def noted(self, image, alpha, beta, confidence):
+        seen.update(image=image, beta=beta, confidence=confidence)
+        return image
+
+    monkey = pytest.MonkeyPatch()
+    monkey.setattr(denoiser.LowLightNetwork, "forward", noted)
+    fuse(network, sample.rig, images, alpha=ALPHA, noise=noise)
+    monkey.undo()
+    high = (seen["confidence"] > 0.8).expand_as(seen["image"])
+    assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.02

@@ -1,0 +1,96 @@
+"""The page of a fused frame: complete in itself, and in a real browser."""
+
+import re
+import shutil
+
+import pytest
+import torch
+
+from arraygeom import Rig
+from pat.data.sample_array import SAMPLE, load_sample
+from pat.fusion.report import Facts, report_page, rig_drawing, write_report
+from pat.fusion.results import Frame
+
+CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
+DRIVER = shutil.which("chromedriver")
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    sample = load_sample()
+    h, w = sample.rig["mono"].hw
+    depth = torch.linspace(2, 9, w).expand(h, w).clone()
+    depth[:, :40] = torch.nan
+    frame = Frame(sample.ground_truth, depth, torch.linspace(0, 1, h)[:, None].expand(h, w))
+    facts = Facts(("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30)
+    path = tmp_path_factory.mktemp("report") / "index.html"
+    return write_report(path, frame, sample.images, sample.rig, "mono", facts)
+
+
+def test_the_page_needs_no_other_file(page):
+    text = page.read_text()
+    assert not re.findall(r"\{\{\w+\}\}", text)
+    sources = re.findall(r'(?:src|href)="([^"]{0,30})', text)
+    assert len(sources) == 6
+    assert all(source.startswith("data:") for source in sources)
+    assert not re.findall(r"https?://|@import|url\(", text)
+    assert "weights: &lt;mono&gt; &amp; more" in text
+    assert "2.5 to 8.93 m, for 98% of the pixels" in text
+    assert "12 s" in text
+    assert "prefers-color-scheme: dark" in text
+
+
+def test_without_depth_poses_and_warnings_there_is_nothing_of_them(page):
+    frame = Frame(torch.rand(3, 20, 30), torch.full((20, 30), torch.nan), torch.rand(20, 30))
+    sample = load_sample()
+    views = {name: sample.rig[name].resize((20, 30)) for name in sample.rig.names}
+    rig = Rig(views)
+    images = {name: torch.rand(1, 20, 30) for name in views}
+    text = report_page(frame, images, rig, "mono", Facts())
+    assert 'data-overlay="depth"' not in text
+    assert "<h2>Warnings" not in text
+    assert text.count("<polyline") == 10
+    assert rig_drawing(Rig.load(SAMPLE / "rig.yaml"), "mono").count("(alpha)") == 1
+
+
+@pytest.mark.skipif(not (CHROMIUM and DRIVER), reason="no browser is installed: apt-get install chromium")
+def test_slider_and_overlays_work_in_a_browser(page):
+    webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed")
+    options = webdriver.ChromeOptions()
+    options.binary_location = CHROMIUM
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    for flag in ("--headless=new", "--no-sandbox", "--window-size=1280,1200", "--disable-dev-shm-usage"):
+        options.add_argument(flag)
+    driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    run = driver.execute_script
+    try:
+        driver.get(page.as_uri())
+        assert run("return [...document.images].every(i => i.complete && i.naturalWidth > 0)")
+        shown = "return [...document.querySelectorAll('.layer.SIDE')].map(i => i.dataset.name)"
+        assert run(shown.replace("SIDE", "left")) == ["alpha: mono"]
+        assert run(shown.replace("SIDE", "right")) == ["fused"]
+        drag(driver, 0.25)
+        boundary = run("return document.querySelector('.stage').style.getPropertyValue('--at')")
+        assert float(boundary[:-1]) == pytest.approx(25, abs=1.5)
+        for name in ("depth", "confidence"):
+            visible = f"return getComputedStyle(document.getElementById('{name}')).visibility"
+            assert run(f"return document.getElementById('{name}').hidden") is True
+            driver.find_element("css selector", f"[data-overlay={name}]").click()
+            assert run(visible) == "visible"
+            assert run(f"return document.getElementById('{name}').hidden") is False
+        assert run("return document.querySelector('.legend').hidden") is False
+        driver.find_element("css selector", "#left option:nth-child(2)").click()
+        assert run(shown.replace("SIDE", "left")) == ["beta: colour"]
+        assert len(driver.get_screenshot_as_png()) > 20_000
+        assert driver.get_log("browser") == []
+    finally:
+        driver.quit()
+
+
+def drag(driver, share):
+    """Drag the slider from the middle to a share of its width, with the mouse."""
+    from selenium.webdriver import ActionChains
+
+    slider = driver.find_element("id", "slider")
+    step = (share - 0.5) * slider.size["width"]
+    ActionChains(driver).click_and_hold(slider).move_by_offset(round(step), 0).release().perform()

@@ -1,0 +1,79 @@
+"""The networks that remove noise."""
+
+import pytest
+import torch
+
+from pat.data.sample_array import load_sample
+from pat.evaluation.low_light import non_local_means
+from pat.media.colour import luminance
+from pat.networks.denoiser import DenoiserConfig, LowLightNetwork, NoisyView
+from pat.networks.weights import DENOISER, SHIPPED, load_denoiser, load_weights, save_weights
+from pat.sensors import NoiseLevel, generator_for
+
+
+def psnr(image, ideal):
+    return -10 * float((image.clamp(0, 1) - ideal).square().mean().log10())
+
+
+def drawn(*shape):
+    return torch.rand(shape, generator=torch.Generator().manual_seed(0))
+
+
+def test_without_noise_images_stay_as_they_are():
+    network, image = load_denoiser(), drawn(2, 3, 37, 50)
+    torch.testing.assert_close(network.colour(image, 0 * image), image, atol=1e-6, rtol=0)
+    assert torch.equal(network.band(image[:, :1], 0 * image[:, :1]), image[:, :1])
+    alpha, beta = NoisyView(image[:, :1], image[:, :1], 0 * image[:, :1]), NoisyView(image, image, 0 * image)
+    assert torch.equal(network(image, alpha, beta, torch.ones(2, 1, 37, 50)), image)
+
+
+@pytest.mark.parametrize("electrons", [200, 50])
+def test_a_band_is_better_than_after_non_local_means(electrons):
+    ideal, recorded, ours = denoised("band", electrons)
+    rival = non_local_means(recorded[0], float((recorded - ideal).std()))[None]
+    assert psnr(ours, ideal) > psnr(rival, ideal) + 0.5
+
+
+@pytest.mark.parametrize(("electrons", "gain"), [(200, 2.5), (50, 6.0)])
+def test_colours_lose_noise(electrons, gain):
+    """In spite of thin lines of equal brightness, which are lost among the noise."""
+    ideal, recorded, ours = denoised("colour", electrons)
+    assert psnr(ours, ideal) > psnr(recorded, ideal) + gain
+
+
+def denoised(part, electrons):
+    """A part of the sample scene, as recorded, and denoised."""
+    ideal = load_sample().ground_truth[None, :, :256, :320]
+    ideal = luminance(ideal) if part == "band" else ideal
+    level = NoiseLevel.of_electrons(electrons, 2)
+    recorded = level.recorded(ideal, generator_for(0, part, electrons))
+    return ideal, recorded, getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded))
+
+
+def test_a_fused_image_takes_the_betas_brightness_as_its_own():
+    """The same scene twice as dark in beta corrects the image all the same."""
+    network, image = load_denoiser(), drawn(1, 3, 32, 48)
+    deviation = torch.full_like(image, 0.05)
+    alpha = NoisyView(luminance(image), luminance(image), deviation[:, :1])
+    beta = NoisyView(image + 0.05 * torch.randn_like(image), image, deviation)
+    dark = NoisyView(*(0.5 * part for part in beta))
+    confidence = torch.ones(1, 1, 32, 48)
+    one, other = (network(image, alpha, view, confidence) for view in (beta, dark))
+    torch.testing.assert_close(one, other, atol=2e-3, rtol=0)
+
+
+def test_the_shipped_network_is_small_and_described():
+    assert DENOISER.stat().st_size < 1e6
+    assert DENOISER.with_suffix(".md").is_file()
+
+
+def test_written_and_read_back(tmp_path):
+    narrow = LowLightNetwork(DenoiserConfig((4, 4, 4), (4, 4, 4), (4, 4, 4)))
+    save_weights(narrow, tmp_path / "w.safetensors")
+    again = load_denoiser(tmp_path / "w.safetensors")
+    assert again.config == narrow.config
+    assert all(torch.equal(v, again.state_dict()[k]) for k, v in narrow.state_dict().items())
+    with pytest.raises(ValueError, match="not weights of this package"):
+        load_weights(tmp_path / "w.safetensors")
+    with pytest.raises(ValueError, match="not weights of this package"):
+        load_denoiser(SHIPPED / "mono-colour-small.safetensors")

@@ -1,0 +1,45 @@
+"""Transformations of torch on public operators: right, or one error of ours."""
+
+import pytest
+import torch
+
+from tests.transformations.operators import ATTENTION, OPERATORS
+from tests.transformations.run import CHECKS, verdict
+
+REFUSED = {"sample", "Moved", "fit_homography", 'attend, backend="cpu"'}
+"""Operators of which some transformations are refused."""
+
+
+@pytest.mark.parametrize("operator", [name for name in OPERATORS if name not in ATTENTION])
+@pytest.mark.parametrize("transformation", ["grad", "jvp", "vmap", "jacfwd", "autocast"])
+def test_geometry(operator, transformation):
+    found = verdict(operator, transformation)
+    assert found == "right" or (operator in REFUSED and found.startswith("refused"))
+
+
+@pytest.mark.parametrize("operator", ATTENTION)
+@pytest.mark.parametrize("transformation", ["grad", "vjp", "jvp", "vmap", "jacrev", "autocast"])
+def test_attention(operator, transformation):
+    found = verdict(operator, transformation)
+    assert found == "right" or (operator in REFUSED and found.startswith("refused: backend 'cpu' has no"))
+
+
+@pytest.mark.parametrize("operator", ["Epipolar", "undistort, brown-conrady", "Rectified"])
+def test_whole_graphs(operator):
+    assert verdict(operator, "compile") == "right"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("operator", OPERATORS)
+@pytest.mark.parametrize("transformation", CHECKS)
+def test_every_one(operator, transformation):
+    assert verdict(operator, transformation).startswith(("right", "refused"))
+
+
+def test_a_wrong_answer_is_seen():
+    """The oracle is none if a derivative that is off passes."""
+    from tests.transformations.run import Operator, check_grad
+
+    off = Operator(lambda x: x.square() + (x.detach() - x), torch.ones(3, dtype=torch.float64))
+    with pytest.raises(AssertionError, match="off, of"):
+        check_grad(off)
