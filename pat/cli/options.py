@@ -31,6 +31,7 @@ WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors"))
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
 VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
 
+
 def _field_names() -> tuple[str, ...]:
     """The keys of `arraygeom.fields.default.FIELDS`, from its text: importing it would import torch."""
     package = importlib.util.find_spec("arraygeom")
