@@ -18,7 +18,6 @@ not valid; their values stay finite and bounded (the point is moved in to the tu
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from math import pi
 from typing import ClassVar
@@ -29,6 +28,7 @@ from torch import Tensor
 
 from .batching import Batched
 from .pixels import floating, product
+from .roots import first_root, invert_increasing
 from .text import distortion_text
 from .tracing import traced
 
@@ -216,8 +216,8 @@ def _brown_limit(lens: _Brown) -> Tensor:
     one = torch.ones_like(k1)
     rising = _product((one, 3 * k1, 5 * k2, 7 * k3), (one, k4, k5, k6))
     falling = _product((one, k1, k2, k3), (0 * one, 2 * k4, 4 * k5, 6 * k6))
-    turn = _first_root(torch.stack([a - b for a, b in zip(rising, falling)], -1))
-    pole = _first_root(torch.stack([one, k4, k5, k6], -1))
+    turn = first_root(torch.stack([a - b for a, b in zip(rising, falling)], -1))
+    pole = first_root(torch.stack([one, k4, k5, k6], -1))
     return torch.minimum(torch.minimum(turn * (1 - MARGIN), pole * POLE), one * WIDEST**2)
 
 
@@ -229,7 +229,7 @@ def _brown_start(lens: _Brown, target: Tensor, limit: Tensor) -> Tensor:
         return r * g, g + 2 * r * r * dg
 
     wanted = _norm(target)
-    r = _invert_increasing(radius, wanted, limit.sqrt().expand_as(wanted).to(wanted))
+    r = invert_increasing(radius, wanted, limit.sqrt().expand_as(wanted).to(wanted))
     return target * (r / torch.where(wanted > 0, wanted, 1.0))[..., None]
 
 
@@ -378,7 +378,7 @@ def _fisheye_start(c: Tensor, u_d: Tensor, limit: Tensor) -> Tensor:
         p, slope = _fisheye_factor(c, theta.square())
         return theta * p, slope
 
-    return _invert_increasing(radius, u_d.sqrt(), limit.sqrt().expand_as(u_d)).square()
+    return invert_increasing(radius, u_d.sqrt(), limit.sqrt().expand_as(u_d)).square()
 
 
 @torch.library.custom_op(
@@ -406,7 +406,7 @@ def _fisheye_limit(c: Tensor) -> Tensor:
     """The squared angle up to which the radius rises, at most pi^2: float64 on the CPU, shape (*b, 1..)."""
     odd = torch.tensor([3.0, 5.0, 7.0, 9.0], dtype=torch.float64)
     slope = torch.cat([torch.ones_like(c[..., :1]).to(odd), c.detach().to(odd) * odd], -1)
-    return _first_root(slope).clamp_max(pi**2) * (1 - MARGIN)
+    return first_root(slope).clamp_max(pi**2) * (1 - MARGIN)
 
 
 def _angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
@@ -430,65 +430,6 @@ def _cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
 
 
 # Shared -----------------------------------------------------------------------------------------------------
-
-
-def _first_root(coefficients: Tensor) -> Tensor:
-    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none, 0 if an a is not finite.
-
-    `coefficients` (*b, n + 1) starts with the 1. The roots are the inverses of those of the reversed
-    polynomial, which is monic, so a leading coefficient of 0 needs no care: eigenvalues of its companion.
-    Huge coefficients, with which LAPACK crashes, are scaled down first (u = s w, with s a power of 2).
-    """
-    a = coefficients[..., 1:]
-    n = a.shape[-1]
-    finite = a.isfinite().all(-1)
-    a = torch.where(finite[..., None], a, 0.0)
-    powers = torch.arange(1, n + 1).to(a)
-    size = (a.abs() ** (1 / powers)).amax(-1)
-    scale = torch.where(size > HUGE, torch.exp2(-size.clamp(min=1.0).log2().ceil()), 1.0)
-    a = a * scale[..., None] ** powers
-    companion = torch.diag_embed(torch.ones_like(a[..., 1:]), offset=-1)
-    companion = companion - torch.cat([a[..., None, :], a.new_zeros((*a.shape[:-1], n - 1, n))], -2)
-    inverse_roots = torch.linalg.eigvals(companion)
-    positive = (inverse_roots.imag == 0) & (inverse_roots.real > 0)
-    root = scale / torch.where(positive, inverse_roots.real, 0.0).amax(-1)
-    return torch.where(finite, root, 0.0)
-
-
-HUGE = 1e4
-"""Coefficients from the n-th power of this on are scaled before their roots are sought; no lens has such."""
-
-
-def _invert_increasing(
-    f: Callable[[Tensor], tuple[Tensor, Tensor]], y: Tensor, high: Tensor, iterations: int = 100
-) -> Tensor:
-    """r in [0, high] with f(r) = y, by Newton inside a bracket; `high` where f never gets to y.
-
-    f gives its value and its slope, f(0) = 0, and rises on the bracket.
-    """
-    reached = f(high)[0] > y
-    y = torch.where(reached, y, 0.0)
-    low, top = torch.zeros_like(y), high
-    r = torch.minimum(y, high)
-    step = high.expand_as(r)
-    for i in range(iterations):
-        value, slope = f(r)
-        low, top = torch.where(value < y, r, low), torch.where(value > y, r, top)
-        newton = r - (value - y) / slope
-        enough = 4 * torch.finfo(y.dtype).eps * r
-        # Newton's steps can cycle within the bracket: from some iteration on either they halve or the bracket does.
-        cycles = ((newton - r).abs() > torch.maximum(step / 2, enough)) & (i >= PATIENCE)
-        following = torch.where((newton >= low) & (newton <= top) & ~cycles, newton, (low + top) / 2)
-        step = (following - r).abs()
-        moved = step > enough
-        r = following
-        if not traced() and not bool(moved.any()):
-            break
-    return torch.where(reached, r, high)
-
-
-PATIENCE = 12
-"""Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket."""
 
 
 def _product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Tensor]:

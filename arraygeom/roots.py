@@ -1,0 +1,69 @@
+"""Roots of polynomials, and inverses of increasing functions, for many at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from .tracing import traced
+
+
+def first_root(coefficients: Tensor) -> Tensor:
+    """The smallest positive root of 1 + a_1 u + ... + a_n u^n, infinity if there is none, 0 if an a is not finite.
+
+    `coefficients` (*b, n + 1) starts with the 1. The roots are the inverses of those of the reversed
+    polynomial, which is monic, so a leading coefficient of 0 needs no care: eigenvalues of its companion.
+    Huge coefficients, with which LAPACK crashes, are scaled down first (u = s w, with s a power of 2).
+    """
+    a = coefficients[..., 1:]
+    n = a.shape[-1]
+    finite = a.isfinite().all(-1)
+    a = torch.where(finite[..., None], a, 0.0)
+    powers = torch.arange(1, n + 1).to(a)
+    size = (a.abs() ** (1 / powers)).amax(-1)
+    scale = torch.where(size > HUGE, torch.exp2(-size.clamp(min=1.0).log2().ceil()), 1.0)
+    a = a * scale[..., None] ** powers
+    companion = torch.diag_embed(torch.ones_like(a[..., 1:]), offset=-1)
+    companion = companion - torch.cat([a[..., None, :], a.new_zeros((*a.shape[:-1], n - 1, n))], -2)
+    inverse_roots = torch.linalg.eigvals(companion)
+    positive = (inverse_roots.imag == 0) & (inverse_roots.real > 0)
+    root = scale / torch.where(positive, inverse_roots.real, 0.0).amax(-1)
+    return torch.where(finite, root, 0.0)
+
+
+HUGE = 1e4
+"""Coefficients from the n-th power of this on are scaled before their roots are sought; no lens has such."""
+
+
+def invert_increasing(
+    f: Callable[[Tensor], tuple[Tensor, Tensor]], y: Tensor, high: Tensor, iterations: int = 100
+) -> Tensor:
+    """r in [0, high] with f(r) = y, by Newton inside a bracket; `high` where f never gets to y.
+
+    f gives its value and its slope, f(0) = 0, and rises on the bracket.
+    """
+    reached = f(high)[0] > y
+    y = torch.where(reached, y, 0.0)
+    low, top = torch.zeros_like(y), high
+    r = torch.minimum(y, high)
+    step = high.expand_as(r)
+    for i in range(iterations):
+        value, slope = f(r)
+        low, top = torch.where(value < y, r, low), torch.where(value > y, r, top)
+        newton = r - (value - y) / slope
+        enough = 4 * torch.finfo(y.dtype).eps * r
+        # Newton's steps can cycle within the bracket: from some iteration on either they halve or the bracket does.
+        cycles = ((newton - r).abs() > torch.maximum(step / 2, enough)) & (i >= PATIENCE)
+        following = torch.where((newton >= low) & (newton <= top) & ~cycles, newton, (low + top) / 2)
+        step = (following - r).abs()
+        moved = step > enough
+        r = following
+        if not traced() and not bool(moved.any()):
+            break
+    return torch.where(reached, r, high)
+
+
+PATIENCE = 12
+"""Iterations after which a step of Newton that is not half the one before is replaced by halving the bracket."""
