@@ -142,7 +142,7 @@ def fit(
     """
     most, fewest = settings.points
     step = max(alpha.numel() // most, 1)
-    x, y = bands[:, ::step].double(), alpha[::step].double()
+    x, y = bands[:, ::step].double().cpu(), alpha[::step].double().cpu()
     unclipped = (y > 0.02) & (y < 0.98) & (x > 0.01).all(0) & (x < 0.98).all(0)
     x, y = x[:, unclipped], y[unclipped]
     if len(y) < fewest:
@@ -150,7 +150,7 @@ def fit(
     gamma, found = _best_gamma(x, y, settings)
     shading: tuple[float, ...] = ()
     if where is not None:
-        terms = _shading_terms(where[::step][unclipped].double())
+        terms = _shading_terms(where[::step].double().cpu()[unclipped])
         slopes = _shading(x, y, terms, settings)
         even = x * (slopes @ terms).exp()
         other_gamma, other = _best_gamma(even, y, settings)

@@ -93,9 +93,10 @@ def agreed(inputs: Inputs, found: tuple[SemiGlobalMatches, ...]) -> list[tuple[T
     inverse_depth, facts, known = _chosen(views)
     guide = to_bytes(torch.nn.functional.avg_pool2d(inputs.alpha, FINE)[0, 0])
     scale = max(float(inverse_depth.max()), 1e-9)
-    plane = (inverse_depth / scale).numpy().astype(np.float32)
-    smooth = filled(plane[None], known.numpy().astype(np.float32) + 1e-5, guide, DISPARITY_FILL)[0]
-    median = cv2.medianBlur(np.where(known.numpy(), plane, smooth), 5)
+    plane = (inverse_depth / scale).cpu().numpy().astype(np.float32)
+    certain = known.cpu().numpy()
+    smooth = filled(plane[None], certain.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)[0]
+    median = cv2.medianBlur(np.where(certain, plane, smooth), 5)
     inverse_depth = torch.from_numpy(median).to(inverse_depth) * scale
     return [_of_view(view, inverse_depth, facts, known, inputs.alpha) for view in views]
 
