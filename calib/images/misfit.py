@@ -11,8 +11,8 @@ from torch import Tensor
 from arraygeom import Rig
 
 from .matches import match_cameras
-from .refinement import line_distances, own_distance
-from .residuals import related
+from .refinement import line_distances
+from .residuals import own_distance, related
 
 LARGEST_SIDE = 1000
 """Images are reduced to this many pixels."""

@@ -27,11 +27,11 @@ from arraygeom import Camera, Rig
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
 from .least_squares import Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
-from .matches import ENOUGH, Matches, fit_fundamental, line_distance, match_cameras, undistort_matches, with_map
+from .matches import ENOUGH, Matches, match_cameras, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
-from .residuals import epipolar_residuals, related, systematic_modes
+from .residuals import epipolar_residuals, own_distance, related, systematic_modes
 
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
@@ -100,8 +100,15 @@ def refine_matches(
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
     force: bool = False,
+    keep_depth: bool = True,
 ) -> Refinement:
-    """`refine` from matched points, without the photometric error."""
+    """`refine` from matched points, without the photometric error.
+
+    Without `keep_depth` the rig's depths are only assumed: they may change in any way, and nothing is refused.
+    """
+    if not keep_depth:
+        problem = RefinementProblem.of(rig, free, frames=frames, sigma=sigma)
+        return problem.report(problem.solve_freely(), force=True)
     fit, solution = fitted(rig, frames, free=free, sigma=sigma)
     return fit.report(solution, force=force)
 
@@ -192,6 +199,10 @@ class RefinementProblem:
         if (depth := self._depth_change(self.after(found.z), found)) is not None and depth.doubtful:
             found = self._determined(unrestricted, residuals, keep_depth=True)
         return found
+
+    def solve_freely(self) -> Solution:
+        """The posterior given the used points, whatever happens to depth."""
+        return solve(lambda z: sampson(self.after(z), self.used), self.count, 0)
 
     def depth_derivatives(self) -> Float[Tensor, "m k"] | None:
         """Derivatives of the logarithm of the used points' depth by free and considered parameters.
@@ -303,18 +314,6 @@ def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str
             f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat rig doctor`"
         ]
     return []
-
-
-def own_distance(rig: Rig, pairs: Pairs) -> float:
-    """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to them."""
-    found = []
-    for names, matches in pairs.items():
-        undistorted = undistort_matches(rig.pair(*names), matches)
-        try:
-            found.append(line_distance(undistorted, fit_fundamental(undistorted)))
-        except ValueError:
-            continue
-    return float(torch.cat(found).median()) if found else 0.0
 
 
 def _uncertain_depth(depth: DepthChange | None) -> list[str]:

@@ -17,7 +17,7 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Link, Pair, Rig, View, essential_matrix, stack
 from arraygeom.pixels import to_homogeneous
 
-from .matches import Matches
+from .matches import Matches, fit_fundamental, line_distance, undistort_matches
 
 
 class EpipolarResiduals(NamedTuple):
@@ -180,3 +180,15 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
         return (to_homogeneous(a), to_homogeneous(b)), pair.fundamental, a_valid & b_valid
     (a, a_valid), (b, b_valid) = (camera.rays(points) for camera, points in zip(pair.cameras, (x, y)))
     return (a, b), essential_matrix(pair.beta_from_alpha), a_valid & b_valid
+
+
+def own_distance(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:
+    """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to them."""
+    found = []
+    for names, matches in pairs.items():
+        undistorted = undistort_matches(rig.pair(*names), matches)
+        try:
+            found.append(line_distance(undistorted, fit_fundamental(undistorted)))
+        except ValueError:
+            continue
+    return float(torch.cat(found).median()) if found else 0.0

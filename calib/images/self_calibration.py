@@ -226,7 +226,7 @@ def _refined(rig: Rig, matches: Matches) -> Rig:
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
-    return refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma).rig
+    return refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
 
 
 def _unit_baseline(rig: Rig) -> Rig:

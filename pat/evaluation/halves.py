@@ -7,7 +7,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-import yaml
+from arraygeom.safe_yaml import load_yaml
 
 from ..data.pairs import StereoPair
 
@@ -17,7 +17,7 @@ Half = Literal["tune", "report", "all"]
 @cache
 def tune_pairs() -> tuple[str, ...]:
     """Parts of the paths of pairs on which settings may be chosen (halves.yaml)."""
-    return tuple(yaml.safe_load(Path(__file__).with_name("halves.yaml").read_text(encoding="utf-8"))["tune"])
+    return tuple(load_yaml(Path(__file__).with_name("halves.yaml").read_text(encoding="utf-8"))["tune"])
 
 
 def of_half(pairs: Iterable[StereoPair], half: Half) -> Iterator[StereoPair]:

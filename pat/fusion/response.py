@@ -39,7 +39,7 @@ class ResponseSettings(NamedTuple):
     least_gain: logarithm of the weights' sum below which it is not taken for another exposure, where the sum is well
         known and where not.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
-    least_shading: largest logarithm of vignetting below which there is none.
+    shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
     """
 
@@ -52,7 +52,7 @@ class ResponseSettings(NamedTuple):
     known: float = 0.015
     least_gain: tuple[float, float] = (0.04, 0.18)
     better: float = 0.8
-    least_shading: float = 0.08
+    shading: tuple[float, float] = (0.08, 0.7)
     explained: float = 0.5
 
 
@@ -154,7 +154,7 @@ def fit(
         slopes = _shading(x, y, terms, settings)
         even = x * (slopes @ terms).exp()
         other_gamma, other = _best_gamma(even, y, settings)
-        if other.error < settings.better * found.error and float((slopes @ terms).abs().max()) > settings.least_shading:
+        if other.error < settings.better * found.error and _plausible(slopes, terms, settings):
             x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
     if found.explained < settings.explained:
         return Response.rec601()
@@ -173,6 +173,14 @@ def _shading_terms(where: Float[Tensor, "n 2"]) -> Float[Tensor, "5 n"]:
     """What vignetting, off its centre too, is made of: 0 in the middle of the image."""
     u, v = where.unbind(-1)
     return torch.stack([u, v, u * u, u * v, v * v])
+
+
+def _plausible(slopes: Tensor, terms: Tensor, settings: ResponseSettings) -> bool:
+    """Whether a lens may shade its image so: noticeably at the points, not absurdly in the corners."""
+    corners = _shading_terms(torch.tensor([[u, v] for u in (-0.5, 0.5) for v in (-0.5, 0.5)]).to(terms))
+    seen, extreme = (float((slopes @ t).abs().max()) for t in (terms, corners))
+    least, most = settings.shading
+    return seen > least and extreme < most
 
 
 def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
