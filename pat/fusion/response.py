@@ -38,6 +38,7 @@ class ResponseSettings(NamedTuple):
         not: there another exposure is as good an explanation as another response.
     least_gain: logarithm of the weights' sum below which it is not taken for another exposure, where the sum is well
         known and where not.
+    near_one: logarithm of a gain up to which it is left alone, where it explains alpha as well as other weights do.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
     shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
@@ -51,6 +52,7 @@ class ResponseSettings(NamedTuple):
     least_change: tuple[float, float] = (0.0125, 0.033)
     known: float = 0.015
     least_gain: tuple[float, float] = (0.04, 0.18)
+    near_one: float = 0.06
     better: float = 0.8
     shading: tuple[float, float] = (0.08, 0.7)
     explained: float = 0.5
@@ -213,6 +215,8 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     unknown = found.deviation > settings.known
     exposed = gamma != 1 or abs(math.log(gain)) > settings.least_gain[unknown]
     gain = gain if exposed else 1.0
+    if not exposed and _only_a_gain(x, y, found, settings):
+        return Response(rec601, explained=found.explained)
     weights = found.weights / gain
     change = gain * float(((weights - rec601) @ x).square().mean().sqrt())
     if change < settings.least_change[gamma != 1 or (exposed and unknown)]:
@@ -220,6 +224,16 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         gain = float((found.share * luma) @ y / ((found.share * luma) @ luma)) if exposed else 1.0
         weights = rec601
     return Response(weights, gain, gamma, found.explained)
+
+
+def _only_a_gain(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
+    """Whether Rec. 601's luma times a gain near 1 explains alpha as well: light differs a little, or exposure."""
+    luma = Response.rec601().weights @ x
+    gain = float((found.share * luma) @ y / ((found.share * luma) @ luma))
+    change = float((found.weights @ x - gain * luma).square().mean().sqrt())
+    apart = abs(math.log(float(found.weights.sum()) / gain))
+    same = apart < 2 * max(found.deviation, 0.005) and change < settings.least_change[0]
+    return same and abs(math.log(gain)) < settings.near_one
 
 
 def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
