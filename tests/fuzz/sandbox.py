@@ -13,6 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
+
 MEMORY = 4 << 30
 SECONDS = 10
 """Of a core's time. A case that sleeps is ended after `WAITING` times as long by the clock."""
@@ -20,7 +22,10 @@ WAITING = 12
 
 
 class Outcome(NamedTuple):
-    """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident bytes."""
+    """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident bytes.
+
+    What the forking process held already is not counted in the peak.
+    """
 
     verdict: str
     message: str
@@ -33,12 +38,12 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
 
     A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
     """
-    begin = time.monotonic()
+    begin, held = time.monotonic(), _resident()
     child = os.fork()
     if child == 0:
         _child(case, log)
     status, usage = _wait(child, begin)
-    seconds, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss * 1024
+    seconds, peak = usage.ru_utime + usage.ru_stime, max(usage.ru_maxrss * 1024 - held, 0)
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
     last = lines[-1] if lines else ""
     if os.WIFSIGNALED(status):
@@ -48,6 +53,11 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
     verdict = {0: "read", 1: "refused"}.get(os.WEXITSTATUS(status), "fault")
     traced = any(line.startswith("Traceback") for line in lines)
     return Outcome("traceback" if traced else verdict, last, seconds, peak)
+
+
+def _resident() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
 
 
 def _wait(child: int, begin: float) -> tuple[int, resource.struct_rusage]:
@@ -68,6 +78,7 @@ def _child(case: Callable[[], str], log: Path) -> None:
     """Does not return."""
     code = 2
     try:
+        torch.set_num_threads(1)  # the threads of the forking process are not there
         handle = os.open(log, os.O_CREAT | os.O_TRUNC | os.O_WRONLY)
         os.dup2(handle, 1)
         os.dup2(handle, 2)
