@@ -22,6 +22,7 @@ from arraygeom import Local, Pair, Segments, View, lazily
 from ..attention import Attended, attend, attend_with_statistics
 from ..media.colour import luminance
 from .blocks import ResidualBlock, conv, enlarge
+from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import (
@@ -33,7 +34,6 @@ from .semi_global import (
     diffused_from,
     matched_colours,
     matches,
-    semi_global_matching,
 )
 from .several import agreed, can_agree
 
@@ -239,7 +239,7 @@ class GuidedPAT(nn.Module):
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
-        matched = torch.cat([found.disparity / 64, found.facts], 1)
+        matched = torch.cat([avg_pool2d(found.disparity, FINE) / 64, found.facts], 1)
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, COARSE)], 1)
         context = self.judge(torch.cat([own.quarter, rough], 1))
