@@ -52,7 +52,8 @@ def test_runs_of_neighbours_are_aligned_by_label():
     band_kernels.band_aggregate(cost, guide, low, high, total)
     run = np.arange(RUN)
     labels = np.concatenate([low[0][:, None] + run, high[0][:, None] + run], 1)
-    np.testing.assert_allclose(total[0] - 6 * cost[0].astype(float), aggregated(cost[0], guide[0], labels), rtol=1e-4, atol=1e-2)
+    paths = total[0] - 6 * cost[0].astype(float)
+    np.testing.assert_allclose(paths, aggregated(cost[0], guide[0], labels), rtol=1e-4, atol=1e-2)
 
 
 @pytest.mark.parametrize("half", [np.full((6, 6), 9.0), np.tile([4.0, 4.0, 4.0, 30.0, 30.0, 30.0], (6, 1))])
