@@ -6,6 +6,7 @@ scene, and focal lengths only poorly: depths are multiples of the baseline, and 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -22,6 +23,8 @@ from arraygeom.pixels import map_homogeneous
 from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
 from .refinement import line_distances, refine_matches
+
+LOG = logging.getLogger(__name__)
 
 FOCAL_SHARE = 1.2
 """The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
@@ -76,9 +79,10 @@ def self_calibrated(
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     upright = _upright(link)
-    trials = []
+    trials: list[RefinedPair] = []
     for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
+        LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
         rig = _unit_baseline(_refined(Rig(cameras), matches))
         distance, bounds = _distance(rig, near), depth_bounds(rig, near)
         if bounds is not None and distance <= best:
@@ -103,6 +107,7 @@ def refined_by_depth(
     matches = dense_matches(pair.rig, images, depth, confidence)
     if len(matches.alpha) < 5 * ENOUGH:
         return pair
+    LOG.info("refining %s and %s by %d points", *pair.rig.names, len(matches.alpha))
     rig = _unit_baseline(_refined(pair.rig, matches))
     bounds = depth_bounds(rig, matches)
     if bounds is None:

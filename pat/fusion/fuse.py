@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 
@@ -14,7 +15,7 @@ from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
-from .corrections import Corrections, find_corrections
+from .corrections import Corrections, expected_work, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
 from .low_light import Noise, denoised_views
 from .response import Given
@@ -22,6 +23,8 @@ from .results import Frame
 from .steps import steps_for
 from .tiles import Plan, fused_in_tiles, plan_frame
 from .views import Views
+
+LOG = logging.getLogger(__name__)
 
 Undo = Callable[[Frame], Frame]
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
@@ -102,7 +105,10 @@ def fuse(
     quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     views = quiet.views
     inputs, undo = _prepared(network, views, match_levels)
-    plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
+    LOG.info("planning")
+    before = 0.0 if corrections else expected_work(inputs, response, align=align)
+    estimate = announce is not None
+    plan = plan_frame(network, inputs, limit=limit, estimate=estimate, stored=store is not None, before=before)
     if announce:
         announce(plan)
     found = corrections or find_corrections(network, inputs, response, align=align)
@@ -111,6 +117,7 @@ def fuse(
             explain(line)
     inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
     state = network.prepare(inputs.inputs)
+    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
     with torch.set_grad_enabled(differentiable):
         wrapped = quiet.wrapped(network)
         frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
@@ -119,6 +126,7 @@ def fuse(
     frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
     steps = steps_for(network, normalise=match_levels)
     frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+    LOG.info("back to the pixels of %s", alpha)
     for back in undo:
         frame = back(frame)
     return frame if differentiable else Frame(*(part.detach() for part in frame))
@@ -150,6 +158,7 @@ def _prepared(network: FusionNetwork, views: Views, normalise: bool) -> tuple[Fr
     for name in views.betas:
         warn_of_grey(name, views.images[name])
     undo: list[Undo] = []
+    LOG.info("preparing %d images", len(views.betas) + 1)
     for step in steps_for(network, normalise=normalise):
         views, back = step.do(views)
         undo.insert(0, back)

@@ -17,7 +17,6 @@ from calib.images.refinement import (
     polish,
     refine,
     refine_matches,
-    sampson,
     solve,
 )
 from calib.images.remedies import swap
