@@ -63,8 +63,8 @@ class Fuse:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Out = Path("out")
-    """Folder for fused.png, confidence.png, depth.tif, depth.png, index.html (a page that shows them) and view.yaml
-    (the rig of the fused view)."""
+    """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png, index.html
+    (a page that shows them) and view.yaml (the rig of the fused view)."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
     """Receptive field in the other cameras; auto takes what the rig allows."""
@@ -383,8 +383,8 @@ class Demo:
 
 def is_rig_file(path: Path) -> bool:
     """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
-    named = any(c in path.name for c in "*?[") or path.suffix.lower() in options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
-    return not named and not path.is_dir()
+    suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
+    return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
 
 
 def warn_of_wrong_rig(views: ViewFiles) -> None:
@@ -399,7 +399,7 @@ def warn_of_wrong_rig(views: ViewFiles) -> None:
 
     with options.working("comparing the rig with the images"):
         try:
-            found = find_misfit(views.developed, views)
+            found = find_misfit(views.developed, dict(views))
         except (ValueError, OSError):  # of a file or an image: the fusion says so
             return
         verdict = found.verdict if found else ""
