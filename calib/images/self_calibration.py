@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -38,10 +38,19 @@ AS_GOOD = 1.5
 SLACK = 0.1
 """A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of F alone,
 and `SLACK` pixels more."""
-ALIKE = 1.25
+ALIKE = 8.0
 ALIKE_SLACK = 0.03
-"""Poses whose points are so much farther from their lines than those of the best, in pixels too, are alike: points do
-not distinguish a rotation from a translation where they are few or far. The smallest rotation is taken."""
+"""Fits whose points are farther from their lines than those of the best by no more than this, over the root of the
+points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation from a translation
+where they are few or far. The smallest rotation is taken."""
+FREEDOMS = (
+    ("translation",),
+    ("rotation", "translation"),
+    ("rotation", "translation", "focal"),
+    ("rotation", "translation", "focal", "centre"),
+)
+"""What is free, least first: the first is taken whose points are alike near to their lines. Where points are few or all
+in one part of the images, what more is free makes the lines wrong elsewhere."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
 MARGIN, LEAST_MARGIN = 1.0, 0.12
@@ -79,19 +88,19 @@ def self_calibrated(
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     upright = _upright(link)
-    trials: list[RefinedPair] = []
+    trials: list[tuple[RefinedPair, Rig]] = []
     for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
-        rig = _unit_baseline(_refined(Rig(cameras), matches))
-        distance, bounds = _distance(rig, near), depth_bounds(rig, near)
-        if bounds is not None and distance <= best:
-            trials.append(RefinedPair(rig.replace(depth=bounds), len(near.alpha), distance))
+        trial = _refined_pair(Rig(cameras), matches, near, FREEDOMS[-1])
+        if trial is not None and trial.distance <= best:
+            trials.append((trial, Rig(cameras)))
     if not trials:
         return None
-    least = min(trial.distance for trial in trials)
-    fitting = [trial for trial in trials if trial.distance <= ALIKE * least + ALIKE_SLACK]
-    return min(fitting, key=lambda trial: _angle(_pair(trial.rig).beta_from_alpha.R, upright))
+    least = min(trial.distance for trial, _ in trials)
+    fitting = [(trial, start) for trial, start in trials if _alike(trial, least)]
+    found, start = min(fitting, key=lambda both: _angle(_pair(both[0].rig).beta_from_alpha.R, upright))
+    return _least_free(start, matches, near, found)
 
 
 def refined_by_depth(
@@ -108,11 +117,7 @@ def refined_by_depth(
     if len(matches.alpha) < 5 * ENOUGH:
         return pair
     LOG.info("refining %s and %s by %d points", *pair.rig.names, len(matches.alpha))
-    rig = _unit_baseline(_refined(pair.rig, matches))
-    bounds = depth_bounds(rig, matches)
-    if bounds is None:
-        return pair
-    return RefinedPair(rig.replace(depth=bounds), len(matches.alpha), _distance(rig, matches))
+    return _least_free(pair.rig, matches, matches) or pair
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
@@ -227,11 +232,36 @@ def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
     return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
 
 
-def _refined(rig: Rig, matches: Matches) -> Rig:
+def _alike(pair: RefinedPair, least: float) -> bool:
+    """Whether a fit is hardly worse than the best one, whose distance is `least`."""
+    return pair.distance <= (1 + ALIKE / math.sqrt(pair.points)) * least + ALIKE_SLACK
+
+
+def _least_free(rig: Rig, matches: Matches, near: Matches, most: RefinedPair | None = None) -> RefinedPair | None:
+    """The pair with as few parameters free as fit the points; `most` is that with all of them free, if it is known.
+
+    None without parallax.
+    """
+    if most is None and (most := _refined_pair(rig, matches, near, FREEDOMS[-1])) is None:
+        return None
+    for kinds in FREEDOMS[:-1]:
+        found = _refined_pair(rig, matches, near, kinds)
+        if found is not None and _alike(found, most.distance):
+            return found
+    return most
+
+
+def _refined_pair(rig: Rig, matches: Matches, near: Matches, kinds: Sequence[str]) -> RefinedPair | None:
+    """The pair refined by matches, its distance and depths those of `near`; None without parallax."""
     alpha, beta = rig.names
-    free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]
+    free = [f"{beta}.{kind}" for kind in kinds]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
-    return refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
+    refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
+    refined = _unit_baseline(refined)
+    bounds = depth_bounds(refined, near)
+    if bounds is None:
+        return None
+    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), _distance(refined, near))
 
 
 def _unit_baseline(rig: Rig) -> Rig:

@@ -107,7 +107,7 @@ class Explore:
 
     def run(self) -> None:
         try:
-            from ..explore.page import serve
+            from ..explore.serving import serve
         except ModuleNotFoundError as error:
             raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
         rig = load_rig(self.rig)

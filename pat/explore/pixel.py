@@ -68,13 +68,25 @@ class ExplorerState:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
+class MatchOffset(NamedTuple):
+    """Where the images match best near the best sample, on the line or beside it, and how well.
+
+    position: in beta's pixels. distance: from the line, pixels. correlation: of the windows there, -1 to 1.
+    """
+
+    position: Float[Tensor, "2"]
+    distance: float
+    correlation: float
+
+
 class BetaReport(NamedTuple):
     """Sampling locations in one beta for the pixel, and the match.
 
     xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a segment.
     weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
     value: beta's image, weighted. position, deviation, peak: mean position, its standard deviation (pixels) and the
-    largest weight, as in `pat.attention`.
+    largest weight, as in `pat.attention`. offset: how far the images' own match lies from the line, None without a
+    segment or a clear match.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -86,6 +98,7 @@ class BetaReport(NamedTuple):
     position: Float[Tensor, "2"]
     deviation: float
     peak: float
+    offset: MatchOffset | None = None
 
 
 class PixelReport(NamedTuple):
@@ -211,7 +224,46 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         position,
         float((weight @ (xy - position).square().sum(-1)).sqrt()),
         float(weight.max()),
+        match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends_of(found)),
     )
+
+
+ACROSS, ALONG, STEP = 8.0, 2.0, 0.5
+"""How far from the best sample the images' own match is sought, across the line and along it, and in what steps,
+pixels."""
+CLEAR = 0.7
+"""Least correlation of a clear match."""
+
+
+def match_offset(
+    guides: tuple[Tensor, Tensor],
+    pair: Pair,
+    x: Float[Tensor, "1 2"],
+    samples: tuple[Float[Tensor, "l 2"], Float[Tensor, "l"]],
+    ends: Float[Tensor, "2 2"] | None,
+) -> MatchOffset | None:
+    """The images' own match near the sample of the largest weight, by the correlation of windows around both.
+
+    Unlike the samples it may lie beside the line, and does if the rig is off.
+    """
+    xy, weight = samples
+    if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
+        return None
+    along = torch.nn.functional.normalize(ends[1] - ends[0], dim=0)
+    across = torch.stack([-along[1], along[0]])
+    u, v = (torch.arange(-reach, reach + STEP / 2, STEP).to(xy) for reach in (ACROSS, ALONG))
+    near = xy[weight.argmax()] + u[:, None, None] * across + v[None, :, None] * along
+    scores = correlations(*guides, pair, x, near.reshape(-1, 2)).reshape(len(u), len(v))
+    row, column = divmod(int(scores.argmax()), len(v))
+    best = float(scores[row, column])
+    if best < CLEAR:
+        return None
+    shift = 0.0
+    if 0 < row < len(u) - 1:
+        before, after = (float(scores[row + step, column]) for step in (-1, 1))
+        shift = 0.5 * (before - after) / min(before - 2 * best + after, -1e-9)
+    distance = float(u[row]) + STEP * shift
+    return MatchOffset(near[row, column] + STEP * shift * across, abs(distance), best)
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:
