@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import cv2
@@ -40,17 +40,9 @@ SLACK = 0.1
 and `SLACK` pixels more."""
 ALIKE = 8.0
 ALIKE_SLACK = 0.03
-"""Fits whose points are farther from their lines than those of the best by no more than this, over the root of the
+"""Poses whose points are farther from their lines than those of the best by no more than this, over the root of the
 points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation from a translation
 where they are few or far. The smallest rotation is taken."""
-FREEDOMS = (
-    ("translation",),
-    ("rotation", "translation"),
-    ("rotation", "translation", "focal"),
-    ("rotation", "translation", "focal", "centre"),
-)
-"""What is free, least first: the first is taken whose points are alike near to their lines. Where points are few or all
-in one part of the images, what more is free makes the lines wrong elsewhere."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
 MARGIN, LEAST_MARGIN = 1.0, 0.12
@@ -88,19 +80,18 @@ def self_calibrated(
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     upright = _upright(link)
-    trials: list[tuple[RefinedPair, Rig]] = []
+    trials: list[RefinedPair] = []
     for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
         LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
-        trial = _refined_pair(Rig(cameras), matches, near, FREEDOMS[-1])
+        trial = _refined_pair(Rig(cameras), matches, near)
         if trial is not None and trial.distance <= best:
-            trials.append((trial, Rig(cameras)))
+            trials.append(trial)
     if not trials:
         return None
-    least = min(trial.distance for trial, _ in trials)
-    fitting = [(trial, start) for trial, start in trials if _alike(trial, least)]
-    found, start = min(fitting, key=lambda both: _angle(_pair(both[0].rig).beta_from_alpha.R, upright))
-    return _least_free(start, matches, near, found)
+    least = min(trial.distance for trial in trials)
+    fitting = [trial for trial in trials if _alike(trial, least)]
+    return min(fitting, key=lambda trial: _angle(_pair(trial.rig).beta_from_alpha.R, upright))
 
 
 def refined_by_depth(
@@ -117,7 +108,7 @@ def refined_by_depth(
     if len(matches.alpha) < 5 * ENOUGH:
         return pair
     LOG.info("refining %s and %s by %d points", *pair.rig.names, len(matches.alpha))
-    return _least_free(pair.rig, matches, matches) or pair
+    return _refined_pair(pair.rig, matches, matches) or pair
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
@@ -233,28 +224,14 @@ def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
 
 
 def _alike(pair: RefinedPair, least: float) -> bool:
-    """Whether a fit is hardly worse than the best one, whose distance is `least`."""
+    """Whether a pose is hardly worse than the best one, whose distance is `least`."""
     return pair.distance <= (1 + ALIKE / math.sqrt(pair.points)) * least + ALIKE_SLACK
 
 
-def _least_free(rig: Rig, matches: Matches, near: Matches, most: RefinedPair | None = None) -> RefinedPair | None:
-    """The pair with as few parameters free as fit the points; `most` is that with all of them free, if it is known.
-
-    None without parallax.
-    """
-    if most is None and (most := _refined_pair(rig, matches, near, FREEDOMS[-1])) is None:
-        return None
-    for kinds in FREEDOMS[:-1]:
-        found = _refined_pair(rig, matches, near, kinds)
-        if found is not None and _alike(found, most.distance):
-            return found
-    return most
-
-
-def _refined_pair(rig: Rig, matches: Matches, near: Matches, kinds: Sequence[str]) -> RefinedPair | None:
+def _refined_pair(rig: Rig, matches: Matches, near: Matches) -> RefinedPair | None:
     """The pair refined by matches, its distance and depths those of `near`; None without parallax."""
     alpha, beta = rig.names
-    free = [f"{beta}.{kind}" for kind in kinds]
+    free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
     refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
     refined = _unit_baseline(refined)

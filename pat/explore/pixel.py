@@ -228,9 +228,10 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
     )
 
 
-ACROSS, ALONG, STEP = 8.0, 2.0, 0.5
-"""How far from the best sample the images' own match is sought, across the line and along it, and in what steps,
-pixels."""
+ACROSS, STEP = 8, 0.25
+"""How far from the line the images' own match is sought, and to which step, pixels."""
+MOST_SAMPLES = 96
+"""Samples on the line, around that of the largest weight, from which it is sought."""
 CLEAR = 0.7
 """Least correlation of a clear match."""
 
@@ -242,7 +243,7 @@ def match_offset(
     samples: tuple[Float[Tensor, "l 2"], Float[Tensor, "l"]],
     ends: Float[Tensor, "2 2"] | None,
 ) -> MatchOffset | None:
-    """The images' own match near the sample of the largest weight, by the correlation of windows around both.
+    """The images' own match near the segment, by the correlation of windows around both pixels.
 
     Unlike the samples it may lie beside the line, and does if the rig is off.
     """
@@ -251,19 +252,19 @@ def match_offset(
         return None
     along = torch.nn.functional.normalize(ends[1] - ends[0], dim=0)
     across = torch.stack([-along[1], along[0]])
-    u, v = (torch.arange(-reach, reach + STEP / 2, STEP).to(xy) for reach in (ACROSS, ALONG))
-    near = xy[weight.argmax()] + u[:, None, None] * across + v[None, :, None] * along
-    scores = correlations(*guides, pair, x, near.reshape(-1, 2)).reshape(len(u), len(v))
-    row, column = divmod(int(scores.argmax()), len(v))
-    best = float(scores[row, column])
-    if best < CLEAR:
+    first = max(int(weight.argmax()) - MOST_SAMPLES // 2, 0)
+    best, score = xy[first], -1.0
+    fine = torch.arange(-1, 1 + STEP / 2, STEP)
+    stages: tuple[tuple[Tensor | None, Tensor, Tensor], ...]
+    stages = (xy[first : first + MOST_SAMPLES], torch.arange(-ACROSS, ACROSS + 1), torch.zeros(1)), (None, fine, fine)
+    for start, u, v in stages:
+        begin = best[None] if start is None else start
+        near = begin[:, None, None] + u.to(xy)[:, None, None] * across + v.to(xy)[:, None] * along
+        scores = correlations(*guides, pair, x, near.reshape(-1, 2))
+        best, score = near.reshape(-1, 2)[scores.argmax()], float(scores.max())
+    if score < CLEAR:
         return None
-    shift = 0.0
-    if 0 < row < len(u) - 1:
-        before, after = (float(scores[row + step, column]) for step in (-1, 1))
-        shift = 0.5 * (before - after) / min(before - 2 * best + after, -1e-9)
-    distance = float(u[row]) + STEP * shift
-    return MatchOffset(near[row, column] + STEP * shift * across, abs(distance), best)
+    return MatchOffset(best, abs(float((best - ends[0]) @ across)), score)
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:

@@ -18,7 +18,8 @@ from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 
-ALL = ["confidence.png", "depth.png", "depth.tif", "fused.png", "index.html", "rig.yaml", "view.yaml"]
+ALL = [*(f"{n}.png" for n in ("confidence", "depth")), "depth.tif", "depth_16.png", "fused.png", "index.html"]
+ALL += ["rig.yaml", "view.yaml"]
 
 
 @pytest.fixture(scope="module")
