@@ -218,11 +218,14 @@ class Explorer:
     def _once_settled(self) -> None:
         """Draw the rig in space once the controls have settled: it takes a browser longer than all else together.
 
-        At once the first time, and in a notebook, where no server can call back.
+        The first time once the page is there, and at once in a notebook, where no server can call back.
         """
         document = pn.state.curdoc
-        if self.space.object is None or document is None or document.session_context is None:
+        if document is None or document.session_context is None:
             self._show_space()
+            return
+        if self.space.object is None:
+            pn.state.onload(self._show_space)
             return
         if self.waiting is not None:
             document.remove_timeout_callback(self.waiting)

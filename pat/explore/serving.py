@@ -34,6 +34,7 @@ def serve(
     """
     check_port(port)
     scene, alpha = prepared(rig, images, alpha)
+    Explorer(scene, alpha).panel()  # once beforehand: what is imported and compiled for it must not delay the page
     pn.config.raw_css = [*pn.config.raw_css, PAGE]
     port = port or free_port()
     server = pn.serve(
