@@ -6,9 +6,11 @@ import warnings
 import cv2
 import numpy as np
 import pytest
+import tifffile
 import torch
 from PIL import Image, ImageCms
 
+from pat.media.colour import srgb_from_linear
 from pat.media.images import read_image, write_image
 from pat.media.profiles import srgb_profile
 
@@ -73,3 +75,34 @@ def test_raw_files_name_the_extra(tmp_path, monkeypatch):
     (tmp_path / "a.dng").write_bytes(b"II*\0")
     with pytest.raises(ValueError, match=r"pip install 'arraygeom-pat\[raw\]'"):
         read_image(tmp_path / "a.dng")
+
+
+def write_dng(path, cfa):
+    """A raw file of an RGGB mosaic whose colours are those of linear sRGB."""
+    matrix = [3.2405, -1.5371, -0.4985, -0.9693, 1.8760, 0.0416, 0.0556, -0.2040, 1.0572]
+    tags = [
+        (33421, "H", 2, (2, 2), True),
+        (33422, "B", 4, bytes((0, 1, 1, 2)), True),
+        (50706, "B", 4, bytes((1, 4, 0, 0)), True),
+        (50708, "s", 0, "A camera", True),
+        (50717, "I", 1, 65535, True),
+        (50721, "2i", 9, tuple(n for value in matrix for n in (round(value * 10_000), 10_000)), True),
+        (50728, "2I", 3, (1, 1) * 3, True),
+        (50778, "H", 1, 21, True),
+    ]
+    tifffile.imwrite(path, cfa, photometric=32803, extratags=tags)
+
+
+def test_raw_files_are_developed(tmp_path):
+    pytest.importorskip("rawpy", reason="the extra 'raw' is not installed")
+    light = np.zeros((64, 96, 3))
+    light[:, :48], light[:, 48:] = (0.2, 0.5, 0.6), (0.6, 0.3, 0.15)
+    cfa = np.zeros((64, 96), np.uint16)
+    for y, x, band in ((0, 0, 0), (0, 1, 1), (1, 0, 1), (1, 1, 2)):
+        cfa[y::2, x::2] = 60_000 * light[y::2, x::2, band]
+    write_dng(tmp_path / "a.dng", cfa)
+    image = read_image(tmp_path / "a.dng")
+    assert image.shape == (3, 64, 96)
+    for x, colour in ((20, (0.2, 0.5, 0.6)), (80, (0.6, 0.3, 0.15))):
+        wanted = srgb_from_linear(torch.tensor(colour)[:, None, None])[:, 0, 0]
+        torch.testing.assert_close(image[:, 32, x] / image[1, 32, x], wanted / wanted[1], atol=0.02, rtol=0)
