@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
-from .corrections import Corrections, find_corrections
+from .corrections import Corrections, expected_work, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
 from .low_light import Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
@@ -24,6 +25,8 @@ from .results import Frame
 from .steps import steps_for
 from .tiles import Plan, fused_in_tiles, plan_frame
 from .views import Views
+
+LOG = logging.getLogger(__name__)
 
 Undo = Callable[[Frame], Frame]
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
@@ -108,7 +111,10 @@ def fuse(
     quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     views = quiet.views
     inputs, undo = _prepared(network, views, match_levels)
-    plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
+    LOG.info("planning")
+    before = 0.0 if corrections else expected_work(inputs, response, align=align)
+    estimate = announce is not None
+    plan = plan_frame(network, inputs, limit=limit, estimate=estimate, stored=store is not None, before=before)
     if announce:
         announce(plan)
     found = corrections or find_corrections(network, inputs, response, align=align)
@@ -118,6 +124,7 @@ def fuse(
     fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=fused)
     state = network.prepare(inputs.inputs)
+    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
     with torch.set_grad_enabled(differentiable):
         wrapped = quiet.wrapped(network)
         frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
@@ -128,6 +135,7 @@ def fuse(
         frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
     steps = steps_for(network, normalise=match_levels)
     frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+    LOG.info("back to the pixels of %s", alpha)
     for back in undo:
         frame = back(frame)
     return frame if differentiable else Frame(*(part.detach() for part in frame))
@@ -159,6 +167,7 @@ def _prepared(network: FusionNetwork, views: Views, normalise: bool) -> tuple[Fr
     for name in views.betas:
         warn_of_grey(name, views.images[name])
     undo: list[Undo] = []
+    LOG.info("preparing %d images", len(views.betas) + 1)
     for step in steps_for(network, normalise=normalise):
         views, back = step.do(views)
         undo.insert(0, back)
