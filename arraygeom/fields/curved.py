@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
-from ..distortion import KANNALA_BRANDT
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
@@ -137,7 +136,7 @@ class _Curve(NamedTuple):
             pixels = Track(_each(beta.K, points.a), _each(beta.K, points.b))
             part = clipped(pixels, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
         elif limits is None:
-            part = clipped(points, near, far, None, in_front=beta.distortion.model != KANNALA_BRANDT)
+            part = clipped(points, near, far, None, in_front=not beta.distortion.sees_behind)
         else:
             part = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
         w_far, w_near = (beside(1 / d.to(x.dtype), x.ndim - 1) for d in (far, near))
