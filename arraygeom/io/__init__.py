@@ -27,6 +27,7 @@ from . import (
     kalibr,
     kitti,
     matlab,
+    metashape,
     middlebury,
     multical,
     native,
@@ -60,6 +61,7 @@ READERS: dict[str, Any] = {
     "pycalib": pycalib,
     "strecha": strecha,
     "open3d": open3d,
+    "metashape": metashape,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {
@@ -68,11 +70,6 @@ WRITERS: dict[str, Any] = {
     "colmap": colmap,
     "kalibr": kalibr,
     "nerfstudio": nerfstudio,
-}
-
-# Recognised by a word in the file or by its suffix, and what to do instead.
-NOT_READ = {
-    "<chunk": ("a Metashape project", "export its cameras in COLMAP's format"),
 }
 
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
@@ -134,9 +131,6 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
-    for mark, (what, advice) in NOT_READ.items():
-        if mark in head or path.suffix == mark:
-            raise RigFileError(path, None, f"is {what}, which is not read: {advice}")
     raise RigFileError(path, None, f"is not a rig file of a known format ({', '.join(READERS)}); or name its format")
 
 

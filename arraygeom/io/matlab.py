@@ -4,6 +4,10 @@ Source convention: pixels with the first centre at 1 (shift -1); OpenCV-like axe
 default millimetres. The old names are of row vectors (x2 = x1 R + t, [x y 1] ~ X K): `IntrinsicMatrix` and
 `RotationOfCamera2` are transposed. The new ones (`K`, `PoseCamera2`, since R2022b) are of columns and are not. The
 world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose: that catches a transposed one.
+
+Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A point u, v off
+`DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3 + a4 r^4); a0 is the focal
+length here. Results of Bouguet's toolbox: see `bouguet`.
 """
 
 from __future__ import annotations
@@ -17,28 +21,33 @@ import torch
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import Distortion
+from ..distortion import SCARAMUZZA, Distortion
 from ..epipolar import epipolar_lines, shift_origin
 from ..extras import needs
-from ..pixels import pixel_grid, to_homogeneous
+from ..pixels import HW, pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
+from . import bouguet
 from .matfile import readable_variables
 from .source import RigSource
 
 CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
+FISHEYE = "MappingCoefficients"
 UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254}
 UNITS |= {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0, "inches": 0.0254}
 
 
 def recognises(path: Path, head: str) -> bool:
-    names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion")
+    names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion", FISHEYE)
     return path.suffix == ".mat" or head.startswith("MATLAB ") or any(f'"{name}"' in head for name in names)
 
 
 def read(source: RigSource) -> Rig:
-    """The pair, named "camera1" and "camera2", or a single camera "camera1"."""
-    fields = _outermost(source, _document(source))
+    """The pair, named "camera1" and "camera2", or a single camera "camera1"; of Bouguet's "left" and "right", "camera"."""
+    document = _document(source)
+    if bouguet.is_result(document):
+        return bouguet.read(source, document)
+    fields = _outermost(source, document)
     if "CameraParameters1" not in fields:
         return source.rig([("camera1", _camera(source, fields, "", Pose.identity()))])
     poses = Pose.identity(), _pose(source, fields)
@@ -86,23 +95,44 @@ def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_camera(fields: dict[str, Any]) -> bool:
-    return "IntrinsicMatrix" in fields or "K" in fields
+    return bool(fields.keys() & {"IntrinsicMatrix", "K", FISHEYE}) or _is_fisheye(fields.get("Intrinsics"))
+
+
+def _is_fisheye(fields: Any) -> bool:
+    return isinstance(fields, dict) and FISHEYE in fields
 
 
 def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+    if _is_fisheye(fields.get("Intrinsics", fields)):
+        return _fisheye(source, fields.get("Intrinsics", fields), entry, pose)
     if "K" in fields:
         K = source.intrinsics(fields["K"], f"{entry}.K", first_pixel=1.0)
     else:
         rows = source.numbers(source.get(fields, ("IntrinsicMatrix", "K"), entry), (3, 3), f"{entry}.IntrinsicMatrix")
         K = source.intrinsics(rows.T, f"{entry}.IntrinsicMatrix", first_pixel=1.0)
     lens = _lens(source, fields, entry)
+    return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
+
+
+def _fisheye(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+    a0, a2, a3, a4 = source.numbers(fields[FISHEYE], (4,), f"{entry}.{FISHEYE}").tolist()
+    if not a0 > 0:
+        raise source.fail(f"{entry}.{FISHEYE}", f"begins with {a0:g}; it is positive, about the focal length in pixels")
+    centre = source.numbers(source.get(fields, "DistortionCenter", entry), (2,), f"{entry}.DistortionCenter")
+    stretch = source.numbers(fields.get("StretchMatrix", [[1, 0], [0, 1]]), (2, 2), f"{entry}.StretchMatrix")
+    K = torch.eye(3, dtype=torch.float64)
+    K[:2, :2], K[:2, 2] = stretch * a0, centre
+    K = source.intrinsics(K, f"{entry}.StretchMatrix", first_pixel=1.0)
+    lens = source.lens(SCARAMUZZA, [a2 * a0, a3 * a0**2, a4 * a0**3], f"{entry}.{FISHEYE}")
+    return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
+
+
+def _size(source: RigSource, fields: dict[str, Any], entry: str, K: Tensor) -> HW:
     size = fields.get("ImageSize")
     if size is None or np.size(size) == 0:
-        hw = source.size_unstated(K)
-    else:
-        height, width = source.numbers(size, (2,), f"{entry}.ImageSize").tolist()
-        hw = source.size(width, height, f"{entry}.ImageSize")
-    return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens)
+        return source.size_unstated(K)
+    height, width = source.numbers(size, (2,), f"{entry}.ImageSize").tolist()
+    return source.size(width, height, f"{entry}.ImageSize")
 
 
 def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
