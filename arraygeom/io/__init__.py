@@ -23,6 +23,7 @@ from ..sensor import Sensor
 from . import (
     aniposelib,
     boofcv,
+    bouguet,
     colmap,
     kalibr,
     kitti,
@@ -50,6 +51,7 @@ READERS: dict[str, Any] = {
     "boofcv": boofcv,
     "ros": ros,
     "native": native,
+    "bouguet": bouguet,
     "matlab": matlab,
     "kitti-raw": kitti.Raw,
     "kitti": kitti,

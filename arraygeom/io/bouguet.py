@@ -7,24 +7,32 @@ with R from the rotation vector `om` where it is not stated; millimetres. The wo
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
+from .matfile import load_variables, readable_variables
 from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); X_right = R X_left + T, world = left camera; mm"
 SIDES = ("left", "right")
 
 
-def is_result(fields: dict[str, Any]) -> bool:
-    """Whether the variables of a .mat file are the toolbox's."""
-    return "fc_left" in fields or ("fc" in fields and "cc" in fields)
+def recognises(path: Path, head: str) -> bool:
+    if not (path.is_file() and (path.suffix == ".mat" or head.startswith("MATLAB "))):
+        return False
+    try:
+        names = readable_variables(path.read_bytes())
+    except (OSError, ValueError):
+        return False
+    return "fc_left" in names or {"fc", "cc"} <= set(names)
 
 
-def read(source: RigSource, fields: dict[str, Any]) -> Rig:
+def read(source: RigSource) -> Rig:
     """The pair "left" and "right", or one camera, "camera"."""
+    fields = load_variables(source)
     if "fc_left" not in fields:
         return source.rig([("camera", _camera(source, fields, "", Pose.identity()))])
     R = source.get(fields, ("R", "om"), "")

@@ -145,7 +145,7 @@ def _intrinsics(source: RigSource, entry: str, model: str, wh: tuple[Any, Any], 
     p = source.numbers(parameters, (kind.focals + 2 + kind.coefficients,), f"{entry} ({model})").tolist()
     K = source.focal_and_centre([p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5)
     hw, c = source.size(*wh, entry), p[kind.focals + 2 :]
-    if kind.lens is None or not any(c) and kind.lens in (BROWN_CONRADY, FOV):
+    if kind.lens is None or (not any(c) and kind.lens in (BROWN_CONRADY, FOV)):
         return _Intrinsics(K, hw, None)
     if kind.lens == BROWN_CONRADY:
         return _Intrinsics(K, hw, source.brown_conrady(c, entry))

@@ -90,9 +90,7 @@ def _poses(source: RigSource, chain: dict[str, dict[str, Any]]) -> dict[str, Pos
 def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
     model = source.get(fields, "camera_model", name)
     if model not in CAMERA_MODELS:
-        raise source.fail(
-            f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}"
-        )
+        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}")
     width, height = source.numbers(source.get(fields, "resolution", name), (2,), f"{name}.resolution").tolist()
     first = len(CAMERA_MODELS[model])
     numbers = source.numbers(source.get(fields, "intrinsics", name), (first + 4,), f"{name}.intrinsics")
@@ -107,9 +105,7 @@ def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) ->
     )
 
 
-def _lens(
-    source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]
-) -> Distortion | None:
+def _lens(source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]) -> Distortion | None:
     """The lens of a camera model and a distortion model; `before` are the numbers before the focal lengths."""
     model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
     if model not in LENSES[camera]:

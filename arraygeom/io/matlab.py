@@ -7,12 +7,11 @@ world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose:
 
 Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A point u, v off
 `DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3 + a4 r^4); a0 is the focal
-length here. Results of Bouguet's toolbox: see `bouguet`.
+length here.
 """
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +22,10 @@ from torch import Tensor
 from ..camera import Camera
 from ..distortion import SCARAMUZZA, Distortion
 from ..epipolar import epipolar_lines, shift_origin
-from ..extras import needs
 from ..pixels import HW, pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
-from . import bouguet
-from .matfile import readable_variables
+from .matfile import load_variables
 from .source import RigSource
 
 CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
@@ -43,11 +40,8 @@ def recognises(path: Path, head: str) -> bool:
 
 
 def read(source: RigSource) -> Rig:
-    """The pair, named "camera1" and "camera2", or a single camera "camera1"; of Bouguet's "left" and "right", "camera"."""
-    document = _document(source)
-    if bouguet.is_result(document):
-        return bouguet.read(source, document)
-    fields = _outermost(source, document)
+    """The pair, named "camera1" and "camera2", or a single camera "camera1"."""
+    fields = _outermost(source, _document(source))
     if "CameraParameters1" not in fields:
         return source.rig([("camera1", _camera(source, fields, "", Pose.identity()))])
     poses = Pose.identity(), _pose(source, fields)
@@ -61,24 +55,9 @@ def read(source: RigSource) -> Rig:
 
 
 def _document(source: RigSource) -> dict[str, Any]:
-    try:
-        data = source.path.read_bytes()
-    except OSError as error:
-        raise source.fail(None, f"cannot be read: {error.strerror}") from None
-    if not data.startswith(b"MATLAB ") and source.path.suffix != ".mat":
-        return source.json()
-    if not data:
-        raise source.fail(None, "is empty")
-    if data.startswith(b"MATLAB 7.3"):
-        raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
-    with needs("calibration", "reading .mat files"):
-        from scipy.io import loadmat
-    try:
-        loaded = loadmat(BytesIO(data), simplify_cells=True, variable_names=readable_variables(data))
-    except Exception as error:
-        # Whatever the parser trips over in a damaged file, the cause is the file.
-        raise source.fail(None, f"is not a .mat file that can be read ({error}); was it cut off?") from None
-    return {name: value for name, value in loaded.items() if not name.startswith("__")}
+    with source.path.open("rb") as file:
+        is_text = source.path.suffix != ".mat" and not file.read(7).startswith(b"MATLAB ")
+    return source.json() if is_text else load_variables(source)
 
 
 def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:

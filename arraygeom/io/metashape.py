@@ -108,9 +108,7 @@ def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> _Sensor:
     width, height = (_floats(source, resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height"))
     h, w = source.size(width, height, f"{entry} resolution")
     f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
-    K = source.intrinsics(
-        [[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5
-    )
+    K = source.intrinsics([[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5)
     return _Sensor(K, (h, w), _lens(source, calibration, entry))
 
 

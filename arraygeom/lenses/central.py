@@ -49,7 +49,9 @@ def central_project(model: str, c: Tensor, X: Tensor) -> tuple[Tensor, Tensor]:
     u = xy.square().sum(-1)
     off_axis = u > 0
     rho = torch.where(off_axis, u, 1.0).sqrt()
-    inside = (off_axis | (z > 0)) & (z > cosine * torch.where(off_axis, u + z.square(), z.square()).clamp(min=TINY).sqrt())
+    inside = (off_axis | (z > 0)) & (
+        z > cosine * torch.where(off_axis, u + z.square(), z.square()).clamp(min=TINY).sqrt()
+    )
     border = torch.cat([xy * (sine / rho)[..., None], cosine.expand_as(z)[..., None]], -1)
     border = torch.where(off_axis[..., None], border, X.new_tensor([0.0, 0.0, 1.0]))
     point, valid = kind.project(c, torch.where(inside[..., None], X, border)), inside & sound

@@ -21,7 +21,7 @@ from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numb
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from arraygeom import Camera, Rig
+    from arraygeom import Rig
 
     from ..fusion.report import Facts
     from ..fusion.results import Frame

@@ -210,7 +210,9 @@ def test_the_axis_is_straight_in_float32():
     for model, c in CASES:
         if model in ("double-sphere", "unified", "fov"):
             continue  # their scale on the axis is not 1
-        J = torch.autograd.functional.jacobian(lambda x, d=lens(model, c, torch.float32): d.distort(x)[0], torch.zeros(2))
+        J = torch.autograd.functional.jacobian(
+            lambda x, d=lens(model, c, torch.float32): d.distort(x)[0], torch.zeros(2)
+        )
         torch.testing.assert_close(J, torch.eye(2))
 
 

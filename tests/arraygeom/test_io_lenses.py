@@ -161,11 +161,20 @@ def test_bouguets_results(tmp_path):
 
     om = np.array([[0.01], [0.1], [-0.02]])
     numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
-    numbers |= {"alpha_c_left": 0.001, "alpha_c_right": 0.0, "om": om, "T": [[-100.0], [2.0], [1.0]], "nx": 640, "ny": 480}
+    numbers |= {
+        "alpha_c_left": 0.001,
+        "alpha_c_right": 0.0,
+        "om": om,
+        "T": [[-100.0], [2.0], [1.0]],
+        "nx": 640,
+        "ny": 480,
+    }
     savemat(tmp_path / "Calib_Results_stereo.mat", numbers)
     rig = read_rig(tmp_path / "Calib_Results_stereo.mat")
     flat = [np.ravel(value) for value in BOUGUET.values()]
-    np.testing.assert_allclose(pixels(rig, "left", POINTS), bouguet_pixels(POINTS, *flat[:2], 0.001, flat[2]), atol=1e-9)
+    np.testing.assert_allclose(
+        pixels(rig, "left", POINTS), bouguet_pixels(POINTS, *flat[:2], 0.001, flat[2]), atol=1e-9
+    )
     angle, axis = np.linalg.norm(om), np.ravel(om) / np.linalg.norm(om)
     cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
     R = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
@@ -174,7 +183,9 @@ def test_bouguets_results(tmp_path):
     savemat(tmp_path / "Calib_Results.mat", {**BOUGUET, "alpha_c": 0.0, "nx": 640, "ny": 480, "KK": np.eye(3)})
     one = read_rig(tmp_path / "Calib_Results.mat")
     assert (one.names, one["camera"].hw) == (("camera",), (480, 640))
-    np.testing.assert_allclose(pixels(one, "camera", POINTS), bouguet_pixels(POINTS, *flat[:2], 0.0, flat[2]), atol=1e-9)
+    np.testing.assert_allclose(
+        pixels(one, "camera", POINTS), bouguet_pixels(POINTS, *flat[:2], 0.0, flat[2]), atol=1e-9
+    )
 
 
 def test_nerfstudios_fisheye(tmp_path):
@@ -195,12 +206,22 @@ def test_nerfstudios_fisheye(tmp_path):
 @pytest.mark.parametrize(
     ("file", "old", "new", "message"),
     [
-        ("kalibr_wide.yaml", "[-0.2, 0.57, 180.0", "[-1.2, 0.57, 180.0", r"cam1.intrinsics: is \[-1.2, 0.57\], which no"),
+        (
+            "kalibr_wide.yaml",
+            "[-0.2, 0.57, 180.0",
+            "[-1.2, 0.57, 180.0",
+            r"cam1.intrinsics: is \[-1.2, 0.57\], which no",
+        ),
         ("kalibr_wide.yaml", "[0.92]", "[4.0]", r"cam3.distortion_coeffs: is \[4.0\], which no fov lens has"),
         ("kalibr_wide.yaml", "[0.92]", "[0.92, 1]", "cam3.distortion_coeffs: has 2 numbers, wanted 1"),
         ("kalibr_wide.yaml", "[1.2, 400.0,", "[400.0,", "cam0.intrinsics: has 4 numbers, wanted 5"),
         ("colmap_wide/cameras.txt", "240 0.92", "240 3.5", "line 4: is"),
-        ("colmap_wide/cameras.txt", "FOV", "RAD_TAN_THIN_PRISM_FISHEYE", "line 4: has model RAD_TAN.*calibrate with one of"),
+        (
+            "colmap_wide/cameras.txt",
+            "FOV",
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            "line 4: has model RAD_TAN.*calibrate with one of",
+        ),
         ("matlab_fisheye.json", "[300.0, ", "[-300.0, ", "MappingCoefficients: begins with -300; it is positive"),
         ("matlab_fisheye.json", "[300.0, ", "[", "MappingCoefficients: has 3 numbers, wanted 4"),
     ],

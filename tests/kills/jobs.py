@@ -12,7 +12,7 @@ import torch
 import yaml
 from safetensors import safe_open
 
-from arraygeom import Pose, Rig
+from arraygeom import Pose
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
 from pat.media.images import write_image
@@ -40,7 +40,13 @@ def frame_job(folder: Path) -> Job:
     options = ["--no-report", "--points", "--threads", "1"]
 
     def arguments(i: int) -> Callable[[Path], list[str]]:
-        return lambda out: [*_fuse(folder), *_images(folder, f"fast_{i}.png", "slow_0.png"), "--out", str(out), *options]
+        return lambda out: [
+            *_fuse(folder),
+            *_images(folder, f"fast_{i}.png", "slow_0.png"),
+            "--out",
+            str(out),
+            *options,
+        ]
 
     def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
         return mixed(files_of(out), versions, "fused.png")
@@ -80,7 +86,15 @@ def _fuse(folder: Path) -> list[str]:
             write_image(folder / "fusion" / "many" / f"{i}.png", frames["slow"][0])
         moving.rig(0.003).save(folder / "fusion" / "rig.yaml")
     made = folder / "fusion"
-    return ["fuse", str(made / "rig.yaml"), "--alpha", "fast", "--weights", str(made / "tiny.safetensors"), "--no-align"]
+    return [
+        "fuse",
+        str(made / "rig.yaml"),
+        "--alpha",
+        "fast",
+        "--weights",
+        str(made / "tiny.safetensors"),
+        "--no-align",
+    ]
 
 
 def _images(folder: Path, fast: str, slow: str) -> list[str]:

@@ -283,12 +283,18 @@ def dask_cluster(folder: Path) -> Iterator[tuple[str, subprocess.Popen]]:
     """A scheduler and a worker as processes of their own; the address, and the scheduler's process."""
     facts = folder / "scheduler.json"
     facts.unlink(missing_ok=True)
-    module = [sys.executable, "-m", "distributed.cli.dask_scheduler"], [sys.executable, "-m", "distributed.cli.dask_worker"]
+    module = (
+        [sys.executable, "-m", "distributed.cli.dask_scheduler"],
+        [sys.executable, "-m", "distributed.cli.dask_worker"],
+    )
     own = ["--no-dashboard", "--scheduler-file", str(facts)]
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
     running: list[subprocess.Popen] = []
     try:
-        for command in ([*module[0], "--host", "127.0.0.1", "--port", "0", *own], [*module[1], "--nthreads", "1", *own]):
+        for command in (
+            [*module[0], "--host", "127.0.0.1", "--port", "0", *own],
+            [*module[1], "--nthreads", "1", *own],
+        ):
             quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
             running.append(subprocess.Popen(command, env=environment, **quiet))  # type: ignore[call-overload]
             while not facts.exists():

@@ -64,7 +64,10 @@ class Kills:
                     faults += [fault for one in found.values() for fault in one.faults]
                     rows.append(row(job.name, found))
                     print(rows[-1], *faults, sep="\n", file=sys.stderr, flush=True)
-        lines = [f"| job | {' | '.join(COLUMNS.values())} | compared | faults |", f"|---|{'---:|' * (len(COLUMNS) + 2)}"]
+        lines = [
+            f"| job | {' | '.join(COLUMNS.values())} | compared | faults |",
+            f"|---|{'---:|' * (len(COLUMNS) + 2)}",
+        ]
         text = "\n".join([*lines, *rows])
         print("\n".join([text, *faults, f"{(time.monotonic() - begin) / 60:.0f} minutes"]))
         if self.out is not None:
