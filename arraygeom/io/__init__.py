@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ..atomic import write_text
+from ..atomic import sweep, write_text, write_together
 from ..camera import Camera, LensView
 from ..pixels import HW
 from ..pose import Pose
@@ -106,7 +106,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig, each file atomically. Formats of several files make a folder.
+    """Write a rig atomically. Formats of several files make a folder, the last of them once the others are there.
 
     What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor records) is named
     by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the format cannot hold, and a batch.
@@ -117,9 +117,11 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     if format != "native" and (lost := _left_out(rig, format)):
         warnings.warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning, 2)
     if isinstance(contents, Mapping):
-        path.mkdir(parents=True, exist_ok=True)
-        for name, text in contents.items():
-            write_text(path / name, text)
+        last = list(contents)[-1]
+        sweep(path, Path(last).stem)
+        with write_together(path, last=last) as folder:
+            for name, text in contents.items():
+                write_text(folder / name, text)
     else:
         write_text(path, contents)
 

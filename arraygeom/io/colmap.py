@@ -103,7 +103,8 @@ def write(rig: Rig) -> dict[str, str]:
         model, parameters = _parameters(name, camera)
         cameras.append(f"{i} {model} {w} {h} {_joined(parameters)}")
         images += [f"{i} {_joined(_wxyz(camera.R))} {_joined(camera.t.tolist())} {i} {name}", ""]
-    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR"]}
+    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR"]
+    texts = {"cameras.txt": cameras, "points3D.txt": points, "images.txt": images}
     return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
 
 

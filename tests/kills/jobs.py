@@ -13,6 +13,7 @@ import yaml
 from safetensors import safe_open
 
 from arraygeom import Pose
+from arraygeom.io import read_rig
 from calib.boards.simulation import photograph
 from calib.boards.target import parse_board
 from pat.media.images import write_image
@@ -25,6 +26,7 @@ from tests.kills.killing import Job, files_of, mixed
 from tests.pat.fusion import moving
 from tests.pat.training.runs import SMALL, short_run
 
+FIXTURES = Path(__file__).parents[1] / "arraygeom" / "fixtures"
 FRAMES = 6
 BOARD = "charuco:9x7:60mm"
 SCENE = """
@@ -33,6 +35,21 @@ cameras:
   mono: {size: [96, 64], focal: 120}
   colour: {size: [80, 60], focal: 90, rotation: [0, 1, 0.5], translation: [-0.1, 0, 0], response: rgb}
 """
+
+
+def conversion_job(folder: Path) -> Job:
+    """A rig written as a COLMAP model, over that of another rig."""
+    rig = read_rig(FIXTURES / "kalibr.yaml")
+    for name, made in (("new", rig), ("old", rig.with_camera("cam0", rig["cam1"]))):
+        made.save(folder / f"{name}.yaml")
+
+    def arguments(name: str) -> Callable[[Path], list[str]]:
+        return lambda out: ["rig", "convert", str(folder / f"{name}.yaml"), str(out), "--write-as", "colmap"]
+
+    def faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
+        return mixed(files_of(out), versions, "images.txt")
+
+    return Job("conversion", arguments("new"), files_of, faults, former=arguments("old"))
 
 
 def frame_job(folder: Path) -> Job:
@@ -206,6 +223,7 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
 
 def all_jobs(folder: Path) -> Iterator[Job]:
     """Those of the table."""
+    yield conversion_job(folder)
     yield frame_job(folder)
     yield batch_job(folder)
     yield batch_job(folder, "--workers", "2", name="batch, two workers")

@@ -297,7 +297,7 @@ def dask_cluster(folder: Path) -> Iterator[tuple[str, subprocess.Popen]]:
         ):
             quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL, "start_new_session": True}
             running.append(subprocess.Popen(command, env=environment, **quiet))  # type: ignore[call-overload]
-            while not facts.exists():
+            while not facts.exists() or not facts.read_text().endswith("}"):
                 time.sleep(0.05)
         yield json.loads(facts.read_text())["address"], running[0]
     finally:

@@ -23,6 +23,7 @@ from .jobs import all_jobs
 from .killing import Job, Killed, killed, reference, scheduler_killed
 
 COUNTS: dict[str, dict[str, int]] = {
+    "conversion": {"moment": 3, "write": 3, "cut": 3},
     "fuse": {"moment": 6, "write": 6, "cut": 3},
     "batch": {"moment": 6, "write": 6, "cut": 3, "scheduler": 4},
     "batch, two workers": {"moment": 3, "worker": 4},
