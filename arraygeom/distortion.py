@@ -7,7 +7,7 @@ pixels.
 Models, with their coefficients:
 
 - ``brown-conrady``: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4 [tx ty]]]], 4, 5, 8, 12 or 14 numbers in OpenCV's order:
-  rational radial, tangential, thin-prism and tilted-sensor terms (OpenCV's ``projectPoints``; Brown 1966, Conrady 1919).
+  rational radial, tangential, thin-prism and tilted-sensor terms (its ``projectPoints``; Brown 1966, Conrady 1919).
 - ``kannala-brandt``: k1 k2 k3 k4, the angle theta from the optical axis goes to the radius
   theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) (Kannala and Brandt 2006; OpenCV's ``fisheye``,
   Kalibr's ``equidistant``, COLMAP's ``OPENCV_FISHEYE``).

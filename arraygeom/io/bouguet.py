@@ -1,8 +1,8 @@
 """Calib_Results.mat and Calib_Results_stereo.mat of Bouguet's Camera Calibration Toolbox for MATLAB.
 
-Source convention: pixels with the first centre at 0 (shift 0), although of MATLAB; OpenCV's lens; X_right = R X_left + T
-with R from the rotation vector `om` where it is not stated; millimetres. The world is the left camera. K has the skew
-`alpha_c` times the first focal length.
+Source convention: pixels with the first centre at 0 (shift 0), although of MATLAB; OpenCV's lens;
+X_right = R X_left + T with R from the rotation vector `om` where it is not stated; millimetres. The world is the left
+camera. K has the skew `alpha_c` times the first focal length.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ default millimetres. The old names are of row vectors (x2 = x1 R + t, [x y 1] ~ 
 `RotationOfCamera2` are transposed. The new ones (`K`, `PoseCamera2`, since R2022b) are of columns and are not. The
 world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose: that catches a transposed one.
 
-Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A point u, v off
-`DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3 + a4 r^4); a0 is the focal
-length here.
+Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A point u, v
+off `DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3 + a4 r^4); a0 is the
+focal length here.
 """
 
 from __future__ import annotations

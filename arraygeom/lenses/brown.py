@@ -25,6 +25,7 @@ class Brown:
 
     @staticmethod
     def named(c: Tensor) -> Brown:
+        """From 4 to 14 coefficients in OpenCV's order, or those and the 15th."""
         n, eighth = c.shape[-1], c[..., 14] if c.shape[-1] == 15 else None
         c = c[..., :14]
         padded = list(torch.cat([c, c.new_zeros((*c.shape[:-1], 14 - c.shape[-1]))], -1).unbind(-1))
@@ -33,6 +34,7 @@ class Brown:
 
 
 def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (*n, 2) to distorted ones, and which are within the range."""
     lens = Brown.named(c)
     limit = brown_limit(lens).to(xy)
     squared = xy.square().sum(-1)

@@ -84,7 +84,7 @@ def _sound(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor]:
 
 @torch.no_grad()
 def _border(kind: _Model, c: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The squared radius that ends the model's range, and sine and cosine of its angle: float64 on the CPU, (*b, 1..)."""
+    """The squared radius that ends the model's range, sine and cosine of its angle: float64 on the CPU, (*b, 1..)."""
     c = c.detach().to("cpu", torch.float64)
     limit = kind.limit(c).clamp(max=WIDEST**2) * (1 - MARGIN)
     ray = unit(kind.unproject(c, torch.stack([limit.sqrt(), torch.zeros_like(limit)], -1)))

@@ -351,6 +351,7 @@ class Demo:
         from ..fusion.results import save_frame
         from ..systems.demo import save_demo_figure
 
+        options.writable(self.out, folder=True)
         sample = load_sample()
         say("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
         baseline = classical(sample.rig, sample.images, ALPHA, BETA)

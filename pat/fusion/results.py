@@ -35,11 +35,11 @@ def save_frame(
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (red is near).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml; with `points`, alpha's
-    camera, the pixels of known depth go to points.ply. With a `name` the files are name_fused.png and so on. Without any
-    known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png and so on, their
-    mean to fused.png. The image comes last: where it is, the others are of the same frame, and points.ply and the page
-    index.html of a former one are gone. After an error all former files are as they were.
+    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml; with `points`, the
+    camera of alpha, the pixels of known depth go to points.ply. With a `name` the files are name_fused.png and so on.
+    Without any known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png
+    and so on, their mean to fused.png. The image comes last: where it is, the others are of the same frame, and
+    points.ply and the page index.html of a former one are gone. After an error all former files are as they were.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""

@@ -345,7 +345,7 @@ def check_variants(one: Drawn, other: Drawn) -> None:
     for name, field, *_ in fields_of(one):
         found = field(batch, pixels)
         for i, (rig, kind) in enumerate(((one.rig, one.kind), (other_rig, other.kind))):
-            # At the epipole, the last pixel, the line's direction is up to rounding; with no baseline to speak of, nearly.
+            # At the epipole (the last pixel) and with hardly any baseline, the direction of the line is up to rounding.
             n = PIXELS - (kind == "on the epipole" and name in BY_LINES)
             tolerance = 1e-4 if kind == "tiny baseline" and name in BY_LINES else 1e-6
             alone = field(rig.pair("alpha", "beta"), pixels[i])

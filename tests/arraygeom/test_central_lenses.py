@@ -68,7 +68,7 @@ def thin_prism_fisheye(X, k1, k2, p1, p2, k3, k4, sx1, sy1):
 
 
 def scaramuzza(X, b2, b3, b4):
-    """MATLAB's: the smallest radius whose direction (r, 1 + b2 r^2 + b3 r^3 + b4 r^4) is the point's, by numpy's roots."""
+    """The smallest radius whose direction (r, 1 + b2 r^2 + b3 r^3 + b4 r^4) is the point's, by `np.roots`."""
     points, seen = np.zeros((len(X), 2)), np.zeros(len(X), bool)
     for i, (x, y, z) in enumerate(X):
         rho = math.hypot(x, y)
@@ -210,10 +210,10 @@ def test_the_axis_is_straight_in_float32():
     for model, c in CASES:
         if model in ("double-sphere", "unified", "fov"):
             continue  # their scale on the axis is not 1
-        J = torch.autograd.functional.jacobian(
-            lambda x, d=lens(model, c, torch.float32): d.distort(x)[0], torch.zeros(2)
+        found = torch.autograd.functional.jacobian(
+            lambda x, m=model, k=c: lens(m, k, x.dtype).distort(x)[0], torch.zeros(2)
         )
-        torch.testing.assert_close(J, torch.eye(2))
+        torch.testing.assert_close(found, torch.eye(2))
 
 
 @pytest.mark.parametrize("model", FORMULAS)

@@ -1,4 +1,4 @@
-"""Rig files with wide lenses: pixels of world points against each tool's own formula, in plain numpy and its own pixels."""
+"""Rig files with wide lenses: pixels of world points against each tool's own formula, in numpy and its own pixels."""
 
 import json
 

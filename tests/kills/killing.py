@@ -33,8 +33,8 @@ WAYS = ("moment", "write", "cut", "worker")
 class Job(NamedTuple):
     """A command that writes to a folder.
 
-    `arguments` of `pat`, for a folder; `again`, those that a killed command is continued with. `compared`: what has to be
-    the same in the end, as bytes by name. `faults`: what is wrong with a folder whose command was killed, given the
+    `arguments` of `pat`, for a folder; `again`, those that a killed command is continued with. `compared`: what has to
+    be the same in the end, as bytes by name. `faults`: what is wrong with a folder whose command was killed, given the
     contents that are right. `kept`: files that must not be made again, by the time they were written. `former`: the
     arguments of a command that has already written to the folder.
     """
@@ -264,7 +264,7 @@ def files_of(out: Path) -> dict[str, bytes]:
 
 
 def mixed(found: dict[str, bytes], versions: list[dict[str, bytes]], last: str) -> list[str]:
-    """What is wrong with files of which some belong to the one that is written last: none is torn, none of another making.
+    """What is wrong with files that belong together: some are torn, or not of the making of the one written last.
 
     Where there is no last one yet, the others only have to be whole.
     """
