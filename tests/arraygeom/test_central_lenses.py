@@ -9,6 +9,7 @@ from torch.autograd import gradcheck, gradgradcheck
 
 from arraygeom import Camera, Curved, Pose, Rig, intrinsics
 from arraygeom.distortion import COEFFICIENT_COUNTS, Distortion
+from calib.boards.observability import LENS_TERMS, TYPICAL_COEFFICIENTS
 from tests.oracles import Oracle
 
 cv2 = Oracle("cv2")
@@ -103,8 +104,10 @@ def directions(n: int = 3000, seed: int = 0) -> torch.Tensor:
     return X / X.norm(dim=-1, keepdim=True)
 
 
-def test_every_model_is_tested():
+def test_every_model_is_tested_and_has_names_and_sizes_for_refinement():
     assert {"brown-conrady", "kannala-brandt", *FORMULAS} == set(COEFFICIENT_COUNTS)
+    for model, counts in COEFFICIENT_COUNTS.items():
+        assert len(LENS_TERMS[model]) == len(TYPICAL_COEFFICIENTS[model]) == counts[-1]
 
 
 @pytest.mark.parametrize(("model", "c"), CASES)
