@@ -27,6 +27,8 @@ SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
 # Rotations in text files are rounded: this much of a deviation is put right, more is refused.
 ROUNDED = 1e-3
+# Of a rotation vector, in radians; it may go round a few times.
+LARGEST_ANGLE = 1e3
 
 
 class RigFileWarning(UserWarning):
@@ -167,6 +169,8 @@ class RigSource:
         """
         numbers = self.numbers(value, None, entry)
         if numbers.numel() == 3:
+            if numbers.abs().max() > LARGEST_ANGLE:
+                raise self.fail(entry, f"is a rotation vector of {numbers.abs().max():.3g}; it is in radians")
             return rotation_from_vector(numbers)
         R = self.numbers(numbers, (3, 3), entry)
         error = float(rotation_error(R))

@@ -188,6 +188,15 @@ def test_bouguets_results(tmp_path):
     )
 
 
+def test_a_rotation_vector_of_no_rotation(tmp_path):
+    from scipy.io import savemat
+
+    numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
+    savemat(tmp_path / "a.mat", {**numbers, "om": [0, 1e300, 0], "T": [1.0, 0, 0], "nx": 640, "ny": 480})
+    with pytest.raises(RigFileError, match="rotation vector of 1e[+]300; it is in radians"):
+        read_rig(tmp_path / "a.mat")
+
+
 def test_nerfstudios_fisheye(tmp_path):
     """OPENCV_FISHEYE is Kannala-Brandt's; pixels with the first centre at 0.5, OpenGL axes, camera->world."""
     fields = {"camera_model": "OPENCV_FISHEYE", "fl_x": 300, "fl_y": 301, "cx": 320, "cy": 240, "w": 640, "h": 480}
