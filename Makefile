@@ -20,7 +20,7 @@ help:
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
-	@echo "make kills      end commands with SIGKILL 80 times, continue and compare; the table of docs/kills.md"
+	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
