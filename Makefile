@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel fuzz transformations
+.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -20,6 +20,7 @@ help:
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
+	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat train'"
 	@echo "make synthesis  adds Blender to the environment (some 400 MB), to render scenes"
@@ -74,6 +75,9 @@ bench: $(READY)
 
 fuzz: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/fuzzing.md
+
+kills: $(READY)
+	@OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 $(BIN)/python -m tests.kills.run --out docs/kills.md
 
 transformations: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.transformations.run --out docs/transformations.md

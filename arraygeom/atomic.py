@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from uuid import uuid4
@@ -37,20 +37,22 @@ def write_atomically(path: str | Path) -> Iterator[Path]:
 
 
 @contextmanager
-def write_together(folder: str | Path, *, last: str) -> Iterator[Path]:
+def write_together(folder: str | Path, *, last: str, stale: Iterable[str] = ()) -> Iterator[Path]:
     """A temporary folder inside `folder` to write files to that belong together, the one named `last` among them.
 
-    They replace those of the same names when the block ends without error: the former last one is removed first, and
-    the new one comes last, so where it is, the others are of the same making. After an error (a full disk, say) all
-    former files are as they were. Missing folders are made. Raises OSError that names the file.
+    They replace those of the same names when the block ends without error: the former last one is removed first, then
+    those named `stale`, and the new last one comes last, so where it is, the others are of the same making. After an
+    error (a full disk, say) all former files are as they were. Missing folders are made. Raises OSError that names the
+    file.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".files-{uuid4().hex}"
+    temporary = folder / f".{Path(last).stem}-{uuid4().hex}"
     temporary.mkdir()
     try:
         yield temporary
-        (folder / last).unlink(missing_ok=True)
+        for name in (last, *stale):
+            (folder / name).unlink(missing_ok=True)
         for file in sorted(temporary.iterdir(), key=lambda file: file.name == last):
             os.replace(file, folder / file.name)
     except OSError as error:
@@ -61,10 +63,14 @@ def write_together(folder: str | Path, *, last: str) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def sweep(folder: Path) -> None:
-    """Remove the temporary files and folders of killed processes from a folder."""
+def sweep(folder: Path, stem: str | None = None) -> None:
+    """Remove the temporary files and folders of killed processes from a folder; or only those of files of one stem.
+
+    Those of safetensors, which writes to a file of its own first, are among the former.
+    """
+    ours = rf"\.{'.*' if stem is None else re.escape(stem)}-[0-9a-f]{{32}}(\.\w+)?"
     for path in folder.glob(".*"):
-        if re.fullmatch(r"\..*-[0-9a-f]{32}(\.\w+)?", path.name):
+        if re.fullmatch(ours if stem else rf"{ours}|\.tmp\w{{6}}", path.name):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 

@@ -12,7 +12,6 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
-from ..distortion import KANNALA_BRANDT
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
@@ -50,10 +49,8 @@ class Curved:
         nodes, seen = curve.at(even)
         pieces = visible_pieces(nodes, seen & curve.valid[..., None], pair.beta.hw)
         xy, seen = curve.at(along_pieces(pieces, sample_fractions(self.samples, like=x)))
-        limits = xy.new_tensor([pair.beta.hw[1] - 0.5, pair.beta.hw[0] - 0.5])
-        inside = ((xy > -0.5 - EDGE) & (xy < limits + EDGE)).all(-1)
+        xy, inside = _onto_edge(xy, pair.beta.hw, EDGE)
         mask = inside & seen & (pieces.length.sum(-1, keepdim=True) > 0)
-        xy = torch.minimum(xy.clamp(min=-0.5), limits)
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
@@ -77,7 +74,8 @@ class ThroughLenses:
         found = self.field(straight, there)
         found = found.positions(self.samples) if isinstance(found, Segments) else found
         xy, shown = beta.distort(found.xy)
-        mask = found.mask & seen[..., None] & shown & pair.beta.contains(xy)
+        xy, inside = _onto_edge(xy, pair.beta.hw, ROUNDED)
+        mask = found.mask & seen[..., None] & shown & inside
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
@@ -103,8 +101,16 @@ class _Straight(NamedTuple):
         return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2], x))
 
 
-EDGE = 0.25
-"""How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge."""
+EDGE, ROUNDED = 0.25, 1e-3
+"""How far outside the image a sample that should be on its edge may fall, pixels; it is moved onto the edge. By the
+spacing of nodes, and by rounding alone."""
+
+
+def _onto_edge(xy: Tensor, hw: HW, margin: float) -> tuple[Tensor, Tensor]:
+    """Points moved onto the image, and which were less than `margin` pixels outside it."""
+    limits = xy.new_tensor([hw[1] - 0.5, hw[0] - 0.5])
+    inside = ((xy > -0.5 - margin) & (xy < limits + margin)).all(-1)
+    return torch.minimum(xy.clamp(min=-0.5), limits), inside
 
 
 WIDE = math.tan(math.radians(75))
@@ -137,7 +143,7 @@ class _Curve(NamedTuple):
             pixels = Track(_each(beta.K, points.a), _each(beta.K, points.b))
             part = clipped(pixels, near, far, (-0.5, -0.5, w - 0.5, h - 0.5))
         elif limits is None:
-            part = clipped(points, near, far, None, in_front=beta.distortion.model != KANNALA_BRANDT)
+            part = clipped(points, near, far, None, in_front=not beta.distortion.sees_behind)
         else:
             part = clipped(points, near, far, [beside(v, x.ndim - 1) for v in limits])
         w_far, w_near = (beside(1 / d.to(x.dtype), x.ndim - 1) for d in (far, near))

@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from ..atomic import write_text
+from ..atomic import sweep, write_text, write_together
 from ..camera import Camera, LensView
 from ..pixels import HW
 from ..pose import Pose
@@ -23,10 +23,12 @@ from ..sensor import Sensor
 from . import (
     aniposelib,
     boofcv,
+    bouguet,
     colmap,
     kalibr,
     kitti,
     matlab,
+    metashape,
     middlebury,
     multical,
     native,
@@ -49,6 +51,7 @@ READERS: dict[str, Any] = {
     "boofcv": boofcv,
     "ros": ros,
     "native": native,
+    "bouguet": bouguet,
     "matlab": matlab,
     "kitti-raw": kitti.Raw,
     "kitti": kitti,
@@ -60,6 +63,7 @@ READERS: dict[str, Any] = {
     "pycalib": pycalib,
     "strecha": strecha,
     "open3d": open3d,
+    "metashape": metashape,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {
@@ -68,11 +72,6 @@ WRITERS: dict[str, Any] = {
     "colmap": colmap,
     "kalibr": kalibr,
     "nerfstudio": nerfstudio,
-}
-
-# Recognised by a word in the file or by its suffix, and what to do instead.
-NOT_READ = {
-    "<chunk": ("a Metashape project", "export its cameras in COLMAP's format"),
 }
 
 __all__ = ["READERS", "WRITERS", "RigFileError", "RigFileWarning", "convention", "read_rig", "recognise", "write_rig"]
@@ -107,7 +106,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
 
 
 def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
-    """Write a rig, each file atomically. Formats of several files make a folder.
+    """Write a rig atomically. Formats of several files make a folder, the last of them once the others are there.
 
     What a format leaves out of the rig (all but the native one: the depth range, links, what a sensor records) is named
     by one RigFileWarning. Raises ValueError for an unknown format, for a rig that the format cannot hold, and a batch.
@@ -118,9 +117,11 @@ def write_rig(rig: Rig, path: str | Path, *, format: str = "native") -> None:
     if format != "native" and (lost := _left_out(rig, format)):
         warnings.warn(f"{path}: {format} files do not hold the rig's {lost}: use the native format", RigFileWarning, 2)
     if isinstance(contents, Mapping):
-        path.mkdir(parents=True, exist_ok=True)
-        for name, text in contents.items():
-            write_text(path / name, text)
+        last = list(contents)[-1]
+        sweep(path, Path(last).stem)
+        with write_together(path, last=last) as folder:
+            for name, text in contents.items():
+                write_text(folder / name, text)
     else:
         write_text(path, contents)
 
@@ -134,9 +135,6 @@ def recognise(path: str | Path) -> str:
     for name, reader in READERS.items():
         if reader.recognises(path, head):
             return name
-    for mark, (what, advice) in NOT_READ.items():
-        if mark in head or path.suffix == mark:
-            raise RigFileError(path, None, f"is {what}, which is not read: {advice}")
     raise RigFileError(path, None, f"is not a rig file of a known format ({', '.join(READERS)}); or name its format")
 
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
+from ..distortion import BROWN_CONRADY, FOV, KANNALA_BRANDT, THIN_PRISM_FISHEYE, Distortion
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -45,8 +45,10 @@ MODELS = {
     "OPENCV": _Model(4, 2, BROWN_CONRADY, 4),
     "OPENCV_FISHEYE": _Model(5, 2, KANNALA_BRANDT, 4),
     "FULL_OPENCV": _Model(6, 2, BROWN_CONRADY, 8),
+    "FOV": _Model(7, 2, FOV, 1),
     "SIMPLE_RADIAL_FISHEYE": _Model(8, 1, KANNALA_BRANDT, 1),
     "RADIAL_FISHEYE": _Model(9, 1, KANNALA_BRANDT, 2),
+    "THIN_PRISM_FISHEYE": _Model(10, 2, THIN_PRISM_FISHEYE, 8),
 }
 
 
@@ -101,7 +103,8 @@ def write(rig: Rig) -> dict[str, str]:
         model, parameters = _parameters(name, camera)
         cameras.append(f"{i} {model} {w} {h} {_joined(parameters)}")
         images += [f"{i} {_joined(_wxyz(camera.R))} {_joined(camera.t.tolist())} {i} {name}", ""]
-    texts = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR"]}
+    points = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR"]
+    texts = {"cameras.txt": cameras, "points3D.txt": points, "images.txt": images}
     return {name: "\n".join(lines) + "\n" for name, lines in texts.items()}
 
 
@@ -138,15 +141,18 @@ def _sensor_name(camera: int, images: list[_Image]) -> str:
 
 def _intrinsics(source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> _Intrinsics:
     if model not in MODELS:
-        raise source.fail(entry, f"has model {model}, which is not supported (known: {', '.join(MODELS)})")
+        raise source.fail(entry, f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}")
     kind = MODELS[model]
     p = source.numbers(parameters, (kind.focals + 2 + kind.coefficients,), f"{entry} ({model})").tolist()
     K = source.focal_and_centre([p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5)
     hw, c = source.size(*wh, entry), p[kind.focals + 2 :]
-    if kind.lens is None:
+    if kind.lens is None or (not any(c) and kind.lens in (BROWN_CONRADY, FOV)):
         return _Intrinsics(K, hw, None)
-    lens = source.brown_conrady(c, entry) if kind.lens == BROWN_CONRADY else source.kannala_brandt(c, entry)
-    return _Intrinsics(K, hw, lens)
+    if kind.lens == BROWN_CONRADY:
+        return _Intrinsics(K, hw, source.brown_conrady(c, entry))
+    if kind.lens == KANNALA_BRANDT:
+        return _Intrinsics(K, hw, source.kannala_brandt(c, entry))
+    return _Intrinsics(K, hw, source.lens(kind.lens, c, entry))
 
 
 def _pose(source: RigSource, entry: str, numbers: list[Any]) -> Pose:
@@ -347,6 +353,8 @@ def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:
         return "PINHOLE", pinhole
     if lens.model == KANNALA_BRANDT:
         return "OPENCV_FISHEYE", pinhole + lens.coefficients.tolist()
+    if lens.model in (FOV, THIN_PRISM_FISHEYE):
+        return ("FOV" if lens.model == FOV else "THIN_PRISM_FISHEYE"), pinhole + lens.coefficients.tolist()
     c = brown_conrady(name, lens, at_most=8)
     return ("OPENCV", pinhole + c) if len(c) == 4 else ("FULL_OPENCV", pinhole + c + [0.0] * (8 - len(c)))
 

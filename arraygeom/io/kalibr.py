@@ -2,7 +2,8 @@
 
 Source convention: pixels with the first centre at 0 (shift 0); OpenCV axes; `T_cn_cnm1` takes points of camera n-1
 into camera n, so poses are chained products; metres. The world is camera 0, or the IMU where every camera states
-`T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time offset.
+`T_cam_imu`. `timeshift_cam_imu` (t_imu = t_cam + shift) becomes the sensor's time offset. Camera models pinhole (with
+radtan, equidistant, fov or no distortion), omni (with radtan or none), ds and eucm (with none).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import torch
 import yaml
 
 from ..camera import Camera
-from ..distortion import KANNALA_BRANDT, Distortion
+from ..distortion import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, KANNALA_BRANDT, UNIFIED, Distortion
 from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor
@@ -24,7 +25,15 @@ from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); T_cn_cnm1 chained, world = cam0 (or the IMU); metres"
 
-AGAIN = "calibrate again with --models pinhole-radtan, or pinhole-equi for wide angles"
+CAMERA_MODELS = {"pinhole": (), "omni": ("xi",), "ds": ("xi", "alpha"), "eucm": ("alpha", "beta")}
+"""And what stands before the focal lengths in `intrinsics`."""
+LENSES = {
+    "pinhole": ("radtan", "equidistant", "fov", "none"),
+    "omni": ("radtan", "none"),
+    "ds": ("none",),
+    "eucm": ("none",),
+}
+AGAIN = "calibrate again with --models pinhole-radtan, or ds-none for wide angles"
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -80,40 +89,63 @@ def _poses(source: RigSource, chain: dict[str, dict[str, Any]]) -> dict[str, Pos
 
 def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) -> Camera:
     model = source.get(fields, "camera_model", name)
-    if model != "pinhole":
-        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: pinhole: {AGAIN}")
+    if model not in CAMERA_MODELS:
+        raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}")
     width, height = source.numbers(source.get(fields, "resolution", name), (2,), f"{name}.resolution").tolist()
-    K = source.focal_and_centre(source.get(fields, "intrinsics", name), f"{name}.intrinsics")
+    first = len(CAMERA_MODELS[model])
+    numbers = source.numbers(source.get(fields, "intrinsics", name), (first + 4,), f"{name}.intrinsics")
+    K = source.focal_and_centre(numbers[first:], f"{name}.intrinsics")
     offset = source.number(fields.get("timeshift_cam_imu", 0.0), f"{name}.timeshift_cam_imu")
     return Camera(
         K=K,
         cam_from_world=pose,
         hw=source.size(width, height, f"{name}.resolution"),
-        distortion=_lens(source, name, fields),
+        distortion=_lens(source, name, model, numbers[:first].tolist(), fields),
         sensor=Sensor(time_offset=offset),
     )
 
 
-def _lens(source: RigSource, name: str, fields: dict[str, Any]) -> Distortion | None:
+def _lens(source: RigSource, name: str, camera: str, before: list[float], fields: dict[str, Any]) -> Distortion | None:
+    """The lens of a camera model and a distortion model; `before` are the numbers before the focal lengths."""
     model, entry = fields.get("distortion_model", "none"), f"{name}.distortion_coeffs"
+    if model not in LENSES[camera]:
+        known = ", ".join(LENSES[camera])
+        raise source.fail(f"{name}.distortion_model", f"is '{model}'; supported for {camera}: {known}: {AGAIN}")
+    count = {"radtan": 4, "equidistant": 4, "fov": 1, "none": 0}[model]
+    c = source.numbers(source.get(fields, "distortion_coeffs", name), (count,), entry).tolist() if count else []
+    if camera == "omni":
+        return source.lens(UNIFIED, [*before, *(c or [0.0] * 4)], f"{name}.intrinsics")
+    if camera != "pinhole":
+        return source.lens(DOUBLE_SPHERE if camera == "ds" else EXTENDED_UNIFIED, before, f"{name}.intrinsics")
     if model == "none":
         return None
-    coefficients = source.get(fields, "distortion_coeffs", name)
-    if model == "radtan":
-        return source.brown_conrady(source.numbers(coefficients, (4,), entry), entry)
-    if model == "equidistant":
-        return source.kannala_brandt(source.numbers(coefficients, (4,), entry), entry)
-    raise source.fail(f"{name}.distortion_model", f"is '{model}'; supported: radtan, equidistant, none: {AGAIN}")
+    if model == "fov":
+        return source.lens(FOV, c, entry)
+    return source.brown_conrady(c, entry) if model == "radtan" else source.kannala_brandt(c, entry)
 
 
 def _entry(name: str, camera: Camera) -> dict[str, Any]:
     h, w = camera.hw
-    entry: dict[str, Any] = {"camera_model": "pinhole", "intrinsics": list(focal_and_centre(name, camera))}
-    lens = camera.distortion
+    model, before, distortion, c = _spelled(name, camera.distortion)
+    return {
+        "camera_model": model,
+        "intrinsics": [*before, *focal_and_centre(name, camera)],
+        "distortion_model": distortion,
+        "distortion_coeffs": c,
+        "resolution": [w, h],
+        "rostopic": f"/{name}/image_raw",
+    }
+
+
+def _spelled(name: str, lens: Distortion | None) -> tuple[str, list[float], str, list[float]]:
+    """Camera model, what stands before its focal lengths, distortion model and coefficients."""
+    c = [] if lens is None else lens.coefficients.tolist()
     if lens is None:
-        entry |= {"distortion_model": "none", "distortion_coeffs": []}
-    elif lens.model == KANNALA_BRANDT:
-        entry |= {"distortion_model": "equidistant", "distortion_coeffs": lens.coefficients.tolist()}
-    else:
-        entry |= {"distortion_model": "radtan", "distortion_coeffs": brown_conrady(name, lens, at_most=4)}
-    return entry | {"resolution": [w, h], "rostopic": f"/{name}/image_raw"}
+        return "pinhole", [], "none", []
+    if lens.model == UNIFIED:
+        return ("omni", c[:1], "radtan", c[1:]) if any(c[1:]) else ("omni", c[:1], "none", [])
+    if lens.model in (DOUBLE_SPHERE, EXTENDED_UNIFIED):
+        return "ds" if lens.model == DOUBLE_SPHERE else "eucm", c, "none", []
+    if lens.model in (FOV, KANNALA_BRANDT):
+        return "pinhole", [], "fov" if lens.model == FOV else "equidistant", c
+    return "pinhole", [], "radtan", brown_conrady(name, lens, at_most=4)

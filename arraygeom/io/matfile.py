@@ -10,7 +10,11 @@ import math
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import NamedTuple
+from io import BytesIO
+from typing import Any, NamedTuple
+
+from ..extras import needs
+from .source import RigSource
 
 LARGEST = 2**26
 """Bytes of a file, and of a variable that is unpacked."""
@@ -26,6 +30,26 @@ COMPLEX = 0x800
 class _Element(NamedTuple):
     kind: int
     data: memoryview
+
+
+def load_variables(source: RigSource) -> dict[str, Any]:
+    """The variables of a .mat file that consist of structs, cells, text and numbers, by name. Raises RigFileError."""
+    try:
+        data = source.path.read_bytes()
+    except OSError as error:
+        raise source.fail(None, f"cannot be read: {error.strerror}") from None
+    if not data:
+        raise source.fail(None, "is empty")
+    if data.startswith(b"MATLAB 7.3"):
+        raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
+    with needs("calibration", "reading .mat files"):
+        from scipy.io import loadmat
+    try:
+        loaded = loadmat(BytesIO(data), simplify_cells=True, variable_names=readable_variables(data))
+    except Exception as error:
+        # Whatever the parser trips over in a damaged file, the cause is the file.
+        raise source.fail(None, f"is not a .mat file that can be read ({error}); was it cut off?") from None
+    return {name: value for name, value in loaded.items() if not name.startswith("__")}
 
 
 def readable_variables(content: bytes) -> list[str]:

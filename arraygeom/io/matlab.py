@@ -4,11 +4,14 @@ Source convention: pixels with the first centre at 1 (shift -1); OpenCV-like axe
 default millimetres. The old names are of row vectors (x2 = x1 R + t, [x y 1] ~ X K): `IntrinsicMatrix` and
 `RotationOfCamera2` are transposed. The new ones (`K`, `PoseCamera2`, since R2022b) are of columns and are not. The
 world is camera 1. A `FundamentalMatrix` in the file has to agree with the pose: that catches a transposed one.
+
+Fisheyes: the struct of fisheyeIntrinsics or fisheyeParameters, a camera "camera1" (Scaramuzza's model). A point u, v
+off `DistortionCenter`, after `StretchMatrix` is undone, is seen along (u, v, a0 + a2 r^2 + a3 r^3 + a4 r^4); a0 is the
+focal length here.
 """
 
 from __future__ import annotations
 
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +20,22 @@ import torch
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import Distortion
+from ..distortion import SCARAMUZZA, Distortion
 from ..epipolar import epipolar_lines, shift_origin
-from ..extras import needs
-from ..pixels import pixel_grid, to_homogeneous
+from ..pixels import HW, pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig
-from .matfile import readable_variables
+from .matfile import load_variables
 from .source import RigSource
 
 CONVENTION = "first pixel's centre at 1 (shift -1); row vectors transposed, world = camera 1; WorldUnits, else mm"
+FISHEYE = "MappingCoefficients"
 UNITS = {"mm": 1e-3, "millimeters": 1e-3, "cm": 1e-2, "centimeters": 1e-2, "m": 1.0, "meters": 1.0, "in": 0.0254}
 UNITS |= {"millimetres": 1e-3, "centimetres": 1e-2, "metres": 1.0, "inches": 0.0254}
 
 
 def recognises(path: Path, head: str) -> bool:
-    names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion")
+    names = ("CameraParameters1", "PoseCamera2", "RotationOfCamera2", "IntrinsicMatrix", "RadialDistortion", FISHEYE)
     return path.suffix == ".mat" or head.startswith("MATLAB ") or any(f'"{name}"' in head for name in names)
 
 
@@ -52,24 +55,9 @@ def read(source: RigSource) -> Rig:
 
 
 def _document(source: RigSource) -> dict[str, Any]:
-    try:
-        data = source.path.read_bytes()
-    except OSError as error:
-        raise source.fail(None, f"cannot be read: {error.strerror}") from None
-    if not data.startswith(b"MATLAB ") and source.path.suffix != ".mat":
-        return source.json()
-    if not data:
-        raise source.fail(None, "is empty")
-    if data.startswith(b"MATLAB 7.3"):
-        raise source.fail(None, "is a version 7.3 .mat file: save it with save(..., '-v7')")
-    with needs("calibration", "reading .mat files"):
-        from scipy.io import loadmat
-    try:
-        loaded = loadmat(BytesIO(data), simplify_cells=True, variable_names=readable_variables(data))
-    except Exception as error:
-        # Whatever the parser trips over in a damaged file, the cause is the file.
-        raise source.fail(None, f"is not a .mat file that can be read ({error}); was it cut off?") from None
-    return {name: value for name, value in loaded.items() if not name.startswith("__")}
+    with source.path.open("rb") as file:
+        is_text = source.path.suffix != ".mat" and not file.read(7).startswith(b"MATLAB ")
+    return source.json() if is_text else load_variables(source)
 
 
 def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
@@ -86,23 +74,44 @@ def _outermost(source: RigSource, fields: dict[str, Any]) -> dict[str, Any]:
 
 
 def _is_camera(fields: dict[str, Any]) -> bool:
-    return "IntrinsicMatrix" in fields or "K" in fields
+    return bool(fields.keys() & {"IntrinsicMatrix", "K", FISHEYE}) or _is_fisheye(fields.get("Intrinsics"))
+
+
+def _is_fisheye(fields: Any) -> bool:
+    return isinstance(fields, dict) and FISHEYE in fields
 
 
 def _camera(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+    if _is_fisheye(fields.get("Intrinsics", fields)):
+        return _fisheye(source, fields.get("Intrinsics", fields), entry, pose)
     if "K" in fields:
         K = source.intrinsics(fields["K"], f"{entry}.K", first_pixel=1.0)
     else:
         rows = source.numbers(source.get(fields, ("IntrinsicMatrix", "K"), entry), (3, 3), f"{entry}.IntrinsicMatrix")
         K = source.intrinsics(rows.T, f"{entry}.IntrinsicMatrix", first_pixel=1.0)
     lens = _lens(source, fields, entry)
+    return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
+
+
+def _fisheye(source: RigSource, fields: dict[str, Any], entry: str, pose: Pose) -> Camera:
+    a0, a2, a3, a4 = source.numbers(fields[FISHEYE], (4,), f"{entry}.{FISHEYE}").tolist()
+    if not a0 > 0:
+        raise source.fail(f"{entry}.{FISHEYE}", f"begins with {a0:g}; it is positive, about the focal length in pixels")
+    centre = source.numbers(source.get(fields, "DistortionCenter", entry), (2,), f"{entry}.DistortionCenter")
+    stretch = source.numbers(fields.get("StretchMatrix", [[1, 0], [0, 1]]), (2, 2), f"{entry}.StretchMatrix")
+    K = torch.eye(3, dtype=torch.float64)
+    K[:2, :2], K[:2, 2] = stretch * a0, centre
+    K = source.intrinsics(K, f"{entry}.StretchMatrix", first_pixel=1.0)
+    lens = source.lens(SCARAMUZZA, [a2 * a0, a3 * a0**2, a4 * a0**3], f"{entry}.{FISHEYE}")
+    return Camera(K=K, cam_from_world=pose, hw=_size(source, fields, entry, K), distortion=lens)
+
+
+def _size(source: RigSource, fields: dict[str, Any], entry: str, K: Tensor) -> HW:
     size = fields.get("ImageSize")
     if size is None or np.size(size) == 0:
-        hw = source.size_unstated(K)
-    else:
-        height, width = source.numbers(size, (2,), f"{entry}.ImageSize").tolist()
-        hw = source.size(width, height, f"{entry}.ImageSize")
-    return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens)
+        return source.size_unstated(K)
+    height, width = source.numbers(size, (2,), f"{entry}.ImageSize").tolist()
+    return source.size(width, height, f"{entry}.ImageSize")
 
 
 def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:

@@ -14,7 +14,7 @@ import yaml
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import Distortion
+from ..distortion import COEFFICIENT_COUNTS, Distortion
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
@@ -27,6 +27,8 @@ SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
 LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
 # Rotations in text files are rounded: this much of a deviation is put right, more is refused.
 ROUNDED = 1e-3
+# Of a rotation vector, in radians; it may go round a few times.
+LARGEST_ANGLE = 1e3
 
 
 class RigFileWarning(UserWarning):
@@ -167,6 +169,8 @@ class RigSource:
         """
         numbers = self.numbers(value, None, entry)
         if numbers.numel() == 3:
+            if numbers.abs().max() > LARGEST_ANGLE:
+                raise self.fail(entry, f"is a rotation vector of {numbers.abs().max():.3g}; it is in radians")
             return rotation_from_vector(numbers)
         R = self.numbers(numbers, (3, 3), entry)
         error = float(rotation_error(R))
@@ -214,6 +218,14 @@ class RigSource:
         if not 1 <= c.numel() <= 4:
             raise self.fail(entry, f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
         return Distortion("kannala-brandt", torch.nn.functional.pad(c, (0, 4 - c.numel())))
+
+    def lens(self, model: str, coefficients: Any, entry: str) -> Distortion:
+        """A lens of any model from all its coefficients, once they are within the model's bounds."""
+        c = self.numbers(coefficients, (COEFFICIENT_COUNTS[model][0],), entry)
+        lens = Distortion(model, c)
+        if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:
+            raise self.fail(entry, f"is {c.tolist()}, which no {model} lens has; was the calibration good?")
+        return lens
 
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
         """The rig, once no name occurs twice."""

@@ -14,11 +14,23 @@ from .bundle import BundleProblem, Free, IntrinsicsPrior, intrinsic_values, norm
 TYPICAL_COEFFICIENTS = {
     "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
     "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
+    "thin-prism-fisheye": (0.3, 0.3, 0.02, 0.02, 0.3, 0.3, 0.02, 0.02),
+    "double-sphere": (0.3, 0.3),
+    "extended-unified": (0.3, 0.5),
+    "unified": (1.0, 1.0, 1.0, 0.02, 0.02),
+    "fov": (0.5,),
+    "scaramuzza": (0.5, 0.5, 0.5),
 }
 """Upper bounds of the usual sizes of distortion coefficients."""
 LENS_TERMS = {
     "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
     "kannala-brandt": ("k1", "k2", "k3", "k4"),
+    "thin-prism-fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx", "sy"),
+    "double-sphere": ("xi", "alpha"),
+    "extended-unified": ("alpha", "beta"),
+    "unified": ("xi", "k1", "k2", "p1", "p2"),
+    "fov": ("omega",),
+    "scaramuzza": ("b2", "b3", "b4"),
 }
 """Names of the coefficients, in order."""
 TYPICAL_FOCAL_ERROR, TYPICAL_CENTRE_ERROR = 0.1, 0.1

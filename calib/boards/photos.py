@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -135,15 +136,23 @@ def _check_orientations(name: str, files: list[Path]) -> None:
 
 
 def _orientation(file: Path) -> int:
-    """The EXIF orientation, 1 if there is none or the file cannot be read, which is reported when it is decoded."""
+    """The EXIF orientation, 1 if there is none or the file cannot be read, which is reported when it is decoded.
+
+    Raises ValueError for a file that states more pixels than any camera has, before anything is decoded.
+    """
     try:
-        with Image.open(file) as image:
-            return int(image.getexif().get(ORIENTATION, 1))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+            with Image.open(file) as image:
+                return int(image.getexif().get(ORIENTATION, 1))
+    except Image.DecompressionBombError as error:
+        raise ValueError(f"{file}: {error}: give the photograph itself, or a smaller copy") from None
     except (OSError, SyntaxError, TypeError, ValueError):
         return 1
 
 
 def _decode_file(path: Path) -> np.ndarray:
+    _orientation(path)
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR  # orientation tags are applied, as when images are fused
     image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
     if image is None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from matplotlib import rc_context
 
-from arraygeom.atomic import write_atomically, write_text
+from arraygeom.atomic import sweep, write_atomically, write_text, write_together
 from arraygeom.rig import depth_range
 
 from .collect import Progress, collect_folder
@@ -48,11 +48,15 @@ def calibrate_photos(
     calibration = calibrate(found.views, target, lens=lens)
     rig = calibration.rig.replace(depth=depth, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
-    write_text(written[0], report_html(calibration, title=f"Calibration of {out.name}", notes=found.notes))
     covariance = rig_covariance(calibration)
-    if covariance is not None:
-        covariance.save(written[1])
-    rig.save(out)
+    sweep(out.parent, out.stem)
+    with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
+        write_text(
+            folder / written[0].name, report_html(calibration, title=f"Calibration of {out.name}", notes=found.notes)
+        )
+        if covariance is not None:
+            covariance.save(folder / written[1].name)
+        rig.save(folder / out.name)
     advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
     messages = [summary(calibration), *found.notes, *calibration.notes, *advice]
     return CalibrationOutput(messages, [path for path in written if path.exists()])

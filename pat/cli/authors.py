@@ -128,6 +128,7 @@ class Ablate:
 
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
+        writable(self.out, folder=True)
         if self.rendered is not None:
             cases = rendered_cases(self.rendered, seed=self.seed)
         else:
@@ -150,6 +151,7 @@ class Showcase:
     def run(self) -> None:
         from ..systems.showcase import showcase
 
+        writable(self.out, folder=True)
         print(showcase(self.data, self.out, self.weights), end="")
         say(f"written: {self.out / 'showcase.md'}, and its figures and rig files")
 
@@ -190,7 +192,7 @@ class SystemsRun:
         from ..systems import load_system, run_system
         from ..systems.fast_slow.recorded import run_recorded
 
-        out = self.out or Path("out/systems") / self.name
+        out = writable(self.out or Path("out/systems") / self.name, folder=True)
         if self.recording is None:
             further: dict[str, Any] = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
             result = run_system(self.name, out, weights=self.weights, say=say, **further)

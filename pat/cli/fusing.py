@@ -22,7 +22,7 @@ from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numb
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from arraygeom import Camera, Rig
+    from arraygeom import Rig
 
     from ..fusion.report import Facts
     from ..fusion.results import Frame
@@ -273,23 +273,17 @@ class Fuse:
             frame = self._exposed(frame)
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
-            written = save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig)
+            points = rig[alpha] if self.points else None
+            written = save_frame(
+                frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig, points=points
+            )
             shutil.rmtree(store, ignore_errors=True)
             if self.points:
-                written.append(self._write_points(frame, rig[alpha]))
-            page = self.out / "index.html"
-            page.unlink(missing_ok=True)
+                self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
                 facts = self._facts(found, time.monotonic() - begin)
-                written.append(write_report(page, frame, images, rig, alpha, facts))
+                written.append(write_report(self.out / "index.html", frame, images, rig, alpha, facts))
         say(f"written: {', '.join(map(str, written))}")
-
-    def _write_points(self, frame: Frame, camera: Camera) -> Path:
-        from ..media.points import write_points
-
-        count = write_points(self.out / "points.ply", camera, frame.depth, frame.image)
-        self._note(f"points.ply: {count} points in alpha's frame")
-        return self.out / "points.ply"
 
     def _facts(self, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
@@ -369,6 +363,7 @@ class Demo:
         from ..fusion.results import save_frame
         from ..systems.demo import save_demo_figure
 
+        options.writable(self.out, folder=True)
         sample = load_sample()
         say("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
         baseline = classical(sample.rig, sample.images, ALPHA, BETA)

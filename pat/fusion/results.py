@@ -13,12 +13,13 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
-from arraygeom import Rig
+from arraygeom import Camera, Rig
 from arraygeom.atomic import write_together
 
 from ..media.colour import linear_from_srgb
 from ..media.figures import colour_depth
 from ..media.images import write_image
+from ..media.points import write_points
 from ..media.raw import developed
 
 MOST = 65535
@@ -35,21 +36,25 @@ def save_frame(
     kind: ImageFormat = "png",
     view: Rig | None = None,
     rig: Rig | None = None,
+    points: Camera | None = None,
     name: str = "",
 ) -> list[Path]:
     """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png (`write_depth`) and
     depth.png (red is near).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml. With a `name` the
-    files are name_fused.png and so on. Without any known depth there are no depth files. Bands that are not one or
-    three go to fused_1.png, fused_2.png and so on, their mean to fused.png. The image comes last: where it is, the
-    others are of the same frame. After an error all former files are as they were.
+    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml; with `points`, the
+    camera of alpha, the pixels of known depth go to points.ply. With a `name` the files are name_fused.png and so on.
+    Without any known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png
+    and so on, their mean to fused.png. The image comes last: where it is, the others are of the same frame, and
+    points.ply and the page index.html of a former one are gone. After an error all former files are as they were.
     Returns what was written.
     """
     prefix = f"{name}_" if name else ""
     last = f"{prefix}fused.{kind}"
-    with write_together(out, last=last) as folder:
+    depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png")}
+    stale = depths | (set() if name else {"points.ply", "index.html"})
+    with write_together(out, last=last, stale=stale) as folder:
         write_image(folder / f"{prefix}confidence.png", frame.confidence[None])
         if frame.depth.isfinite().any():
             write_image(folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True)
@@ -60,6 +65,8 @@ def save_frame(
             view.save(folder / "view.yaml")
         if rig is not None:
             rig.save(folder / "rig.yaml")
+        if points is not None:
+            write_points(folder / "points.ply", points, frame.depth, frame.image)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image
         if len(image) not in (1, 3):
             for i, band in enumerate(image, 1):
@@ -67,8 +74,6 @@ def save_frame(
             image = image.mean(0, keepdim=True)
         write_image(folder / last, image, bits=bits, profile=bits != 32)
         names = {file.name for file in folder.iterdir()} - {last}
-    for stale in {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png")} - names:
-        (out / stale).unlink(missing_ok=True)
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
 
 

@@ -23,7 +23,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from .steps import steps_shown
 
 if TYPE_CHECKING:
-    from distributed import Client, Future
+    from distributed import Client, Future, LocalCluster
 
 T = TypeVar("T")
 OnError = Literal["stop", "skip"]
@@ -121,7 +121,7 @@ class Workers:
             with (
                 environment_restored(),
                 config.set({"distributed.nanny.pre-spawn-environ": ENVIRONMENT}),
-                LocalCluster(**options, memory_limit=0) as cluster,
+                _started(lambda: LocalCluster(**options, memory_limit=0)) as cluster,
                 Client(cluster) as client,
             ):
                 yield client
@@ -132,6 +132,14 @@ class Workers:
                 raise ValueError(f"no Dask scheduler at {self.scheduler}: {error}") from None
             with client:
                 yield client
+
+
+def _started(cluster: Callable[[], LocalCluster]) -> LocalCluster:
+    """A cluster, once its workers run. Raises ValueError if one of them died at its start."""
+    try:
+        return cluster()
+    except RuntimeError as error:
+        raise ValueError(f"a worker died while it started ({error}): give the same command again") from None
 
 
 HERE = Workers()

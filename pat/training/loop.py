@@ -17,6 +17,7 @@ from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torch.utils._pytree import tree_map
 
 from arraygeom import ReceptiveField
+from arraygeom.atomic import sweep
 from pat.networks.paper import AttentionEngine
 from pat.networks.weights import NETWORKS, Network, load_weights, save_weights
 from pat.support.locks import folder_lock
@@ -49,6 +50,9 @@ def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
     if former and former.facts["done"]:
         return config.out / BEST
     with process(config.device) as here, folder_lock(config.out) if here.first else nullcontext():
+        if here.first:
+            for folder in (config.out, config.out / CHECKPOINTS, config.out / "images"):
+                sweep(folder)
         run = Run(config, here, field, former)
         try:
             run.work()

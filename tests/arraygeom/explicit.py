@@ -42,7 +42,7 @@ def _brown(c: np.ndarray, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     u = x * x + y * y
     g = (1 + u * (k1 + u * (k2 + u * k3))) / (1 + u * (k4 + u * (k5 + u * k6)))
     out = np.stack([x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x), y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y], -1)
-    r = np.linspace(0, 3, 30001)
+    r = np.concatenate([np.linspace(0, 3, 30001), np.geomspace(3, 1000, 30001)[1:]])
     v = r * r
     radius = r * (1 + v * (k1 + v * (k2 + v * k3))) / (1 + v * (k4 + v * (k5 + v * k6)))
     falls = np.flatnonzero(np.diff(radius) <= 0)

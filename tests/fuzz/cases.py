@@ -80,11 +80,11 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
             write_rig(rich if format == "native" else plain, target, format=format)
         for file in sorted(target.iterdir()) if target.is_dir() else [target]:
             yield Seed("rig", f"{format} (written)", file, target.is_dir())
-    yield _matlab(folder / "matlab")
+    yield from _matlab(folder / "matlab")
     yield from _colmap_binary(folder / "colmap_binary")
 
 
-def _matlab(folder: Path) -> Seed:
+def _matlab(folder: Path) -> Iterator[Seed]:
     from scipy.io import savemat
 
     camera = {"IntrinsicMatrix": np.array([[800.0, 0, 0], [0, 800, 0], [320, 200, 1]]), "ImageSize": [400.0, 640.0]}
@@ -92,8 +92,14 @@ def _matlab(folder: Path) -> Seed:
     pair = {"CameraParameters1": camera, "CameraParameters2": camera, "WorldUnits": "mm"}
     pair |= {"RotationOfCamera2": np.eye(3), "TranslationOfCamera2": np.array([-100.0, 0, 0])}
     folder.mkdir(parents=True, exist_ok=True)
-    savemat(folder / "pair.mat", {"s": pair})
-    return Seed("rig", "matlab .mat", folder / "pair.mat")
+    fisheye = {"MappingCoefficients": [300.0, -9e-4, 4e-7, -6e-10], "ImageSize": [480.0, 640.0]}
+    fisheye |= {"DistortionCenter": [321.5, 239.25], "StretchMatrix": np.eye(2)}
+    bouguet = {"om": [0.01, 0.1, -0.02], "T": [-100.0, 2, 1], "nx": 640.0, "ny": 480.0}
+    for side in ("left", "right"):
+        bouguet |= {f"fc_{side}": [800.0, 802], f"cc_{side}": [320.5, 238], f"kc_{side}": [-0.2, 0.1, 0, 0, 0.01]}
+    for name, variables in (("pair", {"s": pair}), ("fisheye", {"s": fisheye}), ("bouguet", bouguet)):
+        savemat(folder / f"{name}.mat", variables)
+        yield Seed("rig", f"{name} .mat", folder / f"{name}.mat")
 
 
 def _colmap_binary(folder: Path) -> Iterator[Seed]:

@@ -33,6 +33,9 @@ PAIR = RIG.pair("alpha", "beta")
 A, B = PAIR.cameras
 BROWN = A.replace(distortion=Distortion("brown-conrady", vector(-0.1, 0.02, 1e-3, -5e-4)))
 FISHEYE = A.replace(distortion=Distortion("kannala-brandt", vector(0.05, -0.01, 0.002, -1e-3)))
+SPHERES = Distortion("double-sphere", vector(-0.2, 0.57))
+PRISM = Distortion("thin-prism-fisheye", vector(0.05, -0.01, 1e-3, -2e-3, 3e-3, -5e-4, 1e-3, -7e-4))
+OMNI = Distortion("scaramuzza", vector(-0.3, 0.02, -0.01))
 CURVED = RIG.with_camera("alpha", BROWN).pair("alpha", "beta")
 X = vector(30.2, 20.7, 11.4, 33.1)
 POINTS = vector(0.2, -0.1, 2.5, -0.4, 0.3, 4.0)
@@ -117,6 +120,9 @@ GEOMETRY = {
     "undistort, brown-conrady": Operator(lambda x: BROWN.undistort(pixels(x))[0], X),
     "distort, kannala-brandt": Operator(lambda x: FISHEYE.distort(pixels(x))[0], X),
     "undistort, kannala-brandt": Operator(lambda x: FISHEYE.undistort(pixels(x))[0], X),
+    "project, double-sphere": Operator(lambda x: SPHERES.project(x.reshape(-1, 3))[0], POINTS),
+    "unproject, thin-prism-fisheye": Operator(lambda x: PRISM.unproject(pixels(x) / 50)[0], X),
+    "project, scaramuzza": Operator(lambda x: OMNI.project(x.reshape(-1, 3))[0], POINTS),
     "covering_displacement": Operator(lambda w: covering_displacement(moved_pair(w)), W),
 }
 FIELDS = {

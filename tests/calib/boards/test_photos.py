@@ -1,6 +1,8 @@
 """Which image belongs to which camera and moment."""
 
 import re
+import struct
+import zlib
 
 import cv2
 import numpy as np
@@ -118,3 +120,13 @@ def test_orientation_tags_are_applied_and_have_to_be_the_same(tmp_path):
     (tmp_path / "cam_2.png").unlink()
     photo = find_photos(tmp_path)["cam"][0]
     assert (photo.decode()[..., 0] == np.rot90(pixels, -1)).all()
+
+
+def test_a_photograph_that_states_too_many_pixels_is_not_decoded(tmp_path):
+    """A head of 30000 x 30000 pixels: refused by what it states, although OpenCV would try."""
+    parts = [(b"IHDR", struct.pack(">IIBBBBB", 30_000, 30_000, 8, 2, 0, 0, 0)), (b"IDAT", zlib.compress(bytes(100)))]
+    chunks = [struct.pack(">I", len(d)) + kind + d + struct.pack(">I", zlib.crc32(kind + d)) for kind, d in parts]
+    for i in range(2):
+        (tmp_path / f"a0{i}.png").write_bytes(b"\x89PNG\r\n\x1a\n" + b"".join(chunks))
+    with pytest.raises(ValueError, match=r"a00\.png: Image size \(900000000 pixels\) exceeds .*a smaller copy"):
+        find_photos(tmp_path)

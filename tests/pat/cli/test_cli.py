@@ -442,6 +442,10 @@ runpy.run_module("pat", run_name="__main__")
         (["evaluate", "--kitti", "kitti"], "file", "is a file: name a folder"),
         (["rig", "doctor", "rig.yaml", "--image", "mono=a.png"], "folder", "is a folder: name a file"),
         (["rig", "show", "rig.yaml"], "file", "is a file: name a folder"),
+        (["demo"], "file", "is a file: name a folder"),
+        (["ablate", "--scenes", "1"], "file", "is a file: name a folder"),
+        (["showcase", "--data", "data"], "file", "is a file: name a folder"),
+        (["systems", "run", "exposures"], "file/x", "file is a file, so"),
         (["board", "charuco:8x6:30mm"], "folder", "is a folder: name a file"),
     ],
 )

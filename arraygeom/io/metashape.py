@@ -1,0 +1,147 @@
+"""Cameras exported by Agisoft Metashape as XML (its own format): every aligned image is a camera, named by its label.
+
+Source convention: pixels with the first centre at 0.5 (shift -0.5), the principal point cx, cy off the image's middle;
+OpenCV axes; `transform` is camera->chunk, inverted; the world is the chunk's frame, in the scale that the chunk or its
+component states, taken as metres (its rotation and translation into geographic coordinates are left out). In Brown's
+polynomials p1 and p2 change places; b1 adds to the first focal length and b2 is the skew. Frame and fisheye sensors.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import THIN_PRISM_FISHEYE, Distortion
+from ..pixels import HW
+from ..pose import Pose
+from ..rig import Rig
+from ..safe_yaml import DEEPEST, LARGEST_TEXT
+from .source import RigSource
+
+CONVENTION = "first pixel's centre at 0.5 (shift -0.5); camera->chunk, inverted; the chunk's scale, else as in the file"
+LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+
+
+class _Sensor(NamedTuple):
+    K: Tensor
+    hw: HW
+    lens: Distortion | None
+
+
+def recognises(path: Path, head: str) -> bool:
+    return "<chunk" in head
+
+
+def read(source: RigSource) -> Rig:
+    """All aligned cameras of the file's one chunk."""
+    chunks = list(_document(source).iter("chunk"))
+    if len(chunks) != 1:
+        raise source.fail("chunk", f"occurs {len(chunks)} times: export one chunk's cameras")
+    sensors = {sensor.get("id"): sensor for sensor in chunks[0].iter("sensor")}
+    scales = {part.get("id"): _scale(source, part) for part in chunks[0].iter("component")}
+    scale = _scale(source, chunks[0])
+    made: dict[str, _Sensor] = {}
+    cameras, left_out = [], []
+    for camera in chunks[0].iter("camera"):
+        name, sensor = camera.get("label") or f"camera{camera.get('id')}", camera.get("sensor_id") or ""
+        transform = camera.findtext("transform")
+        if transform is None:
+            left_out.append(name)
+            continue
+        if sensor not in sensors:
+            raise source.fail(name, f"is of sensor '{sensor}', which is not defined")
+        if sensor not in made:
+            made[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
+        K, hw, lens = made[sensor]
+        pose = source.pose_matrix(_floats(source, transform, (16,), f"{name}.transform"), f"{name}.transform").inverse()
+        own = scales.get(camera.get("component_id"))
+        metres = own if own is not None else scale if scale is not None else 1.0
+        cameras.append((name, Camera(K=K, cam_from_world=Pose(pose.R, pose.t * metres), hw=hw, distortion=lens)))
+    if left_out:
+        source.warn(f"holds {len(left_out)} cameras that are not aligned (such as {left_out[0]}); they are left out")
+    return source.rig(cameras)
+
+
+def _document(source: RigSource) -> ET.Element:
+    """The parsed text, once it is neither too large nor nested too deeply, and defines no entities."""
+    text = source.text()
+    if len(text) > LARGEST_TEXT:
+        raise source.fail(None, f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise source.fail(None, "defines entities, which Metashape does not write")
+    parser: ET.XMLPullParser = ET.XMLPullParser(["start", "end"])
+    depth, root = 0, None
+    try:
+        for event, element in _events(parser, text):
+            root = element if root is None else root
+            depth += 1 if event == "start" else -1
+            if depth > DEEPEST:
+                raise source.fail(None, f"is nested more than {DEEPEST} deep")
+        parser.close()
+    except ET.ParseError as error:
+        raise source.fail(f"line {error.position[0]}", "is not XML; is the file whole?") from None
+    assert root is not None
+    return root
+
+
+def _events(parser: ET.XMLPullParser, text: str) -> Iterator[tuple[str, ET.Element]]:
+    for at in range(0, len(text), 4096):
+        parser.feed(text[at : at + 4096])
+        yield from parser.read_events()  # type: ignore[misc]
+
+
+def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> _Sensor:
+    """A sensor's last calibration (the adjusted one, where there are two)."""
+    found = sensor.findall("calibration")
+    if not found:
+        raise source.fail(entry, "has no calibration: optimise the cameras, and export again")
+    calibration = next((c for c in found if c.get("class") == "adjusted"), found[-1])
+    resolution = calibration.find("resolution")
+    resolution = sensor.find("resolution") if resolution is None else resolution
+    if resolution is None:
+        raise source.fail(entry, "has no resolution")
+    width, height = (_floats(source, resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height"))
+    h, w = source.size(width, height, f"{entry} resolution")
+    f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
+    K = source.intrinsics([[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5)
+    return _Sensor(K, (h, w), _lens(source, calibration, entry))
+
+
+def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion | None:
+    k1, k2, k3, k4, p1, p2, p3, p4 = (_number(source, calibration, name, entry) for name in LENS_NUMBERS)
+    kind = calibration.get("type", "frame")
+    if kind not in ("frame", "fisheye"):
+        raise source.fail(entry, f"is of type '{kind}'; frame and fisheye are read: undistort the images first")
+    if p3 or p4 or (k4 and kind == "frame"):
+        raise source.fail(entry, "has p3, p4, or for a frame k4, which are not read: optimise the cameras without them")
+    if kind == "frame":
+        return source.brown_conrady([k1, k2, p2, p1, k3], entry)
+    return source.lens(THIN_PRISM_FISHEYE, [k1, k2, p2, p1, k3, k4, 0.0, 0.0], entry)
+
+
+def _scale(source: RigSource, part: ET.Element) -> float | None:
+    """Metres a unit of a chunk or a component, if that is known."""
+    text = part.findtext("transform/scale")
+    return None if text is None else float(_floats(source, text, (1,), "scale"))
+
+
+def _number(source: RigSource, calibration: ET.Element, name: str, entry: str) -> float:
+    """A number of a calibration; 0 where it is not stated, but for f."""
+    text = calibration.findtext(name)
+    if text is None and name == "f":
+        raise source.fail(entry, "has no f, the focal length")
+    return 0.0 if text is None else float(_floats(source, text, (1,), f"{entry} {name}"))
+
+
+def _floats(source: RigSource, text: str, shape: tuple[int, ...], entry: str) -> Tensor:
+    try:
+        return source.numbers([float(word) for word in text.split()], shape, entry)
+    except ValueError as error:
+        if hasattr(error, "entry"):
+            raise
+        raise source.fail(entry, f"holds something other than numbers: {text[:60]!r}") from None

@@ -1,0 +1,220 @@
+"""Brown-Conrady: radial, tangential and thin-prism polynomials and a tilted sensor, and their inverse."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ..pixels import product
+from ..roots import first_root, invert_increasing
+from ..tracing import traced
+from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, homogeneous, norm, polynomial_product
+
+
+@dataclass(frozen=True)
+class Brown:
+    """The 14 coefficients by name (absent ones 0), and a 15th, the factor of r^8; each of shape (*b, 1..)."""
+
+    k: tuple[Tensor, ...]
+    p: tuple[Tensor, Tensor]
+    s: tuple[Tensor, ...]
+    tilt: tuple[Tensor, Tensor] | None
+    eighth: Tensor | None
+
+    @staticmethod
+    def named(c: Tensor) -> Brown:
+        """From 4 to 14 coefficients in OpenCV's order, or those and the 15th."""
+        n, eighth = c.shape[-1], c[..., 14] if c.shape[-1] == 15 else None
+        c = c[..., :14]
+        padded = list(torch.cat([c, c.new_zeros((*c.shape[:-1], 14 - c.shape[-1]))], -1).unbind(-1))
+        k1, k2, p1, p2, k3, k4, k5, k6, s1, s2, s3, s4, tx, ty = padded
+        return Brown((k1, k2, k3, k4, k5, k6), (p1, p2), (s1, s2, s3, s4), (tx, ty) if n == 14 else None, eighth)
+
+
+def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (*n, 2) to distorted ones, and which are within the range."""
+    lens = Brown.named(c)
+    limit = brown_limit(lens).to(xy)
+    squared = xy.square().sum(-1)
+    inside = squared < limit
+    pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())
+    planar, jacobian = _brown_planar(lens, xy * pull[..., None])
+    tilted, ahead = _tilt(lens, planar)
+    return tilted, inside & _orients(jacobian) & ahead
+
+
+def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
+    """Undo the tilt exactly, solve for the radius in a bracket, then for (x, y) by Newton.
+
+    The last two Newton steps are differentiable: from a solution that is a constant, one step propagates the
+    first derivatives and the next one the second (the error of a Newton step is the square of the one before).
+    """
+    lens = Brown.named(c)
+    target, ahead = _untilt(lens, xy_d)
+    with torch.no_grad():
+        inverse = _traced_brown_inverse if torch.compiler.is_compiling() else _brown_inverse_of
+        solved, valid = inverse(c.detach(), target.detach())
+    safe_target = torch.where(valid[..., None], target, 0.0)
+    xy = torch.where(valid[..., None], solved, 0.0)
+    for _ in range(2):
+        xy = xy - _newton_step(*_brown_planar(lens, xy), safe_target)
+    return torch.where(valid[..., None], xy, solved), valid & ahead
+
+
+def _brown_planar(lens: Brown, xy: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]]:
+    """Everything but the tilt, and its Jacobian (dx'/dx, dx'/dy, dy'/dx, dy'/dy)."""
+    x, y = xy.unbind(-1)
+    (p1, p2), (s1, s2, s3, s4) = lens.p, lens.s
+    u = x * x + y * y
+    g, dg = _radial_factor(lens, u)
+    x_d = x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x) + u * (s1 + s2 * u)
+    y_d = y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y + u * (s3 + s4 * u)
+    cross, prism_x, prism_y = 2 * (x * y * dg + p1 * x + p2 * y), 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
+    xx = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x + prism_x * x
+    yy = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x + prism_y * y
+    return torch.stack([x_d, y_d], -1), (xx, cross + prism_x * y, cross + prism_y * x, yy)
+
+
+def _radial_factor(lens: Brown, u: Tensor) -> tuple[Tensor, Tensor]:
+    """g = (1 + k1 u + k2 u^2 + k3 u^3) / (1 + k4 u + k5 u^2 + k6 u^3) of the squared radius u, and dg/du."""
+    k1, k2, k3, k4, k5, k6 = lens.k
+    top, bottom = 1 + u * (k1 + u * (k2 + u * k3)), 1 + u * (k4 + u * (k5 + u * k6))
+    d_top, d_bottom = k1 + u * (2 * k2 + 3 * u * k3), k4 + u * (2 * k5 + 3 * u * k6)
+    if lens.eighth is not None:
+        top, d_top = top + u**4 * lens.eighth, d_top + 4 * u**3 * lens.eighth
+    g = top / bottom
+    return g, (d_top - g * d_bottom) / bottom
+
+
+@torch.no_grad()
+def brown_limit(lens: Brown) -> Tensor:
+    """The squared radius up to which the radial part r g(r^2) rises: float64 on the CPU, shape (*b, 1..).
+
+    With g = N / D the slope is P / D^2, P(u) = (N + 2 u N') D - 2 u N D', of degree 6 (or 7) with P(0) = 1.
+    """
+    k1, k2, k3, k4, k5, k6 = (k.detach().to("cpu", torch.float64) for k in lens.k)
+    one = torch.ones_like(k1)
+    k7 = () if lens.eighth is None else (lens.eighth.detach().to("cpu", torch.float64),)
+    rising = polynomial_product((one, 3 * k1, 5 * k2, 7 * k3, *(9 * k for k in k7)), (one, k4, k5, k6))
+    falling = polynomial_product((one, k1, k2, k3, *k7), (0 * one, 2 * k4, 4 * k5, 6 * k6))
+    turn = first_root(torch.stack([a - b for a, b in zip(rising, falling)], -1))
+    pole = first_root(torch.stack([one, k4, k5, k6], -1))
+    return torch.minimum(torch.minimum(turn * (1 - MARGIN), pole * POLE), one * WIDEST**2)
+
+
+def _brown_start(lens: Brown, target: Tensor, limit: Tensor) -> Tensor:
+    """The solution if there were only the radial terms."""
+
+    def radius(r: Tensor) -> tuple[Tensor, Tensor]:
+        g, dg = _radial_factor(lens, r * r)
+        return r * g, g + 2 * r * r * dg
+
+    wanted = norm(target)
+    r = invert_increasing(radius, wanted, limit.sqrt().expand_as(wanted).to(wanted))
+    return target * (r / torch.where(wanted > 0, wanted, 1.0))[..., None]
+
+
+def _brown_inverse_of(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    lens = Brown.named(c)
+    return _brown_inverse(lens, target, brown_limit(lens).to(target))
+
+
+@torch.library.custom_op(
+    "arraygeom::brown_inverse", mutates_args=(), schema="(Tensor c, Tensor target) -> (Tensor, Tensor)"
+)
+def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    """The same for torch.compile, which cannot follow iterations that numbers end."""
+    solved, valid = _brown_inverse_of(c, target)
+    return solved.contiguous(), valid.contiguous()
+
+
+@_traced_brown_inverse.register_fake
+def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
+    shape = torch.broadcast_shapes(target.shape[:-1], c.shape[:-1])
+    return target.new_empty((*shape, 2)), target.new_empty(shape, dtype=torch.bool)
+
+
+def _brown_inverse(lens: Brown, target: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+    """The solution and whether there is one; where not, the solution of the radial terms alone.
+
+    Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in.
+    """
+    start = solved = _brown_start(lens, target, limit)
+    valid = torch.zeros_like(target[..., 0], dtype=torch.bool)
+    for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
+        attempt = _brown_solve(lens, torch.where(valid[..., None], solved, begin), target, limit)
+        planar, jacobian = _brown_planar(lens, attempt)
+        tolerance = SOLVED * torch.finfo(target.dtype).eps * (1 + norm(target))
+        valid = (norm(planar - target) < tolerance) & (attempt.square().sum(-1) < limit) & _orients(jacobian)
+        solved = torch.where(valid[..., None], attempt, start)
+        if not traced() and bool(valid.all()):
+            break
+    return solved, valid
+
+
+def _pulled_in(xy: Tensor, squared_radius: Tensor) -> Tensor:
+    factor = (squared_radius / xy.square().sum(-1).clamp_min(1e-30)).sqrt()
+    return xy * factor.clamp_max(1.0)[..., None]
+
+
+def _brown_solve(lens: Brown, xy: Tensor, target: Tensor, limit: Tensor, iterations: int = 30) -> Tensor:
+    """Newton, with halved steps where a whole one goes too far or does not help."""
+    planar, jacobian = _brown_planar(lens, xy)
+    error, scale = norm(planar - target), torch.ones_like(target[..., 0])
+    enough = 2 * torch.finfo(target.dtype).eps * (1 + norm(target))
+    for _ in range(iterations):
+        if not traced() and bool(((error <= enough) | (scale < 1e-3)).all()):
+            break
+        trial = xy - scale[..., None] * _newton_step(planar, jacobian, target)
+        planar_trial, jacobian_trial = _brown_planar(lens, trial)
+        error_trial = norm(planar_trial - target)
+        better = (error_trial < error) & (trial.square().sum(-1) < BEYOND * limit)
+        xy, planar = (torch.where(better[..., None], a, b) for a, b in ((trial, xy), (planar_trial, planar)))
+        jacobian = tuple(torch.where(better, a, b) for a, b in zip(jacobian_trial, jacobian))  # type: ignore[assignment]
+        error, scale = torch.where(better, error_trial, error), torch.where(better, 1.0, scale / 2)
+    return xy
+
+
+def _newton_step(value: Tensor, jacobian: tuple[Tensor, Tensor, Tensor, Tensor], target: Tensor) -> Tensor:
+    xx, xy, yx, yy = jacobian
+    ex, ey = (value - target).unbind(-1)
+    determinant = xx * yy - xy * yx
+    determinant = torch.where(determinant.abs() < 1e-12, 1e-12, determinant)
+    return torch.stack([(yy * ex - xy * ey) / determinant, (xx * ey - yx * ex) / determinant], -1)
+
+
+def _orients(jacobian: tuple[Tensor, Tensor, Tensor, Tensor]) -> Tensor:
+    """Whether the map keeps orientation here: past a fold it mirrors, past two it rotates by 180 degrees."""
+    xx, xy, yx, yy = jacobian
+    return (xx * yy - xy * yx > 0) & (xx + yy > 0)
+
+
+def _tilt_matrix(lens: Brown) -> Tensor | None:
+    """The homography (*b, 1.., 3, 3) of a sensor tilted by tx, ty about x, then y (OpenCV's)."""
+    if lens.tilt is None:
+        return None
+    from kornia.geometry.calibration.distort import tilt_projection
+
+    tx, ty = (angle.double()[..., None] for angle in lens.tilt)  # in float64, which autocast leaves alone
+    return tilt_projection(tx, ty)
+
+
+def _tilt(lens: Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
+    H = _tilt_matrix(lens)
+    return _apply(H, xy)
+
+
+def _untilt(lens: Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
+    H = _tilt_matrix(lens)
+    return _apply(H if H is None else torch.linalg.inv(H), xy)
+
+
+def _apply(H: Tensor | None, xy: Tensor) -> tuple[Tensor, Tensor]:
+    """The homography H of points, and which lie on this side of the line it sends to infinity."""
+    if H is None:
+        return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
+    p = product(H.to(xy), homogeneous(xy)[..., None])[..., 0]
+    ahead = p[..., 2] > 1 / WIDEST
+    return p[..., :2] / torch.where(ahead, p[..., 2], 1.0)[..., None], ahead

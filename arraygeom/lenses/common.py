@@ -1,0 +1,73 @@
+"""What all lens models share: bounds of validity, and small functions that are smooth on the optical axis."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..pixels import floating
+
+# The range of validity ends this fraction (of the squared radius) inside the turn, where the inverse is still
+# good to 1e-6 px in float64.
+MARGIN = 1e-6
+# Nothing past this normalised radius is valid under Brown-Conrady: 89.94 degrees off axis.
+WIDEST = 1e3
+# A denominator of the rational model this close (in squared radius) to its zero gives radii that mean nothing.
+POLE = 0.9
+# How far beyond the limit the search for an inverse may pass (in squared radius); short of a pole.
+BEYOND = 1.1
+# Squared radii are at least this in divisions, for lenses that are valid nowhere.
+TINY = 1e-30
+# An inverse counts as found from this residual on, in units of rounding.
+SOLVED = 64
+
+
+def angle_over_radius(u: Tensor, z: Tensor) -> Tensor:
+    """theta / r of the squared radius u and the depth z, by its series near the axis."""
+    near = (z > 0) & (u < 1e-3 * z.square())
+    z_near = torch.where(near, z, 1.0)
+    t = torch.where(near, u, 0.0) / z_near.square()
+    series = (1 - t * (1 / 3 - t * (1 / 5 - t * (1 / 7 - t * (1 / 9 - t / 11))))) / z_near
+    plain = ~near & (u > 0)
+    r = torch.where(plain, u, 1.0).sqrt()
+    return torch.where(near, series, torch.atan2(r, torch.where(plain, z, 1.0)) / r)
+
+
+def cosine_and_sinc(v: Tensor) -> tuple[Tensor, Tensor]:
+    """cos(theta) and sin(theta) / theta of the squared angle v, by their series near 0."""
+    near = v < 1e-3
+    s, theta = torch.where(near, v, 0.0), torch.where(near, 1.0, v).sqrt()
+    cosine = 1 - s * (1 / 2 - s * (1 / 24 - s * (1 / 720 - s / 40320)))
+    sinc = 1 - s * (1 / 6 - s * (1 / 120 - s * (1 / 5040 - s / 362880)))
+    return torch.where(near, cosine, theta.cos()), torch.where(near, sinc, theta.sin() / theta)
+
+
+def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Tensor]:
+    """The coefficients of the product of two polynomials."""
+    terms: list[Tensor] = [torch.zeros_like(a[0])] * (len(a) + len(b) - 1)
+    for i, a_i in enumerate(a):
+        for j, b_j in enumerate(b):
+            terms[i + j] = terms[i + j] + a_i * b_j
+    return terms
+
+
+def homogeneous(xy: Tensor) -> Tensor:
+    """Points (*n, 2) with a 1 behind."""
+    return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
+
+
+def unit(ray: Tensor) -> Tensor:
+    """Vectors at length 1."""
+    return ray / norm(ray)[..., None]
+
+
+def norm(xy: Tensor) -> Tensor:
+    """Lengths of vectors."""
+    return xy.square().sum(-1).sqrt()
+
+
+def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
+    """Points with those that hold a NaN or an infinity at the origin, and which did not."""
+    points = floating(points)
+    finite = points.isfinite().all(-1)
+    return torch.where(finite[..., None], points, 0.0), finite

@@ -1,0 +1,257 @@
+"""Rig files with wide lenses: pixels of world points against each tool's own formula, in numpy and its own pixels."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Curved, Distortion, Rig
+from arraygeom.io import RigFileError, RigFileWarning, read_rig, recognise, write_rig
+from tests.arraygeom.test_central_lenses import FORMULAS
+from tests.arraygeom.test_io import FIXTURES
+
+POINTS = np.array([[0.3, -0.2, 1.5], [-0.6, 0.4, 1.2], [0.05, 0.02, 3.0], [1.0, 0.3, 1.4], [-0.9, -0.8, 2.0]])
+
+
+def pixels(rig: Rig, name: str, X: np.ndarray) -> np.ndarray:
+    found = rig[name].project(torch.from_numpy(X))
+    assert found.valid.all()
+    return found.x.numpy()
+
+
+def through(model: str, c, focal, centre, X: np.ndarray) -> np.ndarray:
+    return FORMULAS[model][0](X, *c)[0] * focal + centre
+
+
+KALIBR = {
+    "cam0": ("unified", (1.2, -0.1, 0.02, 0.001, -0.002), (400, 402), (319.5, 239.5)),
+    "cam1": ("double-sphere", (-0.2, 0.57), (180, 181), (320, 240)),
+    "cam2": ("extended-unified", (0.6, 1.1), (200, 201), (321, 241)),
+    "cam3": ("fov", (0.92,), (300, 301), (318, 238)),
+}
+
+
+def test_kalibrs_wide_cameras():
+    """cam n is 0.1 m further right; Kalibr's pixels are ours."""
+    rig = read_rig(FIXTURES / "kalibr_wide.yaml")
+    for i, (name, lens) in enumerate(KALIBR.items()):
+        expected = through(*lens, POINTS - [0.1 * i, 0, 0])
+        np.testing.assert_allclose(pixels(rig, name, POINTS), expected, atol=1e-9)
+
+
+def test_colmaps_wide_cameras():
+    """COLMAP's first pixel has its centre at 0.5."""
+    rig = read_rig(FIXTURES / "colmap_wide")
+    prism = (0.05, -0.01, 0.001, -0.002, 0.003, -0.0005, 0.001, -0.0007)
+    left = through("fov", (0.92,), (400, 404), (320, 240), POINTS) - 0.5
+    right = through("thin-prism-fisheye", prism, (260, 262), (321, 239), POINTS - [0.1, 0, 0]) - 0.5
+    np.testing.assert_allclose(pixels(rig, "left.png", POINTS), left, atol=1e-9)
+    np.testing.assert_allclose(pixels(rig, "right.png", POINTS), right, atol=1e-9)
+
+
+@pytest.mark.parametrize(("file", "format"), [("kalibr_wide.yaml", "kalibr"), ("colmap_wide", "colmap")])
+def test_wide_lenses_survive_writing(file, format, tmp_path):
+    rig = read_rig(FIXTURES / file)
+    for written in ("native", format):
+        path = tmp_path / ("model" if written == "colmap" else f"{written}.yaml")
+        write_rig(rig, path, format=written)
+        again = read_rig(path)
+        for mine, theirs in zip(rig.cameras.values(), again.cameras.values()):
+            assert mine.distortion.model == theirs.distortion.model
+            torch.testing.assert_close(mine.distortion.coefficients, theirs.distortion.coefficients)
+            torch.testing.assert_close(mine.K, theirs.K)
+
+
+def metashape_frame(X, f, cx, cy, b1, b2, k, p):
+    """The manual's appendix of camera models: frame cameras. Pixels with the first centre at 0.5."""
+    x, y = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2]
+    return metashape_polynomials(x, y, f, cx, cy, b1, b2, k, p)
+
+
+def metashape_fisheye(X, f, cx, cy, b1, b2, k, p):
+    x0, y0 = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2]
+    r0 = np.sqrt(x0**2 + y0**2)
+    return metashape_polynomials(x0 * np.arctan(r0) / r0, y0 * np.arctan(r0) / r0, f, cx, cy, b1, b2, k, p)
+
+
+def metashape_polynomials(x, y, f, cx, cy, b1, b2, k, p):
+    r = np.sqrt(x**2 + y**2)
+    radial = 1 + k[0] * r**2 + k[1] * r**4 + k[2] * r**6 + k[3] * r**8
+    xd = x * radial + p[0] * (r**2 + 2 * x**2) + 2 * p[1] * x * y
+    yd = y * radial + p[1] * (r**2 + 2 * y**2) + 2 * p[0] * x * y
+    return np.stack([640 * 0.5 + cx + xd * f + xd * b1 + yd * b2, 480 * 0.5 + cy + yd * f], -1)
+
+
+def test_metashape():
+    """Lengths are twice those of the chunk; b's transform is camera->chunk."""
+    assert recognise(FIXTURES / "metashape.xml") == "metashape"
+    with pytest.warns(RigFileWarning, match="1 cameras that are not aligned"):
+        rig = read_rig(FIXTURES / "metashape.xml")
+    assert rig.names == ("a.jpg", "b.jpg")
+    one = metashape_frame(POINTS, 500, 3.5, -2.25, 1.5, 0.75, (-0.1, 0.02, -0.003, 0), (0.001, -0.002)) - 0.5
+    np.testing.assert_allclose(pixels(rig, "a.jpg", POINTS), one, atol=1e-9)
+    R = np.array([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
+    ahead = POINTS @ R.T + 2 * np.array([0.05, 0.01, 0.02])
+    two = metashape_fisheye(POINTS, 260, 1, -1, 0, 0, (0.05, -0.01, 0.003, -0.0005), (0.001, -0.002)) - 0.5
+    np.testing.assert_allclose(pixels(rig, "b.jpg", ahead), two, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ('<calibration type="fisheye"', '<calibration type="equisolid_fisheye"', "type 'equisolid_fisheye'; frame and"),
+        ("<p2>-0.002</p2>", "<p2>-0.002</p2><p3>0.1</p3>", "optimise the cameras without them"),
+        ("<f>500</f>", "", "sensor 0: has no f"),
+        ("<f>500</f>", "<f>five</f>", "sensor 0 f: holds something other than numbers"),
+        ('sensor_id="1"', 'sensor_id="7"', "b.jpg: is of sensor '7'"),
+        ("</chunk>", "</chunk><chunk></chunk>", "chunk: occurs 2 times"),
+        ("</cameras>", "", "is not XML"),
+        ("<document", "<!DOCTYPE a [<!ENTITY b 'c'>]><document", "defines entities"),
+        ("<cameras", "<a>" * 200 + "<cameras", "nested more than"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::arraygeom.io.RigFileWarning")
+def test_metashapes_mistakes(old, new, message, tmp_path):
+    text = (FIXTURES / "metashape.xml").read_text()
+    assert old in text
+    (tmp_path / "m.xml").write_text(text.replace(old, new))
+    with pytest.raises(RigFileError, match=message):
+        read_rig(tmp_path / "m.xml")
+
+
+def matlab_ray(u, v, a, centre, stretch):
+    """MATLAB's fisheyeIntrinsics, pixels from 1: a pixel to its direction."""
+    u, v = np.linalg.inv(stretch) @ (np.array([u, v]) - centre)
+    r = np.hypot(u, v)
+    ray = np.array([u, v, a[0] + a[1] * r**2 + a[2] * r**3 + a[3] * r**4])
+    return ray / np.linalg.norm(ray)
+
+
+def test_matlabs_fisheye():
+    rig = read_rig(FIXTURES / "matlab_fisheye.json")
+    camera = rig["camera1"]
+    assert camera.hw == (480, 640)
+    stretch = np.array([[1.001, 0.0005], [-0.0003, 1]])
+    for x, y in ((0.0, 0.0), (320.5, 238.0), (639.0, 100.0), (50.25, 470.0)):
+        expected = matlab_ray(x + 1, y + 1, (300.0, -0.0009, 4e-7, -6e-10), (321.5, 239.25), stretch)
+        ray, valid = camera.rays(torch.tensor([x, y], dtype=torch.float64))
+        assert valid
+        np.testing.assert_allclose(ray.numpy(), expected, atol=1e-12)
+        back = camera.project(torch.from_numpy(expected * 3))
+        np.testing.assert_allclose(back.x.numpy(), [x, y], atol=1e-8)
+
+
+def bouguet_pixels(X, fc, cc, alpha, kc):
+    """project_points2.m: pixels from 0."""
+    x, y = X[:, 0] / X[:, 2], X[:, 1] / X[:, 2]
+    r2 = x**2 + y**2
+    cdist = 1 + kc[0] * r2 + kc[1] * r2**2 + kc[4] * r2**3
+    dx = 2 * kc[2] * x * y + kc[3] * (r2 + 2 * x**2)
+    dy = kc[2] * (r2 + 2 * y**2) + 2 * kc[3] * x * y
+    xd, yd = x * cdist + dx, y * cdist + dy
+    return np.stack([fc[0] * (xd + alpha * yd) + cc[0], fc[1] * yd + cc[1]], -1)
+
+
+BOUGUET = {"fc": [[800.0], [802.0]], "cc": [[320.5], [238.0]], "kc": [[-0.2], [0.1], [0.001], [-0.002], [0.01]]}
+
+
+def test_bouguets_results(tmp_path):
+    from scipy.io import savemat
+
+    om = np.array([[0.01], [0.1], [-0.02]])
+    numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
+    numbers |= {
+        "alpha_c_left": 0.001,
+        "alpha_c_right": 0.0,
+        "om": om,
+        "T": [[-100.0], [2.0], [1.0]],
+        "nx": 640,
+        "ny": 480,
+    }
+    savemat(tmp_path / "Calib_Results_stereo.mat", numbers)
+    rig = read_rig(tmp_path / "Calib_Results_stereo.mat")
+    flat = [np.ravel(value) for value in BOUGUET.values()]
+    np.testing.assert_allclose(
+        pixels(rig, "left", POINTS), bouguet_pixels(POINTS, *flat[:2], 0.001, flat[2]), atol=1e-9
+    )
+    angle, axis = np.linalg.norm(om), np.ravel(om) / np.linalg.norm(om)
+    cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
+    R = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    right = POINTS @ R.T + [-0.1, 0.002, 0.001]
+    np.testing.assert_allclose(pixels(rig, "right", POINTS), bouguet_pixels(right, *flat[:2], 0.0, flat[2]), atol=1e-9)
+    savemat(tmp_path / "Calib_Results.mat", {**BOUGUET, "alpha_c": 0.0, "nx": 640, "ny": 480, "KK": np.eye(3)})
+    one = read_rig(tmp_path / "Calib_Results.mat")
+    assert (one.names, one["camera"].hw) == (("camera",), (480, 640))
+    np.testing.assert_allclose(
+        pixels(one, "camera", POINTS), bouguet_pixels(POINTS, *flat[:2], 0.0, flat[2]), atol=1e-9
+    )
+
+
+def test_a_rotation_vector_of_no_rotation(tmp_path):
+    from scipy.io import savemat
+
+    numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
+    savemat(tmp_path / "a.mat", {**numbers, "om": [0, 1e300, 0], "T": [1.0, 0, 0], "nx": 640, "ny": 480})
+    with pytest.raises(RigFileError, match=r"rotation vector of 1e\+300; it is in radians"):
+        read_rig(tmp_path / "a.mat")
+
+
+def test_nerfstudios_fisheye(tmp_path):
+    """OPENCV_FISHEYE is Kannala-Brandt's; pixels with the first centre at 0.5, OpenGL axes, camera->world."""
+    fields = {"camera_model": "OPENCV_FISHEYE", "fl_x": 300, "fl_y": 301, "cx": 320, "cy": 240, "w": 640, "h": 480}
+    fields |= {"k1": 0.05, "k2": -0.01, "k3": 0.003, "k4": -5e-4}
+    matrix = [[1, 0, 0, 0.1], [0, -1, 0, 0.2], [0, 0, -1, 0.3], [0, 0, 0, 1]]
+    fields["frames"] = [{"file_path": "a.png", "transform_matrix": matrix}]
+    (tmp_path / "transforms.json").write_text(json.dumps(fields))
+    X = POINTS - [0.1, 0.2, 0.3]
+    r = np.hypot(X[:, 0], X[:, 1])
+    theta = np.arctan2(r, X[:, 2])
+    radius = theta * (1 + 0.05 * theta**2 - 0.01 * theta**4 + 0.003 * theta**6 - 5e-4 * theta**8)
+    expected = X[:, :2] / r[:, None] * radius[:, None] * [300, 301] + [319.5, 239.5]
+    np.testing.assert_allclose(pixels(read_rig(tmp_path / "transforms.json"), "a.png", POINTS), expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        (
+            "kalibr_wide.yaml",
+            "[-0.2, 0.57, 180.0",
+            "[-1.2, 0.57, 180.0",
+            r"cam1.intrinsics: is \[-1.2, 0.57\], which no",
+        ),
+        ("kalibr_wide.yaml", "[0.92]", "[4.0]", r"cam3.distortion_coeffs: is \[4.0\], which no fov lens has"),
+        ("kalibr_wide.yaml", "[0.92]", "[0.92, 1]", "cam3.distortion_coeffs: has 2 numbers, wanted 1"),
+        ("kalibr_wide.yaml", "[1.2, 400.0,", "[400.0,", "cam0.intrinsics: has 4 numbers, wanted 5"),
+        ("colmap_wide/cameras.txt", "240 0.92", "240 3.5", "line 4: is"),
+        (
+            "colmap_wide/cameras.txt",
+            "FOV",
+            "RAD_TAN_THIN_PRISM_FISHEYE",
+            "line 4: has model RAD_TAN.*calibrate with one of",
+        ),
+        ("matlab_fisheye.json", "[300.0, ", "[-300.0, ", "MappingCoefficients: begins with -300; it is positive"),
+        ("matlab_fisheye.json", "[300.0, ", "[", "MappingCoefficients: has 3 numbers, wanted 4"),
+    ],
+)
+def test_what_no_lens_has_is_named(file, old, new, message, tmp_path):
+    import shutil
+
+    text = (FIXTURES / file).read_text()
+    assert old in text
+    target = tmp_path / file
+    target.parent.mkdir(exist_ok=True)
+    if "/" in file:
+        shutil.copytree((FIXTURES / file).parent, target.parent, dirs_exist_ok=True)
+    target.write_text(text.replace(old, new))
+    with pytest.raises(RigFileError, match=message):
+        read_rig(target)
+
+
+def test_fields_work_with_what_was_read():
+    rig = read_rig(FIXTURES / "kalibr_wide.yaml").replace(depth=(1.0, 10.0))
+    for alpha, beta in (("cam0", "cam1"), ("cam1", "cam2"), ("cam3", "cam0")):
+        found = Curved(32)(rig.pair(alpha, beta), torch.tensor([[320.0, 240.0], [200.0, 300.0]]))
+        assert found.mask.all(-1).all()
+        assert isinstance(rig[beta].distortion, Distortion)
