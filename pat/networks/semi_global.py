@@ -332,18 +332,8 @@ def diffused_from(
     matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b fills c h w"]:
     """Bands diffused by weight over what is connected in alpha, in each of the `FILLS` ways."""
-    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(weight[:, 0]), to_bytes(alpha[:, 0])))
-    diffused = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
-
-    def along_brightness(i: int) -> None:
-        diffused[i, 0] = _regressed(*planes[i], COLOUR_FILL)
-
-    def as_it_is(i: int) -> None:
-        colour, _, weight, like = planes[i]
-        diffused[i, 1] = filled(colour, weight, like, COLOUR_FILL)
-
-    in_parallel([partial(how, i) for i in range(len(planes)) for how in (along_brightness, as_it_is)])
-    return torch.from_numpy(diffused).to(alpha)
+    planes = zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(weight[:, 0]), to_bytes(alpha[:, 0]))
+    return torch.from_numpy(np.stack([_diffused(*one) for one in planes])).to(alpha)
 
 
 def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
@@ -366,18 +356,21 @@ def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1
     return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
 
 
-def _regressed(
-    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]
+def _diffused(
+    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray[np.uint8]
 ) -> NDArray[np.float32]:
-    """Colour (c, h, w) by its weighted regression on brightness (h, w), over what is connected in the guide.
+    """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on brightness
+    (h, w), and as it is.
 
     The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no beta sees
     has colour that varies with brightness as it does nearby.
     """
-    moments = filled(np.stack([brightness, brightness**2, *colour, *(colour * brightness)]), weight, guide, how)
-    mean, square, (middle, product) = moments[0], moments[1], np.split(moments[2:], 2)
-    slope = (product - middle * mean) / (np.maximum(square - mean**2, 0) + FLOOR)
-    return middle + slope * np.clip(brightness - mean, -0.3, 0.3)
+    bands = len(colour)
+    totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, COLOUR_FILL)
+    products = smoothed([weight * brightness * p for p in colour], guide, COLOUR_FILL)
+    out = np.empty((FILLS, *colour.shape), np.float32)
+    in_parallel([partial(kernels.regression, brightness, totals, products, i, FLOOR, out) for i in range(bands)])
+    return out
 
 
 def matches(
@@ -405,11 +398,15 @@ def _enlarged(x: Tensor) -> Tensor:
 def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, float]) -> NDArray:
     """The weighted mean of planes (c, h, w) over what is connected in the guide. Weights are positive."""
 
-    def smooth(plane: NDArray) -> NDArray:
-        return cv2.ximgproc.fastGlobalSmootherFilter(guide, np.ascontiguousarray(plane, np.float32), *how)
+    total, *sums = smoothed([weight, *(plane * weight for plane in planes)], guide, how)
+    return np.stack([plane / total for plane in sums])
 
-    total = smooth(weight)
-    return np.stack([smooth(plane * weight) / total for plane in planes])
+
+def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[float, float]) -> list[NDArray]:
+    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several threads, but
+    has its own."""
+    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
+    return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
 
 
 def _numpy(x: Tensor) -> NDArray[np.float32]:
