@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel fuzz transformations
+.PHONY: help env synthesis demo showcase readme test test-long check format bench bench-job train notebooks docs drawings wheel fuzz transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -19,6 +19,7 @@ help:
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
+	@echo "make bench-job  measure pat fuse as a command; QUICK=1: one size, a minute"
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
 	@echo "make train      train on the images at hand; ARGS=... goes to 'pat train'"
@@ -71,6 +72,9 @@ synthesis: $(READY)
 bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
 	@$(BIN)/python -m tests.benchmarks.bench_training
+
+bench-job: $(READY)
+	@$(BIN)/python -m tests.benchmarks.bench_job $(if $(QUICK),--quick)
 
 fuzz: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/fuzzing.md

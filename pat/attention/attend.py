@@ -274,8 +274,7 @@ def _attend_chunks(
     step = max(1, CHUNK_SAMPLES // (first.xy.numel() // 2))
     again = partial(checkpoint, chunk, use_reentrant=False) if torch.is_grad_enabled() else chunk
     chunks = [
-        again(query[:, :, top : top + step], key, value, _bias_rows(bias, top, step), top)
-        for top in range(0, ha, step)
+        again(query[:, :, top : top + step], key, value, _bias_rows(bias, top, step), top) for top in range(0, ha, step)
     ]
     values, positions, spreads, peaks = zip(*chunks)
     if not measured:

@@ -357,7 +357,11 @@ def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1
 
 
 def _diffused(
-    colour: NDArray, brightness: NDArray, weight: NDArray, guide: NDArray[np.uint8]
+    colour: NDArray,
+    brightness: NDArray,
+    weight: NDArray,
+    guide: NDArray[np.uint8],
+    how: tuple[float, float] = COLOUR_FILL,
 ) -> NDArray[np.float32]:
     """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on brightness
     (h, w), and as it is.
@@ -366,8 +370,8 @@ def _diffused(
     has colour that varies with brightness as it does nearby.
     """
     bands = len(colour)
-    totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, COLOUR_FILL)
-    products = smoothed([weight * brightness * p for p in colour], guide, COLOUR_FILL)
+    totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, how)
+    products = smoothed([weight * brightness * p for p in colour], guide, how)
     out = np.empty((FILLS, *colour.shape), np.float32)
     in_parallel([partial(kernels.regression, brightness, totals, products, i, FLOOR, out) for i in range(bands)])
     return out
