@@ -114,4 +114,5 @@ $(READY): pyproject.toml constraints.txt
 	@$(PIP) torch
 	@echo "== installing the rest"
 	@$(PIP) --editable '.[dev]'
+	@$(BIN)/pat warm-up
 	@touch $@

@@ -43,8 +43,8 @@ def curved_positions(begin, end, first, last, valid, lens, even, fractions, hw, 
             _project(first[p], last[p], s_at, lens, x_at, y_at, seen_at)
         right, bottom = hw[1] - 0.5, hw[0] - 0.5
         for i in range(samples):
-            near = (-0.5 - FARTHEST_OFF < x_at[i]) & (x_at[i] < right + FARTHEST_OFF)
-            near = near & (-0.5 - FARTHEST_OFF < y_at[i]) & (y_at[i] < bottom + FARTHEST_OFF)
+            near = (x_at[i] > -0.5 - FARTHEST_OFF) & (x_at[i] < right + FARTHEST_OFF)
+            near = near & (y_at[i] > -0.5 - FARTHEST_OFF) & (y_at[i] < bottom + FARTHEST_OFF)
             counts = (total > 0) & near & seen_at[i]
             mask[p, i] = counts
             xy[p, i, 0] = min(max(x_at[i], -0.5), right) if counts else 0.0

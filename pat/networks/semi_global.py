@@ -30,8 +30,10 @@ from . import semi_global_kernels as kernels
 FINE = 2
 """Matching is done on images this many times smaller."""
 BLOCK = 320
-"""Side of the squares processed at a time, in pixels of the reduced images."""
+"""Sides of what is processed at a time, in pixels of the reduced images."""
 MOST_MARGIN = 192
+MOST_COSTS = 2**25
+"""Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
 CONSISTENT = 0.2
 """A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
 LIKENESS = 0.08
@@ -223,11 +225,12 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
 def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Inner and outer squares: the result, and what is computed for it."""
     margin = min(labels + 32, MOST_MARGIN)
-    for top in range(0, hw[0], BLOCK):
+    rows = hw[0] if hw[0] * (BLOCK + 2 * margin) * labels <= MOST_COSTS else BLOCK
+    for top in range(0, hw[0], rows):
         for left in range(0, hw[1], BLOCK):
-            inner = slice(top, min(top + BLOCK, hw[0])), slice(left, min(left + BLOCK, hw[1]))
+            inner = slice(top, min(top + rows, hw[0])), slice(left, min(left + BLOCK, hw[1]))
             outer = (
-                slice(max(top - margin, 0), top + BLOCK + margin),
+                slice(max(top - margin, 0), top + rows + margin),
                 slice(max(left - margin, 0), left + BLOCK + margin),
             )
             yield inner, outer

@@ -174,8 +174,9 @@ def main() -> None:
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     text = (
         f"# The main job, measured\n\n`pat fuse` as a process, imports and written files included. "
-        f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {threads} threads; load {load:.1f} before, {os.getloadavg()[0]:.1f} "
-        f"after; medians of {runs} runs (4024x3036: one), in turn with the others. Written by `make bench-job`.\n\n"
+        f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {threads} threads; "
+        f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after; "
+        f" medians of {runs} runs (4024x3036: one), in turn with the others. Written by `make bench-job`.\n\n"
         f"{table(COLUMNS, rows)}\nWhere the time goes: share of the seconds, and seconds of a core. Each part without "
         f"those within it.\n\n{table(('', *STAGE_NAMES), stages)}"
     )
