@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
+from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image, sample
 
 from ..media.colour import to_bytes
@@ -190,8 +191,22 @@ def normalised_at_matches(
 def box_mean(x: Tensor, radius: int) -> Tensor:
     """Over squares around each pixel, as far as these are on the image."""
     side = 2 * radius + 1
+    if compilable(x) and not x.requires_grad:
+        return _box_mean_of_numbers(x, radius)
     rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
     return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
+
+
+def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
+    """The same by OpenCV's running sums: a third of the time."""
+    planes = x.detach().contiguous().flatten(0, -3).numpy()
+    counts = [np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1 for n in planes.shape[1:]]
+    share = (1 / (counts[0][:, None] * counts[1])).astype(planes.dtype)
+    out = np.empty_like(planes)
+    for plane, target in zip(planes, out):
+        sums = cv2.boxFilter(plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        np.multiply(sums, share, out=target)
+    return torch.from_numpy(out).view(x.shape)
 
 
 def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
