@@ -1,4 +1,4 @@
-"""Functions compiled by numba, and where it keeps what it compiled. Importing this imports numba."""
+"""Functions compiled by numba, and where it keeps what it compiled."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from functools import cache
 from typing import Any
 from uuid import uuid4
 
-from numba import njit
-
 
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
 
     Where there is no folder that can be written, what `cache` asks to keep is compiled by each process.
     """
+    from numba import njit
+
     if function is None:
         return lambda function: compiled(function, **options)
     try:

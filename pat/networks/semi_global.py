@@ -334,7 +334,7 @@ def diffused_from(
 ) -> Float[Tensor, "b fills c h w"]:
     """Bands diffused by weight over what is connected in alpha, in each of the `FILLS` ways."""
     planes = zip(numpy_of(matched), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
-    return torch.fromnumpy_of(np.stack([_diffused(*one) for one in planes])).to(alpha)
+    return torch.from_numpy(np.stack([_diffused(*one) for one in planes])).to(alpha)
 
 
 def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
