@@ -8,7 +8,7 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme test test-long check format bench train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
@@ -19,6 +19,7 @@ help:
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
+	@echo "make bench-job  measure pat fuse as a command; QUICK=1: one size, a minute"
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
 	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
@@ -73,6 +74,9 @@ bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_attention
 	@$(BIN)/python -m tests.benchmarks.bench_training
 
+bench-job: $(READY)
+	@$(BIN)/python -m tests.benchmarks.bench_job $(if $(QUICK),--quick)
+
 fuzz: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/fuzzing.md
 
@@ -114,4 +118,5 @@ $(READY): pyproject.toml constraints.txt
 	@$(PIP) torch
 	@echo "== installing the rest"
 	@$(PIP) --editable '.[dev]'
+	@$(BIN)/pat warm-up
 	@touch $@

@@ -28,7 +28,8 @@ class Batched:
     @property
     def batch_shape(self) -> torch.Size:
         """The batch axes, empty for one item."""
-        return torch.broadcast_shapes(*(t.shape[: t.ndim - axes] for t, axes in tensors_of(self)))
+        shapes = [t.shape[: t.ndim - axes] for t, axes in tensors_of(self) if t.ndim > axes]
+        return torch.broadcast_shapes(*shapes) if shapes else torch.Size()  # its first call imports sympy
 
     def __len__(self) -> int:
         return self._batched()[0]

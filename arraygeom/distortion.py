@@ -152,6 +152,12 @@ class Distortion(Batched):
     def _text(self) -> str:
         return distortion_text(self)
 
+    @property
+    def squared_limit(self) -> float:
+        """Up to where one lens is valid: a squared normalised radius, or a squared angle (Kannala-Brandt)."""
+        c = self.coefficients.detach()
+        return float(_fisheye_limit(c) if self.model == KANNALA_BRANDT else _brown_limit(_Brown.named(c)))
+
     def _lifted(self, points: Tensor) -> Tensor:
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""
         c = self.coefficients

@@ -51,7 +51,8 @@ class Segments(Batched):
     @property
     def length(self) -> Float[Tensor, "*n"]:
         """Length in pixels. Differentiable, also at zero length (where the gradient is zero)."""
-        squared = (self.end - self.start).square().sum(-1)
+        x, y = (self.end - self.start).unbind(-1)  # a sum over an axis of two takes four times as long
+        squared = x * x + y * y
         positive = squared > 0
         return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
 

@@ -7,7 +7,9 @@ def main() -> None:
     """Run `pat`; an interruption while it is still being imported is one line, too."""
     try:
         from .cli.main import main as command
+        from .support.memory import keep_freed
 
+        keep_freed()
         command()
     except KeyboardInterrupt:
         print("pat: interrupted", file=sys.stderr)

@@ -120,7 +120,12 @@ def imported_at_once(path: Path) -> set[str]:
 
 
 GEOMETRY_NEEDS = {"torch", "kornia", "numpy", "yaml", "jaxtyping", *sys.stdlib_module_names}
-GEOMETRY_MAY_USE = {"opencv.py": {"cv2"}, "matfile.py": {"scipy"}, "viz.py": {"matplotlib", "plotly"}}
+GEOMETRY_MAY_USE = {
+    "compiled.py": {"numba"},
+    "opencv.py": {"cv2"},
+    "matfile.py": {"scipy"},
+    "viz.py": {"matplotlib", "plotly"},
+}
 """What single files of arraygeom import when it is needed, and say so in one line where it is not there."""
 
 

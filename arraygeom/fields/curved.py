@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
@@ -16,9 +19,10 @@ from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
 from ..segments import Positions, Segments, fractions_on_image, sample_fractions
+from ..threads import in_parallel
 from ..tracing import traced
 from ..undistortion import pinhole_view
-from .protocol import ReceptiveField
+from .protocol import ReceptiveField, compilable
 from .straight import Epipolar
 
 
@@ -45,6 +49,8 @@ class Curved:
         near, far = Epipolar(self.near, self.far).bounds(pair)
         x = floating(x)
         curve = _Curve.of(pair, near, far, x)
+        if curve.compilable:
+            return curve.positions(self.nodes, self.samples)
         even = torch.linspace(0, 1, self.nodes, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1)
         nodes, seen = curve.at(even)
         pieces = visible_pieces(nodes, seen & curve.valid[..., None], pair.beta.hw)
@@ -151,6 +157,33 @@ class _Curve(NamedTuple):
         first, last = (points.a + v[..., None] * points.b for v in ends)
         return cls(first, last, ahead & part.valid, beta, beta.distortion is not None and limits is None)
 
+    @property
+    def compilable(self) -> bool:
+        """Whether a compiled loop can follow the curve: on the CPU, of one pair, and no gradient is asked for."""
+        lens = self.beta.distortion
+        numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
+        free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
+        tilted = lens is not None and lens.coefficients.shape[-1] == 14
+        return not free and not tilted and not self.beta.batch_shape and compilable(self.first)
+
+    def positions(self, nodes: int, samples: int) -> Positions:
+        """What `Curved` gives, by a compiled loop in float64."""
+        from .curve_kernels import curved_positions
+
+        like, n = self.first, self.valid.numel()
+        xy = np.empty((n, samples, 2), f"f{like.dtype.itemsize}")
+        mask = np.empty((n, samples), bool)
+        ends = (t.detach().double().reshape(n, 3).contiguous().numpy() for t in (self.first, self.last))
+        double = like.new_empty(0, dtype=torch.float64)
+        fractions = (torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double))
+        given = (*ends, self.valid.reshape(n).contiguous().numpy(), LensNumbers.of(self.beta, wide=self.wide))
+        rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
+        in_parallel([partial(curved_positions, i, min(i + PIECE, n), *given, *rest) for i in range(0, n, PIECE)])
+        axes = self.valid.shape
+        return Positions(
+            torch.from_numpy(xy).reshape(*axes, samples, 2), torch.from_numpy(mask).reshape(*axes, samples)
+        )
+
     def at(self, fraction: Tensor) -> tuple[Tensor, Tensor]:
         """Beta's pixels (*n, l, 2) at fractions (*n, l) of the way from first to last, and which it can see."""
         weights = self._weights_in_angle(fraction) if self.wide else self._weights_in_pixels(fraction)
@@ -174,6 +207,29 @@ class _Curve(NamedTuple):
         return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
 
 
+class LensNumbers(NamedTuple):
+    """A camera as the compiled loop knows it: 0 pinhole, 1 Brown-Conrady, 2 Kannala-Brandt; float64."""
+
+    model: int
+    c: NDArray[np.float64]
+    limit: float
+    K: NDArray[np.float64]
+    wide: bool
+
+    @classmethod
+    def of(cls, camera: Camera, *, wide: bool) -> LensNumbers:
+        """Of one camera."""
+        K, lens = camera.K.detach().double().numpy(), camera.distortion
+        if lens is None:
+            return cls(0, np.zeros(14), 0.0, np.ascontiguousarray(K), wide)
+        c = lens.coefficients.detach().double()
+        padded = np.zeros(14)
+        padded[: len(c)] = c.numpy()
+        return cls(1 + (lens.model == KANNALA_BRANDT), padded, lens.squared_limit, np.ascontiguousarray(K), wide)
+
+
+PIECE = 1 << 12
+"""Pixels of alpha that a thread takes at a time."""
 TINY = 1e-24
 """Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction."""
 

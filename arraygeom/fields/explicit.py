@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
-from ..pixels import floating, pixel_grid
+from ..pixels import HW, floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions
+from ..threads import in_parallel
 from ..tracing import traced
+from .protocol import compilable
 from .straight import require_straight
 
 
@@ -39,7 +43,11 @@ class NearestVoxels:
         usable = placed & (line != 0).any(-1)
         axes = usable.shape
         line, centre = line.expand(*axes, 3), centre.round().expand(*axes, 2)
-        xy, mask = self._nearest(line.reshape(-1, 3), centre.reshape(-1, 2), pair)
+        line, centre = line.reshape(-1, 3), centre.reshape(-1, 2)
+        if compilable(line):
+            xy, mask = self._compiled(line, centre, usable.reshape(-1), pair.beta.hw)
+            return Positions(xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1))
+        xy, mask = self._nearest(line, centre, pair)
         xy, mask = xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1) & usable[..., None]
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
@@ -53,6 +61,18 @@ class NearestVoxels:
         unsure = (distance.amax(-1) > disparity - TIE).nonzero()[:, 0]
         for some in unsure.split(64):
             xy[some], mask[some], _ = self._choose(self._window(centre[some]), line[some], centre[some], pair)
+        return xy, mask
+
+    def _compiled(self, line: Tensor, centre: Tensor, usable: Tensor, hw: HW) -> tuple[Tensor, Tensor]:
+        """The same by a compiled loop, which keeps no list of candidates of all pixels."""
+        from .kernels import nearest_pixels
+
+        n, size = len(line), line.dtype.itemsize
+        xy = torch.from_numpy(np.empty((n, self.count, 2), f"f{size}"))
+        mask = torch.from_numpy(np.empty((n, self.count), bool))
+        numbers = [part.contiguous().numpy() for part in (line, centre, usable)]
+        rest = (self.window, xy.numpy().dtype.type(TIE / (hw[0] * hw[1])), hw, xy.numpy(), mask.numpy())
+        in_parallel([partial(nearest_pixels, i, min(i + PIECE, n), *numbers, *rest) for i in range(0, n, PIECE)])
         return xy, mask
 
     def _choose(self, xy: Tensor, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
@@ -89,6 +109,8 @@ class NearestVoxels:
         return centre[:, None] + grid.reshape(-1, 2)
 
 
+PIECE = 1 << 14
+"""Pixels of alpha that a thread takes at a time."""
 TIE = 1e-3
 """Distances closer than this, in pixels, count as equal."""
 

@@ -13,6 +13,7 @@ from ..camera import Camera
 from ..pixels import floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
+from ..tracing import traced, transformations
 
 SamplingLocations = Segments | Positions
 
@@ -52,6 +53,12 @@ def _numbers(pair: Pair) -> Tensor | None:
     if isinstance(pair.alpha, Camera):
         return pair.alpha.K
     return None if pair.link is None else pair.link.F
+
+
+def compilable(x: Tensor) -> bool:
+    """Whether compiled loops can take a tensor: plain numbers on the CPU that nothing follows."""
+    followed = traced() or transformations() or torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack()
+    return type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and not followed
 
 
 CHUNK = 1 << 15

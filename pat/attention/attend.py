@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Literal
 
 import torch
@@ -271,17 +272,9 @@ def _attend_chunks(
         return run(q, k, v, given, part)
 
     step = max(1, CHUNK_SAMPLES // (first.xy.numel() // 2))
+    again = partial(checkpoint, chunk, use_reentrant=False) if torch.is_grad_enabled() else chunk
     chunks = [
-        checkpoint(
-            chunk,
-            query[:, :, top : top + step],
-            key,
-            value,
-            _bias_rows(bias, top, step),
-            top,
-            use_reentrant=False,
-        )
-        for top in range(0, ha, step)
+        again(query[:, :, top : top + step], key, value, _bias_rows(bias, top, step), top) for top in range(0, ha, step)
     ]
     values, positions, spreads, peaks = zip(*chunks)
     if not measured:

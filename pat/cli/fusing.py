@@ -380,6 +380,26 @@ class Demo:
         say(f"written: {', '.join(map(str, [*written, self.out / 'demo.png']))}")
 
 
+@dataclass
+class WarmUp:
+    """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for it."""
+
+    def run(self) -> None:
+        from arraygeom.compiled import cache_folder
+
+        from ..attention.kernels import forward
+        from ..data.sample_array import ALPHA, load_sample
+        from ..fusion.fuse import fuse
+        from ..networks.weights import load_weights
+
+        options.say_when_compiling()
+        sample, begin = load_sample(), time.monotonic()
+        fuse(load_weights("mono-colour"), sample.rig, sample.images, alpha=ALPHA)
+        folder = cache_folder(forward)
+        kept = "" if folder is None else f", kept in {folder}"
+        say(f"kernels are ready: {time.monotonic() - begin:.0f} s{kept}")
+
+
 def is_rig_file(path: Path) -> bool:
     """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
     suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES

@@ -28,6 +28,7 @@ class Pat:
         "board": calibration.PrintBoard,
         "rig": rigs.RigCommands,
         "demo": fusing.Demo,
+        "warm-up": fusing.WarmUp,
     }
     authors: ClassVar[Mapping[str, Any]] = {
         "evaluate": authors.Evaluate,

@@ -285,7 +285,7 @@ def say_when_compiling() -> None:
         def on_start(self, event: object) -> None:
             if not self.said:
                 self.said = True
-                say("compiling kernels for this machine, once")
+                say("compiling kernels for this machine, once (`pat warm-up` does so beforehand)")
 
         def on_end(self, event: object) -> None:
             pass

@@ -37,6 +37,8 @@ FRAME_BYTES = 20.0
 """A fused frame's for each pixel: three colours, depth and confidence."""
 PROBE = (192, 512)
 """Least and greatest side of the piece of alpha that is fused to estimate the time, pixels."""
+ESTIMATED = 4_000_000
+"""Alpha's pixels from which the time is estimated: smaller frames take seconds, and so does estimating."""
 PROBED = 1 / 40
 """The part of alpha that the piece is between these."""
 
@@ -79,7 +81,8 @@ def plan_frame(
     """
     pieces = matching_pieces(frame.hw, network.multiple)
     large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
-    probe = Probe.of(network, frame) if large and (limit or estimate) else None
+    slow = math.prod(frame.hw) > ESTIMATED
+    probe = Probe.of(network, frame) if (large and limit) or (slow and estimate) else None
     held = held_memory(frame, probe.state if probe else 0.0, whole_frame=not stored)
     matching = 0.0 if probe and not probe.state else MATCHING_BYTES * max(area(tile.outer) for tile in pieces)
     tiles = tiles_within(network, frame, limit, held, matching)

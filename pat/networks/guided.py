@@ -21,7 +21,7 @@ from arraygeom import Local, Pair, Segments, View, lazily
 
 from ..attention import Attended, attend, attend_with_statistics
 from ..media.colour import luminance
-from .blocks import ResidualBlock, conv, enlarge
+from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
@@ -201,7 +201,7 @@ class GuidedPAT(nn.Module):
         if not self.config.head_dim:
             return blend
         rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), COARSE)
-        context = self.propagate(torch.cat([own.quarter, rough], 1))
+        context = self.propagate(stacked(own.quarter, rough))
         return blend + self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
@@ -245,8 +245,8 @@ class GuidedPAT(nn.Module):
         matched = torch.cat([avg_pool2d(found.disparity, FINE) / 64, found.facts], 1)
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, COARSE)], 1)
-        context = self.judge(torch.cat([own.quarter, rough], 1))
-        return self.confidence(torch.cat([enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)], 1))
+        context = self.judge(stacked(own.quarter, rough))
+        return self.confidence(stacked(enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)))
 
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
@@ -371,7 +371,7 @@ class Encoder(nn.Module):
 
     def forward(self, image: Float[Tensor, "b 1 h w"]) -> Encoded:
         """Features of an image whose sides are multiples of 8."""
-        half = self.at_half(pixel_unshuffle(image - 0.5, 2))
+        half = self.at_half(channels_last(pixel_unshuffle(image - 0.5, 2)))
         quarter = self.at_quarter(half)
         return Encoded(half, self.merge(quarter + enlarge(self.up(self.at_eighth(quarter)))))
 
@@ -408,4 +408,4 @@ class Head(nn.Module):
 
     def forward(self, fine: Tensor, half: Tensor, context: Tensor) -> Tensor:
         """(B, bands, H, W), from images at full size, features at 1/2 and the context at 1/4."""
-        return pixel_shuffle(self.last(self.start(torch.cat([pixel_unshuffle(fine, 2), half, enlarge(context)], 1))), 2)
+        return pixel_shuffle(self.last(self.start(stacked(pixel_unshuffle(fine, 2), half, enlarge(context)))), 2)

@@ -20,6 +20,8 @@ EDGE = np.float32(8 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
 FARTHEST = np.float32(8)
 """A difference of labels in the left-right check counts as at most this."""
+MOST_BEYOND = np.float32(0.3)
+"""Brightness this far from the mean of what is around counts as no farther in a regression."""
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 
@@ -168,6 +170,22 @@ def winners(total, end, along, length, cut, rows, columns, disparity, facts):
             facts[y, x, 2] = lowest / (8 * LARGE)
 
 
+@compiled(nogil=True, cache=True)
+def regression(brightness, totals, products, band, floor, out):
+    """A band of `pat.networks.semi_global._diffused`, from smoothed sums of weights, and of weights times brightness,
+    its square and each band (totals), and brightness times each band (products)."""
+    total, first, second, colour, product = totals[0], totals[1], totals[2], totals[3 + band], products[band]
+    height, width = brightness.shape
+    for y in range(height):
+        for x in range(width):
+            share = ONE / total[y, x]
+            mean, middle = first[y, x] * share, colour[y, x] * share
+            variance = max(second[y, x] * share - mean * mean, np.float32(0))
+            slope = (product[y, x] * share - middle * mean) / (variance + floor)
+            beyond = min(max(brightness[y, x] - mean, -MOST_BEYOND), MOST_BEYOND)
+            out[0, band, y, x], out[1, band, y, x] = middle + slope * beyond, middle
+
+
 @compiled(inline="always")
 def _claims(total, end, along, length, rows, columns):
     """For each pixel of beta the label of the alpha pixel that matches it at the least cost."""
@@ -207,5 +225,5 @@ def _between(total, best, last):
     return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)
 
 
-for _entry in (census, costs, aggregate, winners):
+for _entry in (census, costs, aggregate, winners, regression):
     separate_cache(_entry)

@@ -7,7 +7,6 @@ from typing import Literal
 
 import torch
 from jaxtyping import Float
-from kornia.color import CFA, raw_to_rgb, rgb_to_raw
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
@@ -17,7 +16,8 @@ from ..media.raw import demosaiced
 from .chain import Step
 
 Pattern = Literal["RGGB", "GRBG", "BGGR", "GBRG"]
-_KORNIA = {"RGGB": CFA.BG, "GRBG": CFA.GB, "BGGR": CFA.RG, "GBRG": CFA.GR}
+_KORNIA = {"RGGB": "BG", "GRBG": "GB", "BGGR": "RG", "GBRG": "GR"}
+"""kornia's names of the patterns. It is imported where it is used: that takes a quarter of a second."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,9 @@ class Mosaic(Step):
     def apply(self, image: Float[Tensor, "b 3 h w"], generator: Generator) -> Float[Tensor, "b 1 h w"]:
         """The raw images. Raises ValueError for odd sizes."""
         _even(image)
-        return rgb_to_raw(image, _KORNIA[self.pattern])
+        from kornia.color import CFA, rgb_to_raw
+
+        return rgb_to_raw(image, CFA[_KORNIA[self.pattern]])
 
 
 @dataclass(frozen=True)
@@ -112,8 +114,10 @@ class Demosaic(Step):
 
     def apply(self, image: Float[Tensor, "b 1 h w"], generator: Generator) -> Float[Tensor, "b 3 h w"]:
         """The images in colour. Raises ValueError for odd sizes."""
+        from kornia.color import CFA, raw_to_rgb
+
         _even(image)
-        bilinear = raw_to_rgb(image, _KORNIA[self.pattern])
+        bilinear = raw_to_rgb(image, CFA[_KORNIA[self.pattern]])
         if self.method == "bilinear":
             return bilinear
         edge_aware = torch.stack([demosaiced(raw, self.pattern) for raw in image.detach()])

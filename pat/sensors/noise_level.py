@@ -9,7 +9,6 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.optimize import nnls
 from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d, conv2d, pad
 
@@ -143,6 +142,8 @@ def _fitted(added_to: AddedTo, value: Float[Tensor, " n"], variance: Float[Tenso
     signal = linear_from_srgb(value) if added_to == "light" else value
     slope = (srgb_from_linear(signal * 1.01 + 1e-4) - value) / (0.01 * signal + 1e-4) if added_to == "light" else 1.0
     design = torch.stack([signal, torch.ones_like(signal)], -1) * (slope**2 / variance.clamp(min=1e-10))[:, None]
+    from scipy.optimize import nnls  # here, as it takes long to import
+
     (shot, read), _ = nnls(design.numpy(), np.ones(len(value)))
     predicted = design @ torch.tensor([shot, read]).to(design)
     error = float(predicted.clamp(min=1e-6).log().square().mean())

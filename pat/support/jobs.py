@@ -228,7 +228,7 @@ def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOu
 
 def _on_dask(tasks: Sequence[Task], workers: Workers) -> Iterator[TaskOutcome]:
     """Outcomes as they come; a task that kills its workers is an outcome too."""
-    for task, future in completed(attempt, [(task, workers.threads) for task in tasks], workers):
+    for task, future in completed(attempt_on_worker, [(task, workers.threads) for task in tasks], workers):
         yield future.result() if future.status == "finished" else TaskOutcome(task[0].makes, why(future))
 
 
@@ -294,6 +294,14 @@ def attempt(task: Task, threads: int) -> TaskOutcome:
             error, raised = f"{failure}", [failure]
     given = [entry.message for entry in caught if isinstance(entry.message, Warning)]
     return TaskOutcome(task.makes, error, (*given, *raised))
+
+
+def attempt_on_worker(task: Task, threads: int) -> TaskOutcome:
+    """`attempt` in a process of Dask's, which does nothing else."""
+    from .memory import keep_freed
+
+    keep_freed()
+    return attempt(task, threads)
 
 
 def cores() -> int:

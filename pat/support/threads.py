@@ -1,35 +1,5 @@
-"""Compiled loops on as many threads as torch may use.
+"""Compiled loops on as many threads as torch may use."""
 
-A plain pool, for loops that release Python's lock: idle threads sleep, so that they do not take the cores from
-torch's own.
-"""
+from arraygeom.threads import in_parallel
 
-from __future__ import annotations
-
-import os
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
-
-import torch
-
-
-def in_parallel(tasks: Sequence[Callable[[], None]]) -> None:
-    """Run tasks on the threads that torch may use, this one included; an error of any of them is raised."""
-    left = iter(tasks)
-
-    def work() -> None:
-        for task in left:
-            task()
-
-    helpers = min(torch.get_num_threads(), len(tasks)) - 1
-    waiting = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
-    work()
-    for future in waiting:
-        future.result()
-
-
-@lru_cache(maxsize=4)
-def _pool(process: int, threads: int) -> ThreadPoolExecutor:
-    """Threads of this process: those of a parent do not live on in its forks."""
-    return ThreadPoolExecutor(threads, thread_name_prefix="pat")
+__all__ = ["in_parallel"]

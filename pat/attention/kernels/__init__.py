@@ -15,6 +15,8 @@ others.
 import hashlib
 from pathlib import Path
 
+from arraygeom.compiled import cache_file
+
 from .backward import backward
 from .channels import scatter
 from .emit import LANES, compiled, separate_cache
@@ -44,7 +46,8 @@ def _watch_all_sources() -> None:
     sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     stamp = hashlib.sha256(sources).hexdigest()
     for entry in (forward, backward, scatter):
-        entry._cache._cache_file._source_stamp = stamp
+        if (file := cache_file(entry)) is not None:
+            file._source_stamp = stamp
         separate_cache(entry)
 
 

@@ -7,19 +7,17 @@ from __future__ import annotations
 
 import inspect
 from typing import Any
-from uuid import uuid4
 
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, models, register_model
 
+from arraygeom.compiled import compiled, separate_cache
+
+__all__ = ["LANES", "Code", "Vector", "accumulated", "compiled", "instruction", "row_of", "separate_cache", "vector_of"]
+
 LANES = 8
-
-
-def compiled(function=None, **options):
-    """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled."""
-    return njit(inspect.unwrap(function), **options) if function else lambda function: compiled(function, **options)
 
 
 class Vector(types.Type):
@@ -156,13 +154,3 @@ def instruction(result):
         return intrinsic(prefer_literal="literal" in notes)(typed)
 
     return decorate
-
-
-def separate_cache(entry: Any) -> None:
-    """Let this process name the files of its compiled code in numba's cache by itself.
-
-    numba counts them. Two processes that compile at once, each for other types, can choose the same number: then the
-    index of one names the code of the other, which is loaded, and computes something else.
-    """
-    file = entry._cache._cache_file
-    file._data_name_pattern = file._data_name_pattern.replace(".nbc", f"-{uuid4().hex}.nbc")

@@ -1,0 +1,57 @@
+"""Functions compiled by numba, and where it keeps what it compiled."""
+
+from __future__ import annotations
+
+import inspect
+import warnings
+from functools import cache
+from typing import Any
+from uuid import uuid4
+
+
+def compiled(function=None, **options):
+    """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
+
+    Where there is no folder that can be written, what `cache` asks to keep is compiled by each process.
+    """
+    from numba import njit
+
+    if function is None:
+        return lambda function: compiled(function, **options)
+    try:
+        return njit(inspect.unwrap(function), **options)
+    except RuntimeError as error:
+        if not options.pop("cache", False) or "no locator" not in str(error):
+            raise
+        _warn_of_no_folder()
+        return njit(inspect.unwrap(function), **options)
+
+
+@cache
+def _warn_of_no_folder() -> None:
+    warnings.warn(
+        "compiled kernels cannot be kept, and each process compiles them again: let NUMBA_CACHE_DIR name a folder "
+        "that can be written",
+        stacklevel=1,
+    )
+
+
+def cache_file(entry: Any) -> Any:
+    """numba's description of the files in which an entry point is kept; None where it is not."""
+    return getattr(entry._cache, "_cache_file", None)
+
+
+def cache_folder(entry: Any) -> str | None:
+    """The folder in which an entry point is kept; None where it is not."""
+    return None if cache_file(entry) is None else entry._cache._cache_path
+
+
+def separate_cache(entry: Any) -> None:
+    """Let this process name the files of its compiled code in numba's cache by itself.
+
+    numba counts them. Two processes that compile at once, each for other types, can choose the same number: then the
+    index of one names the code of the other, which is loaded, and computes something else.
+    """
+    file = cache_file(entry)
+    if file is not None:
+        file._data_name_pattern = file._data_name_pattern.replace(".nbc", f"-{uuid4().hex}.nbc")

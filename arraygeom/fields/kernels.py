@@ -1,0 +1,97 @@
+"""Compiled loops of the explicit fields, each in one thread and without Python's lock. Imported when first needed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled import compiled, separate_cache
+
+BUCKETS = 128
+"""Buckets into which distances are sorted first."""
+MORE = 1.15
+"""Share of the pixels that should be within the first distance tried, over those wanted."""
+
+
+@compiled(nogil=True, cache=True, error_model="numpy")
+def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask):
+    """The pixels of the window about the centre that are nearest to the line, for pixels `first` to `last` of alpha.
+
+    Out come xy (n, count, 2), the nearest first, and mask (n, count). `line` (n, 3) and `centre` (n, 2) are of the type
+    in which distances are computed; `tie` is by how much a pixel counts as farther than the one before it in the image.
+    """
+    count, most = mask.shape[1], (2 * window + 1) ** 2
+    keys, pixels = np.empty(most, line.dtype), np.empty((most, 2), np.int32)
+    order, begins = np.empty(most, np.int32), np.empty(BUCKETS + 1, np.int32)
+    sorted_keys = np.empty(most, line.dtype)
+    for p in range(first, last):
+        found = 0
+        if usable[p]:
+            found, limit = _within(line[p], centre[p], window, tie, hw, count, keys, pixels)
+            _sort(keys, found, limit, order, begins, sorted_keys)
+        for i in range(count):
+            mask[p, i] = i < found
+            xy[p, i, 0] = pixels[order[i], 0] if i < found else 0
+            xy[p, i, 1] = pixels[order[i], 1] if i < found else 0
+
+
+@compiled(inline="always")
+def _within(line, centre, window, tie, hw, count, keys, pixels):
+    """How many pixels are no farther than some distance, and that: `count` or more, or all of the window."""
+    x, y, a, b = int(centre[0]), int(centre[1]), line[0], line[1]
+    at_centre = centre[0] * a + centre[1] * b + line[2]
+    spans = window * (abs(a) + abs(b))
+    nearest, farthest = max(abs(at_centre) - spans, 0), abs(at_centre) + spans + tie * hw[0] * hw[1]
+    columns = 2 * window + 1
+    step = nearest + max(MORE * count / columns, 0.5) * max(abs(a), abs(b)) / 2 + tie * hw[0] * hw[1]
+    found = _collect(line, at_centre, x, y, window, tie, hw, step, keys, pixels)
+    while found < count and step < farthest:
+        step = nearest + 2 * (step - nearest)
+        found = _collect(line, at_centre, x, y, window, tie, hw, step, keys, pixels)
+    return found, step
+
+
+@compiled(inline="always")
+def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
+    """The pixels of the window with keys up to a limit: by columns, or by rows if the line is steep."""
+    a, b = line[0], line[1]
+    steep = abs(a) > abs(b)
+    slope, other = (b, a) if steep else (a, b)
+    along, across = (y, x) if steep else (x, y)
+    length, width = (hw[0], hw[1]) if steep else (hw[1], hw[0])
+    found, reach, inverse = 0, limit / abs(other) + 0.01, 1 / other
+    for u in range(max(along - window, 0), min(along + window, length - 1) + 1):
+        middle = across - (at_centre + slope * (u - along)) * inverse
+        begin = max(across - window, 0, int(np.ceil(middle - reach)))
+        end = min(across + window, width - 1, int(np.floor(middle + reach)))
+        for v in range(begin, end + 1):
+            column, row = (v, u) if steep else (u, v)
+            distance = np.float32(column - x) * a + np.float32(row - y) * b + at_centre
+            key = abs(distance) + keys.dtype.type(row * hw[1] + column) * tie
+            if key <= limit:
+                keys[found], pixels[found, 0], pixels[found, 1] = key, column, row
+                found += 1
+    return found
+
+
+@compiled(inline="always")
+def _sort(keys, n, limit, order, begins, found):
+    """The order of keys in 0 .. limit, and `found`, the keys in that order: into buckets, then by insertion."""
+    scale = BUCKETS / limit
+    begins[:] = 0
+    for i in range(n):
+        begins[min(int(keys[i] * scale), BUCKETS - 1) + 1] += 1
+    for k in range(BUCKETS):
+        begins[k + 1] += begins[k]
+    for i in range(n):
+        bucket = min(int(keys[i] * scale), BUCKETS - 1)
+        order[begins[bucket]], found[begins[bucket]] = i, keys[i]
+        begins[bucket] += 1
+    for i in range(1, n):
+        one, key, at = order[i], found[i], i
+        while at > 0 and found[at - 1] > key:
+            order[at], found[at] = order[at - 1], found[at - 1]
+            at -= 1
+        order[at], found[at] = one, key
+
+
+separate_cache(nearest_pixels)

@@ -1,0 +1,63 @@
+"""The compiled loops of the explicit fields against their readable forms."""
+
+import pytest
+import torch
+
+from arraygeom import Curved, Distortion, NearestVoxels, Pair, pixel_grid
+from tests.arraygeom.rigs import random_rig
+from tests.arraygeom.test_curved import fisheye_rig
+from tests.benchmarks.bench_fields import pairs
+
+BROWN = [-0.2, 0.05, 0.001, -0.0005, 0.01, 0.02, 0.01, 0.003, 0.001, 0.002, -0.001, 0.0005]
+LENSES = {
+    "none": None,
+    "radial": ("brown-conrady", [-0.4, 0.1, 0.0, 0.0]),
+    "rational": ("brown-conrady", BROWN[:8]),
+    "prism": ("brown-conrady", BROWN),
+    "fisheye": ("kannala-brandt", [0.05, -0.01, 0.002, 0.0]),
+}
+
+
+def readable(monkeypatch) -> None:
+    for module in ("curved", "explicit"):
+        monkeypatch.setattr(f"arraygeom.fields.{module}.compilable", lambda t: False)
+
+
+def pair_with(name: str) -> Pair:
+    """One whose beta sees part of what alpha sees through a lens, or two strong fisheyes."""
+    if name == "wide":
+        return fisheye_rig().pair("alpha", "beta")
+    given = LENSES[name]
+    return pairs(given and Distortion(given[0], torch.tensor(given[1], dtype=torch.float64)))[2]
+
+
+@pytest.mark.parametrize("name", [*LENSES, "wide"])
+def test_curved_positions_are_those_of_the_formulas(name, monkeypatch):
+    pair = pair_with(name)
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::43, ::47].reshape(-1, 2)
+    compiled = Curved(40, nodes=24)(pair, x)
+    readable(monkeypatch)
+    expected = Curved(40, nodes=24)(pair, x)
+    assert torch.equal(compiled.mask, expected.mask)
+    assert 0.5 < compiled.mask.float().mean() < 1
+    assert (compiled.xy - expected.xy).abs().max() < 1e-9
+
+
+def test_where_a_gradient_is_asked_for_the_formulas_are_used():
+    pair = pair_with("radial")
+    x = torch.tensor([[300.0, 200.0]], dtype=torch.float64, requires_grad=True)
+    Curved(5)(pair, x).xy.sum().backward()
+    assert x.grad is not None
+    assert x.grad.abs().max() > 1
+
+
+@pytest.mark.parametrize("field", [NearestVoxels(24, 12), NearestVoxels(96, 80), NearestVoxels(200, 5)], ids=repr)
+@pytest.mark.parametrize("seed", range(3))
+def test_nearest_pixels_are_those_of_the_readable_form(field, seed, monkeypatch):
+    pair = random_rig(seed, turn=0.4).pair("alpha", "beta")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::9, ::11].reshape(-1, 2)
+    compiled = field(pair, x)
+    readable(monkeypatch)
+    expected = field(pair, x)
+    assert torch.equal(compiled.mask, expected.mask)
+    assert torch.equal(compiled.xy, expected.xy)

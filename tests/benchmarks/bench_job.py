@@ -1,0 +1,189 @@
+"""The main job as a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 5]`.
+
+`pat fuse` as a process, from nothing to written files: the sample, 1280x800 with one and three betas, 4024x3036 under
+caps of memory; with kernels compiled before (warm), and with an empty cache (cold). Beside it, in turn in the same run,
+processes that read the same files and write an image by the classical baseline, and by OpenCV's SGBM, WLS and warp.
+The images are the sample array's, enlarged. Prints figures, and puts them into tests/benchmarks/RESULTS_job.md.
+`--quick`: 1280x800 with one beta only, cold once and warm once, nothing written.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+ROOT = Path(__file__).parents[2]
+RESULTS = Path(__file__).with_name("RESULTS_job.md")
+PARTS = (sys.executable, "-m", "tests.benchmarks.job_parts")
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is fused."""
+
+    name: str
+    wh: tuple[int, int]
+    betas: int = 1
+    cap: str | None = None
+
+
+@dataclass
+class Run:
+    """One process: seconds of the wall and of cores, peak resident bytes, and what it printed as JSON."""
+
+    wall: float
+    cores: float
+    peak: float
+    printed: dict[str, Any] = field(default_factory=dict)
+
+
+CASES = (
+    Case("640x400", (640, 400)),
+    Case("1280x800", (1280, 800)),
+    Case("1280x800, 3 betas", (1280, 800), betas=3),
+    *(Case(f"4024x3036, {cap}", (4024, 3036), cap=cap) for cap in ("2GiB", "4GiB", "8GiB")),
+    *(Case(f"4024x3036, 3 betas, {cap}", (4024, 3036), 3, cap) for cap in ("4GiB", "8GiB")),
+)
+QUICK = CASES[1:2]
+
+
+def run(command: Sequence[str], cache: Path) -> Run:
+    """Run a command in the repository's root, numba's cache in a folder. Raises RuntimeError if it fails."""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
+    begin = time.perf_counter()
+    with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
+        process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=out, stderr=errors, text=True)
+        _, status, used = os.wait4(process.pid, 0)
+        wall = time.perf_counter() - begin
+        process.returncode = os.waitstatus_to_exitcode(status)
+        for stream in (out, errors):
+            stream.seek(0)
+        lines = out.read().splitlines()
+        if process.returncode:
+            raise RuntimeError(f"{' '.join(command)} ended with {process.returncode}:\n{errors.read()[-2000:]}")
+    printed = [json.loads(line) for line in lines if line.startswith("{")]
+    return Run(wall, used.ru_utime + used.ru_stime, used.ru_maxrss * 1024.0, printed[-1] if printed else {})
+
+
+def fuse_arguments(case: Case, folder: Path, out: Path) -> list[str]:
+    """`pat fuse`'s own."""
+    names = ["mono", *(f"colour{i + 1}" for i in range(case.betas))]
+    images = [word for name in names for word in ("--image", f"{name}={folder / name}.png")]
+    cap = [] if case.cap is None else ["--max-memory", case.cap]
+    return [str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", str(out), *cap]
+
+
+def scenes(cases: Sequence[Case], work: Path) -> Iterator[tuple[Case, Path]]:
+    """Each case with the folder of its images."""
+    for case in cases:
+        folder = work / f"scene{case.wh[0]}"
+        if not folder.exists():
+            run([*PARTS, "scene", str(folder), *map(str, case.wh), "3"], work / "warm")
+        yield case, folder
+
+
+def measured(case: Case, folder: Path, work: Path, runs: int, *, others: bool) -> dict[str, list[Run]]:
+    """Runs by the way to fuse; the first of each is not counted, and fills the cache."""
+    fuse = fuse_arguments(case, folder, work / "out")
+    ways = {"pat fuse": [sys.executable, "-m", "pat", "fuse", *fuse]}
+    if others:
+        ways |= {way: [*PARTS, way, str(folder), str(work / way)] for way in ("classical", "opencv")}
+    found: dict[str, list[Run]] = {way: [] for way in ways}
+    for i in range(runs + 1):
+        for way, command in ways.items():
+            one = run(command, work / "warm")
+            found[way] += [one] if i else []
+    if others:
+        found["cold"] = [run(ways["pat fuse"], Path(tempfile.mkdtemp(dir=work)))]
+        found["stages"] = [run([*PARTS, "stages", *fuse], work / "warm") for _ in range(min(runs, 3))]
+    return found
+
+
+def row(case: Case, found: dict[str, list[Run]]) -> list[str]:
+    """A line of the table: seconds (median, least to most), core seconds, peak memory, ratios."""
+    ours = found["pat fuse"]
+    walls, cores = [r.wall for r in ours], median(r.cores for r in ours)
+    cells = [case.name, f"{median(walls):.1f} ({min(walls):.1f} to {max(walls):.1f})", f"{cores:.1f}"]
+    cells += [f"{max(r.peak for r in ours) / 2**30:.2f} GiB"]
+    cells += [f"{found['cold'][0].wall:.1f}" if "cold" in found else ""]
+    for way in ("classical", "opencv"):
+        other = found.get(way)
+        if other is None:
+            cells.append("")
+            continue
+        wall, core = (median(getattr(r, kind) for r in other) for kind in ("wall", "cores"))
+        cells.append(f"{wall:.1f} ({core:.1f}): {median(walls) / wall:.1f}x ({cores / core:.1f}x)")
+    return cells
+
+
+def stages_row(case: Case, found: dict[str, list[Run]]) -> list[str]:
+    """The shares of each part of the whole, and core seconds."""
+    shares = {}
+    for kind in ("stages", "cores"):
+        parts = [r.printed[kind] for r in found["stages"]]
+        shares[kind] = {name: median(p[name] for p in parts) for name in parts[0]}
+    total = sum(shares["stages"].values())
+    return [case.name, *(f"{shares['stages'][n] / total:.0%}, {shares['cores'][n]:.2f}" for n in STAGE_NAMES)]
+
+
+STAGE_NAMES = (
+    *("import", "read", "views", "field", "plan", "pre-pass", "matching", "attention", "network", "depth", "write"),
+    "rest",
+)
+COLUMNS = (
+    *("", "seconds", "core seconds", "peak memory", "cold, seconds"),
+    *("classical baseline, seconds (of a core): ratio", "OpenCV, seconds (of a core): ratio"),
+)
+
+
+def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """In Markdown; this file imports nothing of the project, whose memory a child would count as its own."""
+    rule = ["---", *["---:"] * (len(columns) - 1)]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (columns, rule, *rows)) + "\n"
+
+
+def main() -> None:
+    """Print the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--runs", type=int, default=5)
+    given = parser.parse_args()
+    cases, runs = (QUICK, 1) if given.quick else (CASES, given.runs)
+    load = os.getloadavg()[0]
+    rows, stages = [], []
+    with tempfile.TemporaryDirectory() as folder:
+        for case, images in scenes(cases, Path(folder)):
+            large = case.wh[0] > 2000
+            found = measured(case, images, Path(folder), 1 if large else runs, others=not large)
+            rows.append(row(case, found))
+            print(table(COLUMNS, rows[-1:]).splitlines()[-1], flush=True)
+            if "stages" in found:
+                stages.append(stages_row(case, found))
+                print(table(STAGE_NAMES, stages[-1:]).splitlines()[-1], flush=True)
+    threads = os.environ.get("OMP_NUM_THREADS", "all")
+    text = (
+        f"# The main job, measured\n\n`pat fuse` as a process, imports and written files included. "
+        f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {threads} threads; "
+        f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after; "
+        f" medians of {runs} runs (4024x3036: one), in turn with the others. Written by `make bench-job`.\n\n"
+        f"{table(COLUMNS, rows)}\nWhere the time goes: share of the seconds, and seconds of a core. Each part without "
+        f"those within it.\n\n{table(('', *STAGE_NAMES), stages)}"
+    )
+    print(text)
+    if not given.quick:
+        RESULTS.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
