@@ -61,6 +61,16 @@ class Board(ABC):
         return tuple(found)
 
     @property
+    def part(self) -> Int[np.ndarray, " n"]:
+        """The board that each point is on: 0, unless several boards are used at once."""
+        return np.zeros(len(self.points), dtype=int)
+
+    @property
+    def extents(self) -> list[tuple[float, float]]:
+        """`extent` of each board."""
+        return [self.extent]
+
+    @property
     def extent(self) -> tuple[float, float]:
         """Width and height of the print without its margin, metres: the squares around the corners."""
         return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
