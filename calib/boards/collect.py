@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,9 +46,10 @@ def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -
     for name, moments in photos.items():
         sizes = {key: hw for key, (hw, _) in by_camera[name]}
         _check_sizes(name, moments, sizes)
-        seen = {key: found for key, (_, found) in by_camera[name] if found is not None}
+        seen = {key: found for key, (_, found) in by_camera[name] if found}
         _check_board(name, moments, seen, board)
-        views[name] = BoardViews(next(iter(sizes.values())), seen)
+        by_board = {_of_board(key, k): d for key, found in seen.items() for k, d in found.items()}
+        views[name] = BoardViews(next(iter(sizes.values())), by_board)
         notes += _missing(name, moments, seen, board)
     return CollectedViews(views, {n: {k: p.label for k, p in m.items()} for n, m in photos.items()}, tuple(notes))
 
@@ -60,9 +61,19 @@ def collect_folder(
     return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
 
 
-def _detect_photo(photo: Photo, board: Board) -> tuple[tuple[int, int], Detection | None]:
-    grey = photo.read()
-    return (grey.shape[0], grey.shape[1]), detect(grey, board)
+def _detect_photo(photo: Photo, board: Board) -> tuple[tuple[int, int], dict[int, Detection]]:
+    """The image's size and what it shows of each board, numbered as the points of all boards."""
+    grey, found, before = photo.read(), {}, 0
+    for index, member in enumerate(board.members):
+        if (seen := detect(grey, member)) is not None:
+            found[index] = Detection(seen.ids + before, seen.x)
+        before += len(member.points)
+    return (grey.shape[0], grey.shape[1]), found
+
+
+def _of_board(key: FrameKey, board: int) -> FrameKey:
+    """What tells the views of several boards at one moment apart: each has a pose of its own."""
+    return f"{key} board {board + 1}" if board else key
 
 
 def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]) -> None:
@@ -73,12 +84,10 @@ def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[Fr
     raise ValueError(f"{name}: its images differ in size: {'; '.join(shown)}; keep those of one camera at one setting")
 
 
-def _check_board(
-    name: str, moments: Mapping[FrameKey, Photo], seen: Mapping[FrameKey, Detection], board: Board
-) -> None:
+def _check_board(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board) -> None:
     """Raises ValueError if no image shows the board, or if most of some show a larger one."""
     if not seen:
-        why = explain(_greys(list(moments.values())), board)
+        why = explain(_greys(list(moments.values())), board.members[0])
         labels = _named([p.label for p in moments.values()], NAMED)
         raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}")
     if other := other_size(_greys([moments[key] for key in seen]), board):
@@ -88,16 +97,12 @@ def _check_board(
         )
 
 
-def _missing(
-    name: str, moments: Mapping[FrameKey, Photo], seen: Mapping[FrameKey, Detection], board: Board
-) -> list[str]:
+def _missing(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[FrameKey], board: Board) -> list[str]:
     missing = [photo for key, photo in moments.items() if key not in seen]
     if not missing:
         return []
-    labels = _named([p.label for p in missing], NAMED)
-    return [
-        f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {explain(_greys(missing), board)}"
-    ]
+    labels, why = _named([p.label for p in missing], NAMED), explain(_greys(missing), board.members[0])
+    return [f"{name}: no board in {len(missing)} of {len(moments)} images ({labels}): {why}"]
 
 
 def _greys(photos: list[Photo]) -> Iterable[Grey]:

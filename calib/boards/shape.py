@@ -118,14 +118,14 @@ def described(shape: BoardShape, deviations: Float[np.ndarray, "k 4"], extents: 
         stretch, bend = shape.values[k, 0], shape.bend(k, extent)
         if abs(stretch) > 3 * deviation[0]:
             found.append(
-                f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2f} % "
+                f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
                 f"{'longer' if stretch > 0 else 'shorter'} down than across; this is modelled, with the size across as "
                 "specified: measure both"
             )
         relative = float(np.max(np.abs(shape.values[k, 1:]) / deviation[1:]))
         if relative > 3:
             found.append(
-                f"{name} is bent: its middle lies {1e3 * bend.depth:.2f} ± {1e3 * bend.depth / relative:.2f} mm "
+                f"{name} is bent: its middle lies {1e3 * bend.depth:.2f} ± {1e3 * bend.depth / relative:.2g} mm "
                 f"{'behind' if not bend.towards else 'in front of'} its edges (radius {bend.radius:.2f} m); this is "
                 "modelled: glue it to something stiff and flat"
             )

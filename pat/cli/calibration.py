@@ -15,7 +15,8 @@ BoardName = Annotated[
     str,
     arg(
         metavar="BOARD",
-        help="charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm or acircles:4x11:20mm.",
+        help="charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
+        "aprilgrid:6x6:88mm:0.3 (tags), or Kalibr's target file.",
     ),
 ]
 
@@ -30,19 +31,24 @@ class Calibrate:
 
     photos: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Folder with the images (or videos) of all cameras."""
-    board: BoardName
+    board: UseAppendAction[tuple[BoardName, ...]] = ()
+    """Once for each board; several at once need markers of their own (see `pat board`)."""
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
     """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
-    lens: Literal["brown-conrady", "kannala-brandt", "none"] = "brown-conrady"
-    """Lens model; kannala-brandt for fisheyes."""
+    lens: Literal["auto", "brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"] = (
+        "brown-conrady"
+    )
+    """Lens model; kannala-brandt for fisheyes. auto compares them on held-out frames and takes what they support."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
 
     def run(self) -> None:
         from calib.boards.run import calibrate_photos
 
+        if not self.board:
+            raise ValueError("which board is in the images? Give it, such as --board charuco:8x6:30mm")
         options.writable(self.out)
         patterns = options.files_by_name(self.camera, "--camera")
         found = calibrate_photos(

@@ -9,7 +9,7 @@ estimated parameters per degree of freedom (mean and largest of the draws), 1 if
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -67,10 +67,10 @@ def judged(share: float, draw: int) -> Draw:
     return Draw(worst, float(error @ np.linalg.solve(covariance, error)) / len(error), found.rms)
 
 
-def rows(draws: int) -> Iterator[str]:
+def rows(draws: int, shares: Sequence[float]) -> Iterator[str]:
     yield markdown_header(["wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px"])
     beyond = []
-    for share in (0.0, 0.05, 0.2):
+    for share in shares:
         judgements = [judged(share, draw) for draw in tqdm(range(draws), desc=f"{share:.0%}", mininterval=10)]
         bad = [i for i, d in enumerate(judgements) if d.worst > 5]
         worst, squares, rms = (np.array(column) for column in zip(*judgements))
@@ -83,12 +83,13 @@ def rows(draws: int) -> Iterator[str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--shares", type=float, nargs="*", default=[0.0, 0.05, 0.2])
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
     lines = []
-    for row in rows(options.draws):
+    for row in rows(options.draws, options.shares):
         print(row, flush=True)
         lines.append(row)
     if options.out:
