@@ -403,10 +403,11 @@ def normal_equations(problem: BundleProblem, free: Free, sigma: Mapping[str, flo
 class Jackknife(NamedTuple):
     """By how the blocks disagree: covariances of the cameras' parameters and of the shapes.
 
-    step: the shapes after one Gauss-Newton step.
+    left_out: of the cameras' parameters by leaving out each block in turn. step: the shapes after a Gauss-Newton step.
     """
 
     covariance: Float[np.ndarray, "c c"]
+    left_out: Float[np.ndarray, "c c"]
     shapes: Float[np.ndarray, "s s"]
     step: Float[np.ndarray, " s"]
 
@@ -436,8 +437,12 @@ def jackknife(problem: BundleProblem, free: Free, sigma: Mapping[str, float]) ->
     whole = equations.g - np.einsum("bcd,bd->c", Y, equations.h)
     step = np.linalg.lstsq(total, whole, rcond=1e-14)[0]
     covariance = _clustered(total, H, g - H @ step)
+    each = np.stack([np.linalg.lstsq(total - P, whole - slope, rcond=1e-14)[0] for P, slope in zip(H, g)])
+    each -= each.mean(0)
     after = np.zeros(0) if problem.shape is None else problem.shape.values.ravel() + step[c - shapes :]
-    return Jackknife(covariance[: c - shapes, : c - shapes], covariance[c - shapes :, c - shapes :], after)
+    cameras, boards = slice(c - shapes), slice(c - shapes, c)
+    left_out = (b - 1) / b * (each.T @ each)[cameras, cameras]
+    return Jackknife(covariance[cameras, cameras], left_out, covariance[boards, boards], after)
 
 
 def _clustered(total: Array, H: Array, g: Array) -> Array:

@@ -24,10 +24,10 @@ Progress = Callable[[Iterable[Any], int], Iterable[Any]]
 
 @dataclass(frozen=True)
 class CollectedViews:
-    """Detections of each camera, the names of its images, and notes on failed ones."""
+    """Detections of each camera, its images, and notes on failed ones."""
 
     views: dict[str, BoardViews]
-    labels: dict[str, dict[FrameKey, str]]
+    photos: Photos
     notes: tuple[str, ...]
 
 
@@ -51,7 +51,7 @@ def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -
         by_board = {_of_board(key, k): d for key, found in seen.items() for k, d in found.items()}
         views[name] = BoardViews(next(iter(sizes.values())), by_board)
         notes += _missing(name, moments, seen, board)
-    return CollectedViews(views, {n: {k: p.label for k, p in m.items()} for n, m in photos.items()}, tuple(notes))
+    return CollectedViews(views, photos, tuple(notes))
 
 
 def collect_folder(

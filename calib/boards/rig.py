@@ -168,18 +168,26 @@ def calibrate_single(
 
 
 def _scaled_covariance(together: _JointFit) -> tuple[_JointFit, float]:
-    """The fit with its covariance raised to that of the jackknife over frames, if considerably larger; and the factor.
+    """The fit with its covariance raised if frames disagree considerably; and the factor of its deviations (median).
 
-    The factor is that of the standard deviations, in the mean over all directions.
+    The raised covariance is the mean of the jackknife's, which few frames make noisy, and of that of the points' noise,
+    scaled to the jackknife's level.
     """
     fit = together.fit
     if fit.covariance is None or not len(fit.covariance) or len(fit.problem.structure) < FEWEST_TO_JACKKNIFE:
         return together, 1.0
-    found = jackknife(fit.problem, fit.free(), fit.sigma).covariance
-    factor = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found)) / len(found)))
-    if factor < CONSIDERABLE:
+    found = jackknife(fit.problem, fit.free(), fit.sigma)
+    disagreement = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found.covariance)) / len(fit.covariance)))
+    if disagreement < CONSIDERABLE:
         return together, 1.0
-    return together._replace(fit=fit._replace(covariance=factor**2 * fit.covariance)), factor
+    level = max(disagreement, float(np.median(_ratio(found.left_out, fit.covariance))))
+    raised = (level**2 * fit.covariance + found.left_out) / 2
+    return together._replace(fit=fit._replace(covariance=raised)), float(np.median(_ratio(raised, fit.covariance)))
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of the standard deviations of two covariances."""
+    return np.asarray(np.sqrt(a.diagonal() / b.diagonal()))
 
 
 def _noted(factor: float) -> list[str]:

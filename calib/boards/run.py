@@ -15,7 +15,7 @@ from .collect import Progress, collect_folder
 from .intrinsics import Lens
 from .lens_comparison import compare_lenses
 from .printing import draw_board
-from .report import coverages, report_html, rig_covariance, summary
+from .report import coverage_advice, coverages, report_html, rig_covariance, summary
 from .rig import calibrate
 from .target import parse_board, parse_boards
 
@@ -54,12 +54,19 @@ def calibrate_photos(
     lenses = [f"{name}: {c.advice}" for name, c in comparisons.items()]
     rig = calibration.rig.replace(depth=depth, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
-    write_text(written[0], report_html(calibration, title=f"Calibration of {out.name}", notes=[*lenses, *found.notes]))
+    report = report_html(
+        calibration,
+        title=f"Calibration of {out.name}",
+        notes=[*lenses, *found.notes],
+        detected=found.views,
+        photos=found.photos,
+    )
+    write_text(written[0], report)
     covariance = rig_covariance(calibration)
     if covariance is not None:
         covariance.save(written[1])
     rig.save(out)
-    advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
+    advice = coverage_advice(calibration, coverages(calibration))
     messages = [summary(calibration), *lenses, *found.notes, *calibration.notes, *advice]
     return CalibrationOutput(messages, [path for path in written if path.exists()])
 

@@ -103,7 +103,7 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
 def is_significant(values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int) -> bool:
     """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's test)."""
     count = len(values)
-    if frames <= count + 2:
+    if frames < 2 * count + 2:
         return False
     squared = float(values @ np.linalg.solve(covariance, values))
     ratio = squared * (frames - count) / (count * (frames - 1))

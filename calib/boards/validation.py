@@ -23,9 +23,9 @@ FOLDS = 5
 """Frames are held out in so many parts, each once."""
 FEWEST_LEFT = 3
 """Frames that every camera must keep."""
-MISFIT = 2.5
+MISFIT = 1.8
 """A frame does not fit if its residuals exceed those of the camera's median frame by this factor,"""
-CONSPICUOUS = 2.0
+CONSPICUOUS = 1.8
 """and the camera's noise by this one."""
 LISTED = 5
 
