@@ -28,8 +28,8 @@ FILLS = 0.35, 0.7
 """Widths of proposed boards, as shares of the image's."""
 NAMES = {(-1, -1): "upper left", (0, -1): "top", (1, -1): "upper right", (-1, 0): "left", (0, 0): "middle"}
 NAMES |= {(1, 0): "right", (-1, 1): "lower left", (0, 1): "bottom", (1, 1): "lower right"}
-TILTS = {(0, 1): "left edge nearer", (0, -1): "right edge nearer", (1, 0): "lower edge nearer"}
-TILTS |= {(-1, 0): "upper edge nearer"}
+TILTS = {(0, 1): "right edge nearer", (0, -1): "left edge nearer", (1, 0): "upper edge nearer"}
+TILTS |= {(-1, 0): "lower edge nearer"}
 
 
 class Intrinsics(NamedTuple):
@@ -128,8 +128,13 @@ def _median(change: np.ndarray, covariance: np.ndarray) -> float:
 
 def _candidates(known: Intrinsics, board: Board) -> Mapping[str, np.ndarray]:
     """Views in words, and the information that each adds on the free intrinsics."""
-    found = {}
-    camera, (h, w) = known.camera, known.camera.hw
+    gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board).items()}
+    return {text: gain for text, gain in gains.items() if gain is not None}
+
+
+def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:
+    """Views of a board in words, and its points in the camera's frame."""
+    found, (h, w) = {}, camera.hw
     middle = torch.from_numpy((board.points.max(0) + board.points.min(0)) / 2)
     for fill in FILLS:
         depth = float(camera.K[0, 0]) * max(board.extent) / (fill * w)
@@ -140,9 +145,7 @@ def _candidates(known: Intrinsics, board: Board) -> Mapping[str, np.ndarray]:
             for (a, b), tilt in TILTS.items():
                 R = rotation_from_vector(torch.deg2rad(TILT * torch.tensor([a, b, 0.0], dtype=torch.float64)))
                 X = Pose(R, centre - R @ middle).apply(torch.from_numpy(board.points)).numpy()
-                gain = _gain(known, X)
-                if gain is not None:
-                    found[f"the board at the {position}, {depth:.2g} m away, tilted, {tilt}"] = gain
+                found[f"the board at the {position}, {depth:.2g} m away, tilted, {tilt}"] = X
     return found
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from arraygeom.viz import COLOURS
@@ -46,7 +47,7 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
 
 
 def _map(axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str) -> None:
-    drawn = axes.tripcolor(*x.T, value, shading="gouraud", cmap="viridis", vmin=0)
+    drawn = axes.tripcolor(*x.T, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm())
     axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[])
     axes.set_title(_escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9)
     figure.colorbar(drawn, ax=axes, shrink=0.8)

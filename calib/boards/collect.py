@@ -9,6 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from arraygeom.pixels import HW
+
 from .detect import Detection, Grey, detect, explain, other_size
 from .intrinsics import BoardViews
 from .photos import FrameKey, Photo, Photos, find_photos
@@ -39,16 +41,16 @@ def collect(photos: Photos, board: Board, *, progress: Progress | None = None) -
     """
     jobs = [(name, key, photo) for name, moments in photos.items() for key, photo in moments.items()]
     with ThreadPoolExecutor(2) as pool:
-        results = pool.map(lambda job: _detect_photo(job[2], board), jobs)
-        detected = list(progress(results, len(jobs)) if progress else results)
-    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, detected) if n == name] for name in photos}
+        results = pool.map(lambda job: detected(job[2], job[1], board), jobs)
+        found = list(progress(results, len(jobs)) if progress else results)
+    by_camera = {name: [(k, r) for (n, k, _), r in zip(jobs, found) if n == name] for name in photos}
     views, notes = {}, []
     for name, moments in photos.items():
         sizes = {key: hw for key, (hw, _) in by_camera[name]}
         _check_sizes(name, moments, sizes)
-        seen = {key: found for key, (_, found) in by_camera[name] if found}
+        seen = {key: boards for key, (_, boards) in by_camera[name] if boards}
         _check_board(name, moments, seen, board)
-        by_board = {_of_board(key, k): d for key, found in seen.items() for k, d in found.items()}
+        by_board = {key: d for boards in seen.values() for key, d in boards.items()}
         views[name] = BoardViews(next(iter(sizes.values())), by_board)
         notes += _missing(name, moments, seen, board)
     return CollectedViews(views, photos, tuple(notes))
@@ -61,19 +63,18 @@ def collect_folder(
     return collect(find_photos(Path(folder), patterns=patterns), board, progress=progress)
 
 
-def _detect_photo(photo: Photo, board: Board) -> tuple[tuple[int, int], dict[int, Detection]]:
-    """The image's size and what it shows of each board, numbered as the points of all boards."""
-    grey, found, before = photo.read(), {}, 0
+def detected(photo: Photo, key: FrameKey, board: Board) -> tuple[HW, dict[FrameKey, Detection]]:
+    """An image's size and the points of each board in it, numbered as those of all boards.
+
+    Each board has poses of its own, hence a key of its own; that of the first one is the image's. Raises ValueError if
+    the image cannot be read.
+    """
+    grey, found, before = photo.read(), dict[FrameKey, Detection](), 0
     for index, member in enumerate(board.members):
         if (seen := detect(grey, member)) is not None:
-            found[index] = Detection(seen.ids + before, seen.x)
+            found[f"{key} board {index + 1}" if index else key] = Detection(seen.ids + before, seen.x)
         before += len(member.points)
     return (grey.shape[0], grey.shape[1]), found
-
-
-def _of_board(key: FrameKey, board: int) -> FrameKey:
-    """What tells the views of several boards at one moment apart: each has a pose of its own."""
-    return f"{key} board {board + 1}" if board else key
 
 
 def _check_sizes(name: str, moments: Mapping[FrameKey, Photo], sizes: Mapping[FrameKey, tuple[int, int]]) -> None:

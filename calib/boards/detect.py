@@ -242,7 +242,7 @@ def _reason(grey: Grey, board: Board) -> str:
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
     border = board.border if isinstance(board, AprilGrid) else 1
     ids, last = _markers(grey, board.dictionary, border), board.markers[-1]
-    if isinstance(board, AprilGrid) and len(_markers(grey, board.dictionary, 3 - border)) >= max(4, 2 * len(ids)):
+    if isinstance(board, AprilGrid) and len(_markers(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
         other = f"border{3 - border}"
         return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
     if len(ids) >= 4 and max(ids) > last:

@@ -43,6 +43,8 @@ class Calibrate:
     """Lens model; kannala-brandt for fisheyes. auto compares them on held-out frames and takes what they support."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
+    watch: bool = False
+    """While images are taken: a page (.watch.html) with what was detected and which view would help most."""
 
     def run(self) -> None:
         from calib.boards.run import calibrate_photos
@@ -51,6 +53,8 @@ class Calibrate:
             raise ValueError("which board is in the images? Give it, such as --board charuco:8x6:30mm")
         options.writable(self.out)
         patterns = options.files_by_name(self.camera, "--camera")
+        if self.watch:
+            self._watch({name: str(pattern) for name, pattern in patterns.items()})
         found = calibrate_photos(
             self.photos,
             self.board,
@@ -62,6 +66,18 @@ class Calibrate:
         )
         print("\n".join(found.messages))
         say(f"written: {', '.join(map(str, found.written))}")
+
+    def _watch(self, patterns: dict[str, str]) -> None:
+        from calib.boards.target import parse_boards
+        from calib.boards.watch import watch
+
+        page = self.out.with_suffix(".watch.html")
+        say(f"open {page} in a browser; Ctrl-C calibrates with all images and ends")
+        lens = "brown-conrady" if self.lens == "auto" else self.lens
+        try:
+            watch(self.photos, parse_boards(self.board), page, patterns=patterns, lens=lens)
+        except KeyboardInterrupt:
+            say("")
 
 
 @dataclass
