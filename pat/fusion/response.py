@@ -42,6 +42,7 @@ class ResponseSettings(NamedTuple):
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
     shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
+    sensor: weights of a usual unfiltered sensor, which sees more blue than Rec. 601.
     """
 
     prior: float = 0.15
@@ -56,6 +57,7 @@ class ResponseSettings(NamedTuple):
     better: float = 0.8
     shading: tuple[float, float] = (0.08, 0.7)
     explained: float = 0.5
+    sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
 
 
 SETTINGS = ResponseSettings()
@@ -220,20 +222,36 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     weights = found.weights / gain
     change = gain * float(((weights - rec601) @ x).square().mean().sqrt())
     if change < settings.least_change[gamma != 1 or (exposed and unknown)]:
-        luma = rec601 @ x
-        gain = float((found.share * luma) @ y / ((found.share * luma) @ luma)) if exposed else 1.0
-        weights = rec601
+        return Response(rec601, _ratio(y, rec601 @ x, found) if exposed else 1.0, gamma, found.explained)
+    if unknown and not exposed and _unlike_sensors(x, y, found, settings):
+        halfway = (weights / weights.sum() + rec601) / 2
+        return Response(halfway, math.sqrt(_ratio(y, rec601 @ x, found)), gamma, found.explained)
     return Response(weights, gain, gamma, found.explained)
 
 
 def _only_a_gain(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
     """Whether Rec. 601's luma times a gain near 1 explains alpha as well: light differs a little, or exposure."""
     luma = Response.rec601().weights @ x
-    gain = float((found.share * luma) @ y / ((found.share * luma) @ luma))
+    gain = _ratio(y, luma, found)
     change = float((found.weights @ x - gain * luma).square().mean().sqrt())
     apart = abs(math.log(float(found.weights.sum()) / gain))
     same = apart < 2 * max(found.deviation, 0.005) and change < settings.least_change[0]
     return same and abs(math.log(gain)) < settings.near_one
+
+
+def _unlike_sensors(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
+    """Whether alpha is brighter than luma where a usual sensor would be darker, or the other way round.
+
+    In a scene of one hue light or exposure explain that as well as a response does, and are as likely.
+    """
+    luma = Response.rec601().weights @ x
+    sensor = luma.new_tensor(settings.sensor) @ x
+    return (_ratio(y, luma, found) - 1) * (_ratio(sensor, luma, found) - 1) < 0
+
+
+def _ratio(y: Tensor, luma: Tensor, found: _Fit) -> float:
+    """The factor by which luma is y, by least squares with the fit's weights."""
+    return float((found.share * luma) @ y / ((found.share * luma) @ luma))
 
 
 def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:

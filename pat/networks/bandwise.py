@@ -14,9 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from .guided import BetaEstimate, Encoded, GuidedPAT, GuidedPATConfig, output_of
+from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
-from .semi_global import FINE, Normalisations, SemiGlobalMatches, semi_global_matching
+from .semi_global import FINE, Normalisations, SemiGlobalMatches
 from .spectral_mix import SpectralMix, coarse_mix, semi_global_matching_of_bands
 
 COARSELY = 400_000

@@ -57,8 +57,8 @@ BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 class SemiGlobalMatches(NamedTuple):
     """The matches of images of H x W.
 
-    disparity: (B, 1, H / 2, W / 2), how far from its segment's end the match is, pixels of beta; where the match is
-        not consistent, diffused from where it is.
+    disparity: (B, 1, H, W), how far from its segment's end the match is, pixels of beta; where the match is not
+        consistent, diffused from where it is.
     facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
         others, and its cost; each 0 to 1.
     matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
@@ -75,7 +75,7 @@ class SemiGlobalMatches(NamedTuple):
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        return SemiGlobalMatches(self.disparity[half], self.facts[half], self.matched[whole], self.colour[whole])
+        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
 
 
 class Normalisation(NamedTuple):
@@ -133,35 +133,14 @@ class _Geometry(NamedTuple):
     cut: NDArray[np.float32]
 
 
-@torch.no_grad()
-def semi_global_matching(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    blocks: Segments,
-    normalisations: Normalisations | None = None,
-) -> SemiGlobalMatches:
-    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
-
-    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
-    of its 2x2 pixels, in beta's pixels. All sides are even. `balances` are those of the whole images if these are
-    parts. On the CPU, with as many threads as torch may use; the same whatever their number.
-    """
-    normalisations = normalisations or Normalisations.of(alpha, guide)
-    disparity, facts = matched_at_half_size(alpha, guide, blocks, normalisations.half)
-    matched, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
-    return SemiGlobalMatches(disparity, facts, matched, diffused_from(matched, alpha, weight))
-
-
 def matched_at_half_size(
     alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, normalisation: Normalisation
 ) -> tuple[Float[Tensor, "b 1 h2 w2"], Float[Tensor, "b 3 h2 w2"]]:
     """`disparity` and `facts` alone; `normalisation` is that of half the size."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
-    geometry = _geometry(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
-    found, measured = _matched_blocks(_numpy(own[:, 0]), _numpy(other[:, 0]), geometry)
+    geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
+    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry)
     consistent = (measured[..., 0] < CONSISTENT).astype(np.float32)
     planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
     dense = np.stack([filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
@@ -192,16 +171,16 @@ def box_mean(x: Tensor, radius: int) -> Tensor:
     return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
 
 
-def _geometry(segments: Segments, batch: int, hw: tuple[int, int]) -> _Geometry:
-    """An invalid segment is as short as none: its length is negative.
+def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
+    """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no pixel.
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
     length = segments.length
     cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
-    end = (segments.end + 0.5) / FINE - 0.5
-    length = torch.where(segments.valid, length / FINE, -1.0)
-    planes = (_numpy(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length, cut))
+    end = (segments.end + 0.5) / factor - 0.5
+    length = torch.where(segments.valid, length / factor, -1.0)
+    planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length, cut))
     return _Geometry(*planes)
 
 
@@ -215,14 +194,14 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
     tasks = []
     for i, (a, b) in enumerate(zip(own, other)):
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
-        tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in _blocks(a.shape, labels)]
+        boxes = inner_and_outer(a.shape, min(labels + 32, MOST_MARGIN))
+        tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in boxes]
     in_parallel(tasks)
     return disparity, facts
 
 
-def _blocks(hw: tuple[int, ...], labels: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
+def inner_and_outer(hw: tuple[int, ...], margin: int) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Inner and outer squares: the result, and what is computed for it."""
-    margin = min(labels + 32, MOST_MARGIN)
     for top in range(0, hw[0], BLOCK):
         for left in range(0, hw[1], BLOCK):
             inner = slice(top, min(top + BLOCK, hw[0])), slice(left, min(left + BLOCK, hw[1]))
@@ -274,7 +253,7 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
     """Each blurred with its standard deviation in pixels; 0: as it is."""
 
     def one(image: Tensor, blur: float) -> Tensor:
-        return torch.from_numpy(cv2.GaussianBlur(_numpy(image), (0, 0), blur)).to(image) if blur else image
+        return torch.from_numpy(cv2.GaussianBlur(numpy_of(image), (0, 0), blur)).to(image) if blur else image
 
     return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
 
@@ -288,7 +267,7 @@ def matched_colours(
     guide: Float[Tensor, "b 1 hb wb"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    disparity: Float[Tensor, "b 1 h2 w2"],
+    disparity: Float[Tensor, "b 1 h w"],
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
@@ -307,7 +286,7 @@ def matched_colours(
 
 
 def at_matches(
-    beta: Float[Tensor, "b c hb wb"], segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]
+    beta: Float[Tensor, "b c hb wb"], segments: Segments, disparity: Float[Tensor, "b 1 _ _"]
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
     """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
     hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity).to(beta)
@@ -319,7 +298,7 @@ def at_matches(
 
 def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
     """1 where the match is consistent."""
-    return _enlarged((facts[:, :1] < CONSISTENT).to(facts))
+    return enlarged((facts[:, :1] < CONSISTENT).to(facts))
 
 
 def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
@@ -332,7 +311,7 @@ def diffused_from(
     matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b fills c h w"]:
     """Bands diffused by weight over what is connected in alpha, in each of the `FILLS` ways."""
-    planes = list(zip(_numpy(matched), _numpy(alpha[:, 0]), _numpy(weight[:, 0]), to_bytes(alpha[:, 0])))
+    planes = list(zip(numpy_of(matched), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0])))
     diffused = np.zeros((len(planes), FILLS, *matched.shape[1:]), np.float32)
 
     def along_brightness(i: int) -> None:
@@ -381,14 +360,16 @@ def _regressed(
 
 
 def matches(
-    segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"], *, beyond_edge: bool = False
+    segments: Segments, disparity: Float[Tensor, "b 1 _ _"], *, beyond_edge: bool = False
 ) -> Float[Tensor, "b h w 2"]:
     """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels.
 
-    Not beyond the segments' near ends, unless `beyond_edge`.
+    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`.
     """
     length = segments.length
-    far = interpolate(disparity, scale_factor=FINE, mode="bilinear")[:, 0].to(length).clamp(min=0)
+    if disparity.shape[-2:] != length.shape[-2:]:
+        disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
+    far = disparity[:, 0].to(length).clamp(min=0)
     return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments)
 
 
@@ -398,7 +379,8 @@ def along(segments: Segments) -> Float[Tensor, "*n 2"]:
     return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
 
 
-def _enlarged(x: Tensor) -> Tensor:
+def enlarged(x: Tensor) -> Tensor:
+    """From half the size, each value four times."""
     return x.repeat_interleave(FINE, -1).repeat_interleave(FINE, -2)
 
 
@@ -412,5 +394,6 @@ def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, f
     return np.stack([smooth(plane * weight) / total for plane in planes])
 
 
-def _numpy(x: Tensor) -> NDArray[np.float32]:
+def numpy_of(x: Tensor) -> NDArray[np.float32]:
+    """A float32 copy on the CPU, in one piece."""
     return np.ascontiguousarray(x.detach().cpu().numpy(), np.float32)

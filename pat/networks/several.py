@@ -14,13 +14,14 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
 from arraygeom.epipolar import Track
 
 from ..media.colour import to_bytes
 from .protocol import Beta, Inputs
-from .semi_global import CONSISTENT, DISPARITY_FILL, FINE, SemiGlobalMatches, along, filled
+from .semi_global import CONSISTENT, DISPARITY_FILL, FINE, SemiGlobalMatches, along, enlarged, filled
 
 SUPPORT = 1.5
 """A beta supports an inverse depth that is less than this many of its pixels from its own match."""
@@ -29,7 +30,7 @@ FARTHEST = 8.0
 
 
 class MatchedBeta(NamedTuple):
-    """One beta at the centres of alpha's blocks, (h, w): segments, tracks, matches and their facts."""
+    """One beta at alpha's pixels, (h, w): segments, tracks, matches and their facts."""
 
     segments: Segments
     track: Track
@@ -40,13 +41,13 @@ class MatchedBeta(NamedTuple):
     @classmethod
     def of(cls, beta: Beta, found: SemiGlobalMatches) -> MatchedBeta:
         """Of a beta with a track, and its own matches."""
-        blocks, disparity = beta.field.of_blocks(FINE), found.disparity[0, 0]
-        segments = Segments(blocks.start[0], blocks.end[0], blocks.valid[0])
-        hw = (disparity.shape[0], disparity.shape[1])
+        pixels, disparity = beta.field.straight, found.disparity[0, 0]
+        segments = Segments(pixels.start[0], pixels.end[0], pixels.valid[0])
         assert beta.track is not None
-        track = beta.track((pixel_grid(hw, dtype=torch.float64) + 0.5) * FINE - 0.5)
+        track = beta.track(pixel_grid((disparity.shape[0], disparity.shape[1]), dtype=torch.float64))
         size = (beta.image.shape[-2], beta.image.shape[-1])
-        return cls(segments, track, disparity.to(segments.end), found.facts[0].to(segments.end), size)
+        facts = enlarged(found.facts)[0]
+        return cls(segments, track, disparity.to(segments.end), facts.to(segments.end), size)
 
     @property
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
@@ -66,7 +67,7 @@ class MatchedBeta(NamedTuple):
     def hidden(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
         """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the image.
 
-        By a depth buffer of half of beta's size.
+        By a depth buffer of half of beta's size: alpha's pixels leave no holes in it.
         """
         x = self.track.at(inverse_depth)
         rows, columns = (-(-n // FINE) for n in self.hw)
@@ -88,10 +89,10 @@ def can_agree(inputs: Inputs) -> bool:
 
 
 def agreed(inputs: Inputs, found: tuple[SemiGlobalMatches, ...]) -> list[tuple[Tensor, Tensor]]:
-    """`disparity` and `facts` of each beta, from the inverse depths on which the matches agree."""
+    """`disparity` and `facts` (at half the size) of each beta, from the inverse depths on which the matches agree."""
     views = [MatchedBeta.of(beta, matches) for beta, matches in zip(inputs.betas, found)]
     inverse_depth, facts, known = _chosen(views)
-    guide = to_bytes(torch.nn.functional.avg_pool2d(inputs.alpha, FINE)[0, 0])
+    guide = to_bytes(inputs.alpha[0, 0])
     scale = max(float(inverse_depth.max()), 1e-9)
     plane = (inverse_depth / scale).cpu().numpy().astype(np.float32)
     certain = known.cpu().numpy()
@@ -103,11 +104,11 @@ def agreed(inputs: Inputs, found: tuple[SemiGlobalMatches, ...]) -> list[tuple[T
 
 def _of_view(
     view: MatchedBeta, inverse_depth: Tensor, facts: Tensor, known: Tensor, like: Tensor
-) -> tuple[Float[Tensor, "1 1 h w"], Float[Tensor, "1 3 h w"]]:
+) -> tuple[Float[Tensor, "1 1 h w"], Float[Tensor, "1 3 h2 w2"]]:
     disparity = view.disparity_of(inverse_depth).clamp(min=0).minimum(view.segments.length)
     unlike = (view.hidden(inverse_depth) / (FINE * FARTHEST)).clamp(0, 1)
     unlike = torch.where(known, unlike, 1.0)
-    return disparity[None, None].to(like), torch.cat([unlike[None], facts])[None].to(like)
+    return disparity[None, None].to(like), avg_pool2d(torch.cat([unlike[None], facts])[None].to(like), FINE)
 
 
 def _chosen(views: list[MatchedBeta]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "2 h w"], Bool[Tensor, "h w"]]:

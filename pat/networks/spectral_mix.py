@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
+from .matching import matched
 from .semi_global import (
     MOST_DETAIL,
     Normalisation,
@@ -122,12 +123,11 @@ def semi_global_matching_of_bands(
     normalisations: Normalisations,
 ) -> SemiGlobalMatches:
     """`semi_global_matching` of alpha and the mix of the bands; all are warped to alpha's view."""
-    disparity, facts = matched_at_half_size(alpha, mix.of(beta), blocks, normalisations.half)
+    disparity, facts = matched(alpha, mix.of(beta), segments, blocks, normalisations)
     values, valid = at_matches(beta, segments, disparity)
-    matched, unlike = _matched(values, alpha, mix, normalisations.whole)
-    return SemiGlobalMatches(
-        disparity, facts, matched, diffused_from(matched, alpha, match_weight(unlike, is_consistent(facts), valid))
-    )
+    colours, unlike = _matched(values, alpha, mix, normalisations.whole)
+    weight = match_weight(unlike, is_consistent(facts), valid)
+    return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))
 
 
 def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Normalisation) -> tuple[Tensor, Tensor]:

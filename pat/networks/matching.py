@@ -1,0 +1,139 @@
+"""Where alpha's pixels are in beta: semi-global matching at half the size, then at full size over few labels around it.
+
+At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at full
+size, between labels around the least and around the greatest disparity of its neighbourhood at half the size.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom import Segments
+
+from ..media.colour import to_bytes
+from ..support.threads import in_parallel
+from . import band_kernels as kernels
+from .semi_global import (
+    CONSISTENT,
+    DISPARITY_FILL,
+    FINE,
+    Normalisation,
+    Normalisations,
+    SemiGlobalMatches,
+    diffused_from,
+    filled,
+    geometry_of,
+    inner_and_outer,
+    matched_at_half_size,
+    matched_colours,
+    numpy_of,
+)
+from .semi_global_kernels import census
+
+NEIGHBOURHOOD = 5
+"""Side of the neighbourhood at half the size, pixels."""
+MARGIN = 48
+"""What is matched around a block, pixels."""
+
+
+@torch.no_grad()
+def semi_global_matching(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    beta: Float[Tensor, "b c hb wb"],
+    segments: Segments,
+    blocks: Segments,
+    normalisations: Normalisations | None = None,
+) -> SemiGlobalMatches:
+    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
+
+    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
+    of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole images if these
+    are parts. On the CPU, with as many threads as torch may use; the same whatever their number.
+    """
+    normalisations = normalisations or Normalisations.of(alpha, guide)
+    disparity, facts = matched(alpha, guide, segments, blocks, normalisations)
+    colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
+    return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))
+
+
+@torch.no_grad()
+def matched(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    segments: Segments,
+    blocks: Segments,
+    normalisations: Normalisations,
+) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 3 h2 w2"]]:
+    """`disparity` and `facts` alone."""
+    half, facts = matched_at_half_size(alpha, guide, blocks, normalisations.half)
+    disparity, unlike = matched_at_full_size(alpha, guide, segments, half, normalisations.whole)
+    return disparity, torch.cat([avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
+
+
+def matched_at_full_size(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    segments: Segments,
+    disparity: Float[Tensor, "b 1 h2 w2"],
+    normalisation: Normalisation,
+) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
+    """Disparity from that at half the size, and how far matching back from beta disagrees, 0 to 1.
+
+    Where it disagrees, disparity is diffused from where it does not. `normalisation` is that of whole images.
+    """
+    own, other = normalisation.equally_sharp(alpha, normalisation.normalised(guide))
+    geometry = geometry_of(segments, len(alpha), (guide.shape[-2], guide.shape[-1]), factor=1)
+    planes = [numpy_of(x[:, 0]) for x in (own, other)]
+    bits = [np.empty(x.shape, np.uint64) for x in planes]
+    in_parallel([partial(census, p, o) for x, out in zip(planes, bits) for p, o in zip(x, out)])
+    found, unlike = np.empty((2, *planes[0].shape), np.float32)
+    tasks = []
+    for i, half in enumerate(numpy_of(disparity[:, 0])):
+        views = planes[0][i], bits[0][i], planes[1][i], bits[1][i], *(g[i] for g in geometry), *_runs(half)
+        tasks += [partial(_block, views, box, found[i], unlike[i]) for box in inner_and_outer(found.shape[1:], MARGIN)]
+    in_parallel(tasks)
+    smooth = np.stack([_smoothed(*one) for one in zip(found, unlike, to_bytes(alpha[:, 0]))])
+    return torch.from_numpy(smooth)[:, None].to(alpha), torch.from_numpy(unlike)[:, None].to(alpha)
+
+
+def _runs(half: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """First labels of both runs at full size, from disparity at half the size: around the least of its neighbourhood
+    and around the greatest, or, where these are near each other, one beside the other."""
+    window, run = np.ones((NEIGHBOURHOOD, NEIGHBOURHOOD), np.uint8), kernels.RUN
+    low, high = (np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate))
+    low = np.maximum(np.where(high < low + run, (low + high) // 2 - run // 2, low), 0)
+    return low, np.maximum(high, low + run)
+
+
+def _doubled(plane: NDArray) -> NDArray:
+    return plane.repeat(FINE, 0).repeat(FINE, 1)
+
+
+def _block(views: tuple, box: tuple, found: NDArray, unlike: NDArray) -> None:
+    own, own_bits, other, other_bits, end, along, length, cut, low, high = views
+    inner, outer = box
+    planes = (own, own_bits, end, along, length, cut, low, high)
+    a, a_bits, e, u, n, c, lo, hi = (np.ascontiguousarray(x[outer]) for x in planes)
+    cost = np.empty((*a.shape, kernels.LABELS), np.uint8)
+    kernels.band_costs(a, a_bits, other, other_bits, e, u, n, c, lo, hi, cost)
+    total = np.zeros(cost.shape, np.float32)
+    kernels.band_aggregate(cost, a, lo, hi, total)
+    d, f = np.empty(a.shape, np.float32), np.empty(a.shape, np.float32)
+    kernels.band_winners(total, lo, hi, e, u, n, *other.shape, d, f)
+    inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
+    found[inner], unlike[inner] = d[inside], f[inside]
+
+
+def _smoothed(found: NDArray, unlike: NDArray, guide: NDArray) -> NDArray[np.float32]:
+    consistent = (unlike < CONSISTENT).astype(np.float32)
+    dense = filled(found[None], consistent + 1e-5, guide, DISPARITY_FILL)[0]
+    return np.asarray(cv2.medianBlur(np.where(consistent > 0, found, dense), 5), np.float32)

@@ -1,0 +1,100 @@
+"""Matching at full size, around what was found at half the size."""
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Segments, pixel_grid
+from pat.networks import band_kernels, semi_global_kernels
+from pat.networks.band_kernels import LABELS, RUN
+from pat.networks.matching import _runs, matched
+from pat.networks.semi_global import Normalisations, matched_at_half_size
+
+H, W, NEAREST = 96, 160, 30
+FAR, NEAR = 6, 21
+BOX = (slice(21, 70), slice(53, 104))
+
+
+def test_with_all_labels_it_is_semi_global_matching():
+    """Both runs beside each other are ten labels; those of every pixel begin elsewhere."""
+    rng = np.random.default_rng(0)
+    guide = rng.random((9, 11), np.float32)
+    cost = rng.integers(0, 60, (9, 11, LABELS), np.uint8)
+    low = np.full((9, 11), 3, np.int32)
+    whole, bands = np.zeros((2, *cost.shape), np.float32)
+    semi_global_kernels.aggregate(cost, guide, whole)
+    band_kernels.band_aggregate(cost, guide, low, low + RUN, bands)
+    np.testing.assert_allclose(bands, whole, rtol=1e-5)
+
+
+def aggregated(cost, guide, labels):
+    """One path along a row, written out: `labels` (w, LABELS) of each pixel."""
+    total = cost.astype(float).copy()
+    for order in (range(1, len(cost)), range(len(cost) - 2, -1, -1)):
+        path = cost.astype(float).copy()
+        for x in order:
+            before = x - 1 if order.step > 0 else x + 1
+            jump = max(13.0, 100 / (1 + abs(float(guide[x]) - float(guide[before])) / (8 / 255)))
+            apart = np.abs(labels[x][:, None] - labels[before][None])
+            step = np.where(apart == 0, 0.0, np.where(apart == 1, 12.0, jump))
+            path[x] = cost[x] + (path[before][None] + step).min(1) - path[before].min()
+        total += path
+    return total - cost
+
+
+def test_runs_of_neighbours_are_aligned_by_label():
+    rng = np.random.default_rng(1)
+    guide = rng.random((1, 12), np.float32)
+    cost = rng.integers(0, 60, (1, 12, LABELS), np.uint8)
+    low = rng.integers(0, 6, (1, 12), np.int32)
+    high = low + RUN + rng.integers(0, 6, (1, 12), np.int32)
+    total = np.zeros(cost.shape, np.float32)
+    band_kernels.band_aggregate(cost, guide, low, high, total)
+    run = np.arange(RUN)
+    labels = np.concatenate([low[0][:, None] + run, high[0][:, None] + run], 1)
+    paths = total[0] - 6 * cost[0].astype(float)
+    np.testing.assert_allclose(paths, aggregated(cost[0], guide[0], labels), rtol=1e-4, atol=1e-2)
+
+
+@pytest.mark.parametrize("half", [np.full((6, 6), 9.0), np.tile([4.0, 4.0, 4.0, 30.0, 30.0, 30.0], (6, 1))])
+def test_runs_hold_what_is_nearby_and_do_not_overlap(half):
+    low, high = _runs(half.astype(np.float32))
+    assert (high >= low + RUN).all()
+    for value in np.unique(half):
+        beside = np.abs(np.arange(12) // 2 - np.flatnonzero(half[0] == value)[:, None]).min(0) <= 2
+        held = [(first <= value) & (value < first + RUN) for first in (low[:, beside], high[:, beside])]
+        assert (held[0] | held[1]).all()
+
+
+def scene() -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, Segments, Segments]:
+    """A square before a wall, edges between the blocks of half the size; alpha, beta, disparity, segments, blocks."""
+    g = torch.Generator().manual_seed(0)
+    wall, square = torch.rand(H, W + 64, generator=g), torch.rand(BOX[0].stop - BOX[0].start, 51, generator=g)
+    images = []
+    for far, near in ((0, 0), (FAR, NEAR)):
+        image = wall[:, 32 + far : 32 + far + W].clone()
+        image[BOX[0], BOX[1].start - near : BOX[1].stop - near] = square
+        images.append(image[None, None])
+    disparity = torch.full((H, W), float(FAR))
+    disparity[BOX] = NEAR
+    found = []
+    for step in (1, 2):
+        x = (pixel_grid((H // step, W // step), dtype=torch.float64) + 0.5) * step - 0.5
+        start = torch.stack([(x[..., 0] - NEAREST).clamp(min=0), x[..., 1]], -1)
+        found.append(Segments(start[None], x[None], torch.ones(1, *x.shape[:-1], dtype=torch.bool)))
+    return images[0], images[1], disparity, *found
+
+
+def test_an_edge_is_found_to_the_pixel():
+    alpha, beta, disparity, segments, blocks = scene()
+    normalisations = Normalisations.of(alpha, beta)
+    half, _ = matched_at_half_size(alpha, beta, blocks, normalisations.half)
+    found, facts = matched(alpha, beta, segments, blocks, normalisations)
+    near_edge = torch.zeros(H, W, dtype=torch.bool)
+    near_edge[BOX[0].start : BOX[0].stop, BOX[1].stop - 4 : BOX[1].stop + 4] = True
+    doubled = half[0, 0].repeat_interleave(2, 0).repeat_interleave(2, 1)
+    wrong = [float(((d - disparity).abs() > 1)[near_edge].float().mean()) for d in (doubled, found[0, 0])]
+    assert wrong[1] < 0.05
+    assert wrong[1] < 0.5 * wrong[0]
+    occluded = facts[0, 0, 14:32, 24:26]
+    assert (occluded > 0.2).float().mean() > 0.8
