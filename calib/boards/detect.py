@@ -129,7 +129,7 @@ def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
 
     AprilTags touch other squares at their corners: OpenCV's way of finding them and that of their authors miss others.
     """
-    found = {}
+    found: dict[int, np.ndarray] = {}
     april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
     for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
         parameters = cv2.aruco.DetectorParameters()

@@ -127,8 +127,10 @@ def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) ->
     found = []
     for name, covered in covers.items():
         found += [f"{name}: {text}" for text in covered.missing]
-        if covered.missing and calibration.fit.covariance is not None:
-            known = intrinsics_of(calibration.fit, name)
+        if not covered.missing or calibration.fit.covariance is None:
+            continue
+        known = intrinsics_of(calibration.fit, name)
+        if len(known.covariance):
             views = next_views(known, calibration.board, float(np.mean(covered.depths)))
             listed = "; then ".join(view.text for view in views)
             gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"

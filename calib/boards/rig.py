@@ -309,7 +309,10 @@ def _with_shape(fit: BundleResult, free: Free, flat: BoardShape) -> BundleResult
     if fit.problem.shape is not None:
         return fit
     trial = replace(fit.problem, shape=flat)
-    found = jackknife(trial, free, fit.sigma)
+    try:
+        found = jackknife(trial, free, fit.sigma)
+    except np.linalg.LinAlgError:  # some parameters are not observable yet
+        return fit
     if not is_significant(found.step, found.shapes, len(flat.part)):
         return fit
     shaped = adjust(trial, free)

@@ -11,14 +11,11 @@ from tyro.conf import Positional, UseAppendAction, arg
 from . import options
 from .options import Depth, Out, say
 
-BoardName = Annotated[
-    str,
-    arg(
-        metavar="BOARD",
-        help="charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
-        "aprilgrid:6x6:88mm:0.3 (tags), or Kalibr's target file.",
-    ),
-]
+BOARDS = (
+    "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
+    "aprilgrid:6x6:88mm:0.3 (tags), or Kalibr's target file."
+)
+BoardName = Annotated[str, arg(metavar="BOARD", help=BOARDS)]
 
 
 @dataclass
@@ -31,8 +28,9 @@ class Calibrate:
 
     photos: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Folder with the images (or videos) of all cameras."""
-    board: UseAppendAction[tuple[BoardName, ...]] = ()
-    """Once for each board; several at once need markers of their own (see `pat board`)."""
+    board: UseAppendAction[
+        Annotated[tuple[str, ...], arg(metavar="BOARD", help=f"Once for each board in the images: {BOARDS}")]
+    ] = ()
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
@@ -90,8 +88,13 @@ class PrintBoard:
     board: Positional[BoardName]
     out: Out = Path("board.pdf")
     """File to write, ending in .pdf or .svg."""
+    paper: Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None = None
+    """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:
+        from calib.boards.printing import page_note
         from calib.boards.run import write_board
+        from calib.boards.target import parse_board
 
-        say(f"written: {write_board(self.board, options.writable(self.out))}")
+        say(f"written: {write_board(self.board, options.writable(self.out), paper=self.paper)}")
+        say(page_note(parse_board(self.board)))

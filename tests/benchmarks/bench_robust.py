@@ -71,7 +71,10 @@ def rows(draws: int, shares: Sequence[float]) -> Iterator[str]:
     yield markdown_header(["wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px"])
     beyond = []
     for share in shares:
-        judgements = [judged(share, draw) for draw in tqdm(range(draws), desc=f"{share:.0%}", mininterval=10)]
+        judgements: list[Draw] = []
+        for draw in (progress := tqdm(range(draws), desc=f"{share:.0%}")):
+            judgements.append(judged(share, draw))
+            progress.set_postfix(worst=max(d.worst for d in judgements))
         bad = [i for i, d in enumerate(judgements) if d.worst > 5]
         worst, squares, rms = (np.array(column) for column in zip(*judgements))
         cells = f"{worst.max():.1f}", len(bad), f"{squares.mean():.2f}, {squares.max():.2f}", f"{rms.max():.3f}"
