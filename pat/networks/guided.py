@@ -41,7 +41,7 @@ COARSE = 4
 """Context is computed at a quarter of the size."""
 LEAST_WEIGHT = 1e-3
 """The least weight of a pixel in propagation."""
-TRUST = 1.0
+CONFIDENCE_OFFSET = 1.0
 """Added to the logit of the confidence where colour is blended, and twice as much to that of taking what was matched:
 matches have become better since the weights were trained. Chosen on Middlebury's pairs of the tune half."""
 NOWHERE = -10.0
@@ -194,7 +194,7 @@ class GuidedPAT(nn.Module):
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
     ) -> Float[Tensor, "b c h w"]:
         """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
-        confidence = torch.cat([(s.logit + TRUST).sigmoid().expand_as(s.colour) for s in estimates], 1)
+        confidence = torch.cat([(s.logit + CONFIDENCE_OFFSET).sigmoid().expand_as(s.colour) for s in estimates], 1)
         colour = torch.cat([s.colour for s in estimates], 1)
         rest = torch.cat([self._unseen(own, s) for s in estimates], 1)
         blend = torch.lerp(rest, colour, confidence)
@@ -236,7 +236,7 @@ class GuidedPAT(nn.Module):
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, found.matched, (exact + 2 * TRUST).sigmoid())
+        colour = torch.lerp(value - alpha, found.matched, (exact + 2 * CONFIDENCE_OFFSET).sigmoid())
         position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
         return BetaEstimate(attended, colour, found.colour, logit, choice, position)
 

@@ -48,6 +48,24 @@ def test_grey_points_leave_rec601():
     assert fit(x, x.mean(0) + 0.01 * torch.randn(4000, generator=g)).is_rec601
 
 
+def points_of_one_hue():
+    """Warm surfaces, light and dark, whose hue varies a little."""
+    g = torch.Generator().manual_seed(0)
+    value = torch.rand(4000, generator=g) * 0.8 + 0.15
+    return torch.tensor([0.95, 0.65, 0.3])[:, None] * value * (1 + 0.03 * torch.randn(3, 4000, generator=g)), g
+
+
+def test_in_one_hue_a_darker_alpha_is_a_sensor_and_a_brighter_one_may_be_light():
+    """Usual sensors see warm surfaces darker than Rec. 601's luma does: what is brighter may as well be exposure."""
+    x, g = points_of_one_hue()
+    noise = 0.01 * torch.randn(4000, generator=g)
+    sensor = fit(x, (torch.tensor([0.33, 0.39, 0.28])[:, None] * x).sum(0) + noise)
+    assert sensor.gain == 1
+    assert not sensor.is_rec601
+    brighter = fit(x, 1.12 * luminance(x[:, None])[0, 0] + noise)
+    assert brighter.gain == pytest.approx(1.12**0.5, abs=0.02)
+
+
 def test_fusion_of_another_response():
     """Taken for Rec. 601, the colours of this alpha are several dB off; with its response stated they are not."""
     sample, network = load_sample(), load_weights("mono-colour-small")
