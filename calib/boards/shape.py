@@ -1,6 +1,6 @@
 """Boards that are neither flat nor printed true to size: their shape as unknowns of the bundle adjustment.
 
-A print may be longer along one axis, and a sheet may bend. To third order a bent sheet keeps the lengths on it: with
+A print may be longer along one axis, and a sheet may curved. To third order a bent sheet keeps the lengths on it: with
 the symmetric curvature C (1/m) about the board's middle, the point q moves to q - C q (q^T C q) / 6, and out of the
 plane by q^T C q / 2 - (q^T C q) (q^T C^2 q) / 24; exact to that order for cylinders of any axis.
 """
@@ -73,17 +73,17 @@ class BoardShape:
         """Inverse variances of the values before any measurement."""
         return np.tile(DEVIATIONS**-2.0, len(self.values))
 
-    def bend(self, board: int, extent: tuple[float, float]) -> Bend:
+    def main_curvature(self, board: int, extent: tuple[float, float]) -> Curvature:
         """The board's main curvature over a board of some width and height (metres)."""
         _, a, b, c = self.values[board]
         curvatures, axes = np.linalg.eigh(np.array([[a, b], [b, c]]))
         main = int(np.abs(curvatures).argmax())
         length = float(np.abs(axes[:, main]) @ np.array(extent))
         curvature = float(curvatures[main])
-        return Bend(abs(curvature) * length**2 / 8, 1 / max(abs(curvature), 1e-9), curvature > 0)
+        return Curvature(abs(curvature) * length**2 / 8, 1 / max(abs(curvature), 1e-9), curvature > 0)
 
 
-class Bend(NamedTuple):
+class Curvature(NamedTuple):
     """How far the middle lies off the plane of two opposite edges, metres; radius, metres; towards the cameras."""
 
     depth: float
@@ -115,7 +115,7 @@ def described(shape: BoardShape, deviations: Float[np.ndarray, "k 4"], extents: 
     found = []
     for k, (extent, deviation) in enumerate(zip(extents, deviations)):
         name = f"board {k + 1}" if len(extents) > 1 else "the board"
-        stretch, bend = shape.values[k, 0], shape.bend(k, extent)
+        stretch, curved = shape.values[k, 0], shape.main_curvature(k, extent)
         if abs(stretch) > 3 * deviation[0]:
             found.append(
                 f"{name} is stretched: squares are {100 * abs(stretch):.2f} ± {100 * deviation[0]:.2g} % "
@@ -125,8 +125,8 @@ def described(shape: BoardShape, deviations: Float[np.ndarray, "k 4"], extents: 
         relative = float(np.max(np.abs(shape.values[k, 1:]) / deviation[1:]))
         if relative > 3:
             found.append(
-                f"{name} is bent: its middle lies {1e3 * bend.depth:.2f} ± {1e3 * bend.depth / relative:.2g} mm "
-                f"{'behind' if not bend.towards else 'in front of'} its edges (radius {bend.radius:.2f} m); this is "
-                "modelled: glue it to something stiff and flat"
+                f"{name} is bent: its middle lies {1e3 * curved.depth:.2f} ± {1e3 * curved.depth / relative:.2g} mm "
+                f"{'in front of' if curved.towards else 'behind'} its edges (radius {curved.radius:.2f} m); this "
+                "is modelled: glue it to something stiff and flat"
             )
     return found
