@@ -64,9 +64,21 @@ def resampled(
     Where `source` sees nothing values are 0, or if `extended` those of its nearest pixel; they are not valid. The
     baseline between the two is ignored; uncalibrated views count as having the same orientation.
     """
-    x, seen = pixels_between(source, target)
+    return sampled_between(image, source, pixels_between(source, target), interpolation, extended=extended)
+
+
+def sampled_between(
+    image: Float[Tensor, "c h w"],
+    source: LensView,
+    found: tuple[Float[Tensor, "ht wt 2"], Tensor],
+    interpolation: Interpolation,
+    *,
+    extended: bool = False,
+) -> Sampled:
+    """`resampled` with what `pixels_between` found, which several images of one camera share."""
+    x, seen = found
     h, w = source.hw
     nearest = torch.minimum(x.clamp(min=0), x.new_tensor([w - 1, h - 1]))
     inside = torch.where(seen[..., None], x, nearest if extended else 0.0)
-    found = sample(image[None], inside[None].to(image), interpolation=interpolation)
-    return Sampled(found.values * (seen | extended), found.valid & seen)
+    values, valid = sample(image[None], inside[None].to(image), interpolation=interpolation)
+    return Sampled(values * (seen | extended), valid & seen)

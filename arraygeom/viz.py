@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from statistics import fmean
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -41,17 +42,19 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
     """The rig in three dimensions: each camera's frustum and name, and alpha's view from near to far.
 
     `size` is the frusta's length in metres (by default a fraction of the rig's extent), `alpha` the camera whose
-    depth range is drawn (the first calibrated one; the range is left out where it would dwarf the rig, beyond 40
+    depth range is drawn (the first calibrated one; the range is left out where it would dwarf the rig, beyond 6
     times its extent, or is infinite). Up in the figure is -y of the world.
     """
     cameras = calibrated(rig)
     figure = new_figure(figsize=(5.2, 4.6), layout="constrained")
     axes: Any = figure.add_subplot(projection="3d", proj_type="ortho")
     size = size or frustum_size(cameras)
+    middle = fmean(float(camera.centre[0]) for camera in cameras.values())
     for colour, (name, camera) in zip(_colours(), cameras.items()):
         for line in frustum(camera, size):
             axes.plot(*_upright(line), color=colour, lw=1.1)
-        axes.text(*_upright(numpy(camera.centre)), f"{name} ", color=colour, fontsize=8, ha="right", va="top")
+        side = "right" if float(camera.centre[0]) <= middle else "left"
+        axes.text(*_upright(numpy(camera.centre)), f" {name} ", color=colour, fontsize=8, ha=side, va="top")
     for line in depth_outline(rig, cameras, alpha):
         axes.plot(*_upright(line), color="0.6", lw=0.8, ls="--")
     _equal_axes(axes)
@@ -119,7 +122,7 @@ def depth_outline(rig: Rig, cameras: Mapping[str, Camera], alpha: str | None) ->
     if rig.depth is None:
         return []
     camera = cameras[alpha or next(iter(cameras))]
-    limit = 40 * max(extent_of(cameras), 0.05)
+    limit = 6 * max(extent_of(cameras), 0.05)
     depths = [float(d) for d in rig.depth if float(d) <= limit]
     borders = [seen_at(camera, image_border(camera.hw), d) for d in depths]
     edges = zip(*(b[:: len(b) // 4][:4] for b in borders)) if len(borders) == 2 else []
@@ -202,6 +205,85 @@ def draw_sampling_locations(axes: Axes, field: ReceptiveField, pair: Pair, x: Fl
 # How well it fits ---------------------------------------------------------------------------------------------
 
 
+class NearLine(NamedTuple):
+    """The part of an epipolar line (a curve, through a lens) around a point of beta, and the point's distance."""
+
+    curve: Float[Tensor, "n p 2"]
+    distance: Float[Tensor, " n"]
+
+
+def near_line(pair: Pair, x: Float[Tensor, "n 2"], y: Float[Tensor, "n 2"], half: float) -> NearLine:
+    """The lines of alpha's points x where they pass y, `half` pixels to either side. Pixels of the images as recorded.
+
+    Distances are from the nearest point of the line. NaN where a lens has no ray.
+    """
+    F = pair.fundamental.to(torch.float64)
+    (own, _), (other, _) = pair.alpha.undistort(x.double()), pair.beta.undistort(y.double())
+    line = epipolar_lines(F, own)
+    nearest = other - epipolar_distance(F, own, other)[:, None] * direction(line[:, :2])
+    along = torch.stack([-line[:, 1], line[:, 0]], -1)
+    points = nearest[:, None] + torch.linspace(-half, half, 65).double()[:, None] * direction(along)[:, None]
+    curve, valid = pair.beta.distort(points)
+    return NearLine(torch.where(valid[..., None], curve, torch.nan), (pair.beta.distort(nearest)[0] - y).norm(dim=-1))
+
+
+def draw_matches(
+    rig: Rig,
+    alpha: str,
+    matches: Mapping[str, tuple[Float[Tensor, "n 2"], Float[Tensor, "n 2"]]],
+    images: Mapping[str, Any],
+    *,
+    count: int = 7,
+    half: int = 18,
+) -> Figure:
+    """Patches around points matched between alpha and each beta, spread over alpha's image, and the lines they miss.
+
+    Above, alpha's patch, `half` pixels to either side of the point; below, beta's around the match, with the line that
+    the rig gives to alpha's point and the distance in pixels. `matches` holds points (x, y) of alpha and of the beta,
+    by beta, found in the images: they are on their lines only if the rig is right.
+    """
+    figure = new_figure(figsize=(1.55 * count, 3.7 * len(matches)), layout="constrained")
+    parts: Any = figure.subfigures(len(matches), 1, squeeze=False)
+    for row, (part, (name, (x, y))) in enumerate(zip(parts[:, 0], matches.items())):
+        near = near_line(rig.pair(alpha, name), x, y, 2 * half)
+        chosen = _spread(x, min(count, len(x)))
+        factor = max(rig[name].hw) / max(rig[alpha].hw)
+        axes = part.subplots(2, count, squeeze=False)
+        for blank in axes.flat:
+            blank.set_axis_off()
+        for column, i in enumerate(chosen):
+            _draw_patch(axes[0][column], rig[alpha].hw, images.get(alpha), numpy(x[i]), half)
+            below = axes[1][column]
+            _draw_patch(below, rig[name].hw, images.get(name), numpy(y[i]), half * factor)
+            below.plot(*numpy(near.curve[i]).T, color=COLOURS[1 + row % 7], lw=1.4)
+            below.set_title(f"{float(near.distance[i]):.2f} px off", fontsize=9)
+        median = float(near.distance.nanmedian())
+        part.suptitle(
+            f"{alpha} (above) and {name} (below): {len(x)} matched points, {median:.2f} px from their lines (median)",
+            fontsize=10,
+        )
+    return figure
+
+
+def _draw_patch(axes: Axes, hw: HW, image: Any, middle: np.ndarray, half: float) -> None:
+    """An image around a point, which a small cross marks without covering it."""
+    show_image(axes, hw, image)
+    for part in ([0.12, 0.35], [-0.12, -0.35]):
+        ends = np.array(part) * half
+        for dx, dy in ((ends, 0 * ends), (0 * ends, ends)):
+            axes.plot(middle[0] + dx, middle[1] + dy, color="gold", lw=1.2)
+    axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] + half, middle[1] - half))
+    axes.set_axis_on()
+
+
+def _spread(x: Float[Tensor, "n 2"], count: int) -> list[int]:
+    """Indices of points far from each other: each next one is the farthest from those before."""
+    chosen = [int((x - x.mean(0)).norm(dim=-1).argmin())]
+    while len(chosen) < count:
+        chosen.append(int(torch.cdist(x, x[chosen]).amin(1).argmax()))
+    return sorted(chosen, key=lambda i: float(x[i, 0]))
+
+
 def draw_residuals(
     pair: Pair,
     x_alpha: Float[Tensor, "n 2"],
@@ -256,7 +338,8 @@ def show_image(axes: Axes, hw: HW, image: Any = None) -> None:
     if image is not None:
         pixels = np.asarray(image.detach().cpu() if isinstance(image, Tensor) else image)
         pixels = pixels.transpose(1, 2, 0) if pixels.ndim == 3 and pixels.shape[0] in (1, 3) else pixels
-        axes.imshow(np.squeeze(pixels), cmap="gray", interpolation="antialiased", aspect="equal")
+        white = 1.0 if np.issubdtype(pixels.dtype, np.floating) else np.iinfo(pixels.dtype).max
+        axes.imshow(np.squeeze(pixels), cmap="gray", vmin=0, vmax=white, interpolation="antialiased", aspect="equal")
     axes.set(xlim=(-0.5, w - 0.5), ylim=(h - 0.5, -0.5), aspect="equal", xticks=[], yticks=[])
     axes.set_facecolor("0.94")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -22,6 +23,8 @@ from .matches import Matches, match_cameras
 from .plausibility import least_surprise
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
+
+LOG = logging.getLogger(__name__)
 
 MOST = 250
 """Largest number of matches used of a pair."""
@@ -169,6 +172,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     """`diagnose` from matched points of images of these sizes."""
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
     tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
+    LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     figures, inliers, noise = _evaluate(rig, tried, pairs)
     fits = all(rig[name].hw == hw for name, hw in sizes.items())
     order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].penalised_misfit)
@@ -178,6 +182,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
     if healthy or (fits and figures[best].penalised_misfit > LARGEST_REMAINDER * figures[0].penalised_misfit):
         best = 0
     candidate = best
+    LOG.info("comparing the mistake found with a drift")
     if best and fits and not _clearly_better(rig, tried[best], (figures[0], figures[best]), pairs, inliers, noise):
         best = 0
     equal = {tried[i].kind: tried[i] for i in reversed(order) if figures[i].penalised_misfit <= least and candidate}

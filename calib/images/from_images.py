@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -17,6 +18,8 @@ from arraygeom import Rig, View, intrinsics
 from .lenses import describe_lenses
 from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, with_map
 from .refinement import line_distances, refine_matches, split
+
+LOG = logging.getLogger(__name__)
 
 
 class UncalibratedRig(NamedTuple):
@@ -67,6 +70,7 @@ def rig_from_images(
     )
     links, matched = {}, found.matches
     for names, matches in matched.items():
+        LOG.info("lines of %s and %s", *names)
         F, distance, by_focal = _fundamental(matches, *(K.get(name) for name in names))
         links[names] = fit_link(matches, F, within=AGREE).link
         found.distance[names], found.by_focal[names] = distance, by_focal

@@ -6,7 +6,8 @@ free; the rest are considered: uncertain, so that they explain what they may, bu
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -22,6 +23,20 @@ LEAST_NOISE = 0.03
 """Lower bound of the noise of matched points, pixels."""
 
 Residuals = Callable[[Tensor], Tensor]
+
+
+@dataclass(frozen=True)
+class JoinedResiduals:
+    """Residuals of several parts, such as pairs of cameras, each of which depends on some of the parameters only.
+
+    Derivatives by the others, which are 0, are not computed.
+    """
+
+    parts: Callable[[Tensor], Sequence[Tensor]]
+
+    def __call__(self, z: Float[Tensor, " k"]) -> Float[Tensor, " m"]:
+        """All residuals."""
+        return torch.cat(list(self.parts(z)))
 
 
 class Solution(NamedTuple):
@@ -126,11 +141,18 @@ def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
 def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:
     """f(z) and its derivatives, for many values of few parameters.
 
-    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian.
+    The gradient of u . f in z is linear in u; its derivatives in u are the columns of the Jacobian. An entry of the
+    gradient that is exactly 0 is of a parameter on which no value depends.
     """
     z = z.detach().requires_grad_()
-    values = f(z)
-    u = torch.zeros_like(values, requires_grad=True)
-    (slope,) = torch.autograd.grad(values, z, u, create_graph=True)
-    (columns,) = torch.autograd.grad(slope, u, torch.eye(len(z)).to(slope), is_grads_batched=True)
-    return values.detach(), columns.T
+    values, rows = f.parts(z) if isinstance(f, JoinedResiduals) else [f(z)], []
+    for part in values:
+        u = torch.linspace(1, 2, len(part), dtype=part.dtype, requires_grad=True)
+        (slope,) = torch.autograd.grad(part, z, u, create_graph=True)
+        depends = slope.detach() != 0
+        columns = torch.zeros(len(z), len(part), dtype=part.dtype)
+        if bool(depends.any()):
+            basis = torch.eye(len(z)).to(slope)[depends]
+            (columns[depends],) = torch.autograd.grad(slope, u, basis, is_grads_batched=True, retain_graph=True)
+        rows.append(columns.T)
+    return torch.cat([part.detach() for part in values]), torch.cat(rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping
 from contextlib import suppress
 from itertools import combinations
@@ -10,7 +11,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from kornia.color import rgb_to_grayscale
 from numpy.typing import NDArray
 from torch import Tensor
@@ -20,9 +21,13 @@ from arraygeom.pixels import shift_matrix
 
 from .patch_matching import refine_points
 
+LOG = logging.getLogger(__name__)
+
 RATIO = 0.75
 """The best match must be this much nearer than the second best (Lowe 2004, section 7.1)."""
 FEATURES = 6000
+MATCHED_AT_ONCE = 1024
+"""Features whose distances from all of the other image are held at once."""
 ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
 LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
@@ -90,10 +95,10 @@ def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:
     """Indices in both of the mutually nearest features that pass the ratio test."""
     if len(a.points) < 2 or len(b.points) < 2:
         return [], []
-    forward = _nearest(a.descriptors, b.descriptors)
-    backward = _nearest(b.descriptors, a.descriptors)
-    pairs = [(i, j) for i, j in forward.items() if backward.get(j) == i]
-    return [i for i, _ in pairs], [j for _, j in pairs]
+    forward, backward = _nearest(a.descriptors, b.descriptors), _nearest(b.descriptors, a.descriptors)
+    i = torch.arange(len(forward))
+    mutual = (forward >= 0) & (backward[forward] == i)
+    return i[mutual].tolist(), forward[mutual].tolist()
 
 
 def _match(a: SiftFeatures, b: SiftFeatures) -> Matches:
@@ -123,11 +128,17 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
     """
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
-    features = {name: detect_features(image) for name, image in images.items()}
+    features = {}
+    for name, image in images.items():
+        LOG.info("features of %s", name)
+        features[name] = detect_features(image)
     for name, own in features.items():
         if len(own.points) < ENOUGH:
             raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
-    found = {(a, b): _agreeing(features[a], features[b], images[b]) for a, b in combinations(images, 2)}
+    found = {}
+    for a, b in combinations(images, 2):
+        LOG.info("matching %s and %s", a, b)
+        found[a, b] = _agreeing(features[a], features[b], images[b])
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
         displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
@@ -281,6 +292,16 @@ def _percentiles(values: Tensor, share: float) -> tuple[float, float]:
     return low, high
 
 
-def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> dict[int, int]:
-    found = cv2.BFMatcher().knnMatch(a, b, k=2)
-    return {m.queryIdx: m.trainIdx for m, second in found if m.distance < RATIO * second.distance}
+def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> Int[Tensor, " n"]:
+    """For each row of `a` the nearest of `b` if it passes the ratio test, else -1.
+
+    By matrix products, as they are several times faster than OpenCV's matcher; of SIFT's whole numbers they are exact.
+    """
+    others = torch.from_numpy(b)
+    power, found = others.square().sum(1), []
+    for rows in torch.from_numpy(a).split(MATCHED_AT_ONCE):
+        squared = power - 2 * rows @ others.T + rows.square().sum(1, keepdim=True)
+        least, nearest = squared.min(1)
+        second = squared.scatter_(1, nearest[:, None], torch.inf).amin(1)
+        found.append(torch.where(least.clamp(min=0) < RATIO**2 * second, nearest, -1))
+    return torch.cat(found)

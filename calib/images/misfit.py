@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -10,9 +12,10 @@ from torch import Tensor
 
 from arraygeom import Rig
 
-from .matches import match_cameras
+from .doctor import diagnose_matches
+from .matches import Matches, match_cameras
 from .refinement import line_distances
-from .residuals import own_distance, related
+from .residuals import match_depths, own_distance, related
 
 LARGEST_SIDE = 1000
 """Images are reduced to this many pixels."""
@@ -22,12 +25,47 @@ BADLY, OF_OWN = 1.5, 3.0
 than this many times their distance from the lines of an F fitted to them."""
 
 
+OUTSIDE = 0.5
+"""And a rig is wrong that has more than this share of the points behind the cameras or outside its depth range..."""
+BEYOND = 1.5
+"""... by more than this factor."""
+FEW = 10
+"""Least number of points for a share."""
+
+
+class Misfit(NamedTuple):
+    """How badly a rig fits: its matched points and how far they lie from their lines (median, pixels), the share of
+    them behind the cameras or outside the depth range, and a sentence on both. `rig` and `pairs` are of the sizes that
+    the images were reduced to."""
+
+    rig: Rig
+    pairs: Mapping[tuple[str, str], Matches]
+    off: float
+    outside: float
+    text: str
+
+    @property
+    def verdict(self) -> str:
+        """What the doctor says of it; empty if it names no mistake."""
+        sizes = {name: self.rig[name].hw for pair in self.pairs for name in pair}
+        found = diagnose_matches(self.rig, sizes, self.pairs)
+        return "" if found.named.kind == "nothing" else found.verdict
+
+
 def misfit_warning(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> str | None:
-    """A sentence if the rig fits one image (C, H, W) of each of two or more of its cameras badly; else None.
+    """The sentence of `find_misfit`, with what to do; else None."""
+    found = find_misfit(rig, images)
+    if found is None:
+        return None
+    return f"{found.text}; `pat rig doctor` finds usual mistakes, `pat rig refine` improves a rig that has drifted"
+
+
+def find_misfit(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Misfit | None:
+    """What is wrong if the rig fits one image (C, H, W) of each of two or more of its cameras badly; else None.
 
     None too where nothing can be said: too few matched points, images of another size, cameras that are not related.
     """
-    some = dict(list(images.items())[:MOST_CAMERAS])
+    some = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(some) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in some.items()):
         return None
     reduced = {}
@@ -41,12 +79,27 @@ def misfit_warning(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> st
         pairs = related(rig, match_cameras(reduced))
     except ValueError:
         return None
-    off = float(line_distances(rig, pairs).abs().median())
-    if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)):
+    off, outside = float(line_distances(rig, pairs).abs().median()), share_outside(rig, pairs)
+    if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)) and outside <= OUTSIDE:
         return None
     points = sum(len(matches.alpha) for matches in pairs.values())
     at = "" if all(reduced[name] is some[name] for name in some) else f", in images reduced to {LARGEST_SIDE} px"
-    return (
-        f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines (median{at}); "
-        "`pat rig doctor` finds usual mistakes, `pat rig refine` improves a rig that has drifted"
-    )
+    text = f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines (median{at})"
+    if outside > OUTSIDE:
+        text += f", {outside:.0%} of them behind the cameras or outside the depth range"
+    return Misfit(rig, pairs, off, outside, text)
+
+
+def share_outside(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:
+    """The share of points of observable depth that are behind the cameras or outside the rig's depth range; 0 for few.
+
+    Points of calibrated pairs only; the depth range counts with a margin.
+    """
+    near, far = (0.0, math.inf) if rig.depth is None else (float(rig.depth[0]) / BEYOND, float(rig.depth[1]) * BEYOND)
+    outside = []
+    for names, matches in pairs.items():
+        if (found := match_depths(rig.pair(*names), matches)) is not None:
+            inside = found.front & (found.depth >= near) & (found.depth <= far)
+            outside.append(~inside[found.observable])
+    joined = torch.cat(outside) if outside else torch.zeros(0)
+    return float(joined.double().mean()) if len(joined) >= FEW else 0.0

@@ -6,6 +6,7 @@ import fnmatch
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float
@@ -51,7 +52,7 @@ class FreeParameter:
     factor: float
     correlation: float = 0.0
 
-    @property
+    @cached_property
     def root(self) -> Float[Tensor, "k k"]:
         """A lower triangular root of the prior covariance: the change is root z."""
         eye = torch.eye(len(self.sigma), dtype=torch.float64)

@@ -20,8 +20,8 @@ from arraygeom import Camera, Rig
 from .least_squares import jacobian
 from .matches import Matches
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
-from .refinement import sampson, systematic_columns
-from .residuals import match_depths
+from .refinement import systematic_columns
+from .residuals import match_depths, sampson
 
 Pairs = Mapping[tuple[str, str], Matches]
 

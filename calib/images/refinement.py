@@ -15,6 +15,7 @@ fusion: see `photometric`.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,13 +26,15 @@ from torch import Tensor
 from arraygeom import Camera, Rig
 
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
-from .least_squares import Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
+from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
 from .matches import ENOUGH, Matches, match_cameras, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
-from .residuals import epipolar_residuals, own_distance, related, systematic_modes
+from .residuals import epipolar_residuals, own_distance, related, sampson_of_pairs, systematic_modes
+
+LOG = logging.getLogger(__name__)
 
 Pairs = Mapping[tuple[str, str], Matches]
 Frame = Mapping[str, Float[Tensor, "_ _ _"]]
@@ -189,10 +192,14 @@ class RefinementProblem:
         If depth still changes by more than they determine it, without any change of depth that can be avoided.
         """
         systematic = systematic_columns(self.rig, self.used)
+        LOG.info("refining %d parameters by %d points", self.count, len(systematic))
+        columns = systematic.split([len(matches.alpha) for matches in self.used.values()])
 
-        def residuals(z: Tensor) -> Tensor:
-            return sampson(self.after(z[: self.uncertain]), self.used) + systematic @ z[self.uncertain :]
+        def parts(z: Tensor) -> list[Tensor]:
+            found = sampson_of_pairs(self.after(z[: self.uncertain]), self.used)
+            return [part + own @ z[self.uncertain :] for part, own in zip(found, columns)]
 
+        residuals = JoinedResiduals(parts)
         considered = self.uncertain - self.count + systematic.shape[1]
         unrestricted = solve(residuals, self.count, considered)
         found = self._determined(unrestricted, residuals)
@@ -202,7 +209,7 @@ class RefinementProblem:
 
     def solve_freely(self) -> Solution:
         """The posterior given the used points, whatever happens to depth."""
-        return solve(lambda z: sampson(self.after(z), self.used), self.count, 0)
+        return solve(JoinedResiduals(lambda z: sampson_of_pairs(self.after(z), self.used)), self.count, 0)
 
     def depth_derivatives(self) -> Float[Tensor, "m k"] | None:
         """Derivatives of the logarithm of the used points' depth by free and considered parameters.
@@ -371,6 +378,7 @@ def polish(
         parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
         return torch.cat([error[valid & (_held_out_pixels(error) == held_out)] for error, valid in parts])
 
+    LOG.info("minimising the photometric error, %d frames", len(frames))
     noise = noise_scale(errors(solution.z, held_out=False).detach())
     y = torch.zeros(root.shape[1], dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([y], max_iter=ROUNDS, line_search_fn="strong_wolfe", tolerance_change=1e-4)
@@ -393,12 +401,6 @@ def _held_out_pixels(error: Tensor) -> Tensor:
     """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
     rows, columns = (torch.arange(n) // 4 for n in error.shape)
     return (columns + 2 * rows[:, None]) % HELD_OUT == 0
-
-
-def sampson(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Sampson distances of all points of all pairs, pixels; 0 where a pixel has no ray."""
-    parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]
-    return torch.cat([torch.where(part.valid, part.sampson, 0.0) for part in parts])
 
 
 def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:

@@ -6,6 +6,7 @@ scene, and focal lengths only poorly: depths are multiples of the baseline, and 
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -23,6 +24,8 @@ from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_li
 from .patch_matching import refine_points
 from .refinement import line_distances, refine_matches
 
+LOG = logging.getLogger(__name__)
+
 FOCAL_SHARE = 1.2
 """The focal length that is assumed, as a share of the image's longer side: that of a view 45 degrees wide."""
 SIGMA = {"rotation": math.radians(3), "translation": 0.3, "focal": 0.05}
@@ -35,10 +38,11 @@ AS_GOOD = 1.5
 SLACK = 0.1
 """A calibrated pair is accepted if points are at most `AS_GOOD` times as far from its lines as from those of F alone,
 and `SLACK` pixels more."""
-ALIKE = 1.25
+ALIKE = 8.0
 ALIKE_SLACK = 0.03
-"""Poses whose points are so much farther from their lines than those of the best, in pixels too, are alike: points do
-not distinguish a rotation from a translation where they are few or far. The smallest rotation is taken."""
+"""Poses whose points are farther from their lines than those of the best by no more than this, over the root of the
+points' number, as a share, and so many pixels more, are alike: points do not distinguish a rotation from a translation
+where they are few or far. The smallest rotation is taken."""
 OUTLYING = 8.0
 """Inverse depths this many times their median deviation from the median are of wrong matches."""
 MARGIN, LEAST_MARGIN = 1.0, 0.12
@@ -76,17 +80,17 @@ def self_calibrated(
     near = near_lines(matches, link.F, within=NEAR_LINE)
     best = AS_GOOD * float(line_distance(near, link.F).median()) + SLACK
     upright = _upright(link)
-    trials = []
+    trials: list[RefinedPair] = []
     for pose in (*_lateral_poses(near, upright, K[alpha], K[beta]), *_poses(near, link.F, K[alpha], K[beta])):
         cameras = {alpha: _camera(views[alpha], K[alpha], Pose.identity()), beta: _camera(views[beta], K[beta], pose)}
-        rig = _unit_baseline(_refined(Rig(cameras), matches))
-        distance, bounds = _distance(rig, near), depth_bounds(rig, near)
-        if bounds is not None and distance <= best:
-            trials.append(RefinedPair(rig.replace(depth=bounds), len(near.alpha), distance))
+        LOG.info("calibrating %s and %s, pose %d", alpha, beta, len(trials) + 1)
+        trial = _refined_pair(Rig(cameras), matches, near)
+        if trial is not None and trial.distance <= best:
+            trials.append(trial)
     if not trials:
         return None
     least = min(trial.distance for trial in trials)
-    fitting = [trial for trial in trials if trial.distance <= ALIKE * least + ALIKE_SLACK]
+    fitting = [trial for trial in trials if _alike(trial, least)]
     return min(fitting, key=lambda trial: _angle(_pair(trial.rig).beta_from_alpha.R, upright))
 
 
@@ -103,11 +107,8 @@ def refined_by_depth(
     matches = dense_matches(pair.rig, images, depth, confidence)
     if len(matches.alpha) < 5 * ENOUGH:
         return pair
-    rig = _unit_baseline(_refined(pair.rig, matches))
-    bounds = depth_bounds(rig, matches)
-    if bounds is None:
-        return pair
-    return RefinedPair(rig.replace(depth=bounds), len(matches.alpha), _distance(rig, matches))
+    LOG.info("refining %s and %s by %d points", *pair.rig.names, len(matches.alpha))
+    return _refined_pair(pair.rig, matches, matches) or pair
 
 
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
@@ -222,11 +223,22 @@ def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
     return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
 
 
-def _refined(rig: Rig, matches: Matches) -> Rig:
+def _alike(pair: RefinedPair, least: float) -> bool:
+    """Whether a pose is hardly worse than the best one, whose distance is `least`."""
+    return pair.distance <= (1 + ALIKE / math.sqrt(pair.points)) * least + ALIKE_SLACK
+
+
+def _refined_pair(rig: Rig, matches: Matches, near: Matches) -> RefinedPair | None:
+    """The pair refined by matches, its distance and depths those of `near`; None without parallax."""
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]
     sigma = {**SIGMA, "centre": CENTRE_SHARE * max(rig[beta].hw)}
-    return refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
+    refined = refine_matches(rig, [{(alpha, beta): matches}], free=free, sigma=sigma, keep_depth=False).rig
+    refined = _unit_baseline(refined)
+    bounds = depth_bounds(refined, near)
+    if bounds is None:
+        return None
+    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), _distance(refined, near))
 
 
 def _unit_baseline(rig: Rig) -> Rig:

@@ -5,6 +5,7 @@ Imported when such a command runs, as it imports torch.
 
 from __future__ import annotations
 
+import logging
 import math
 import re
 import warnings
@@ -28,6 +29,8 @@ from ..media.exif import focal_length
 from ..media.images import read_image, write_image
 from ..media.video import read_video
 from ..networks.weights import Network, load_weights
+
+LOG = logging.getLogger(__name__)
 
 MATCHED = 1600
 """Images are reduced to this many pixels along their longer side to match features."""
@@ -185,6 +188,7 @@ def _refined(pair: RefinedPair, images: Images, network: Network) -> tuple[Refin
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         network = _for_bands(network, len(small[beta]))
+        LOG.info("coarse fusion of %s and %s", alpha, beta)
         frame = fuse(network, rig, small, alpha=alpha, align=False, response="rec601")
     refined = refined_by_depth(pair._replace(rig=rig), small, frame.depth, frame.confidence)
     if refined.rig is rig:

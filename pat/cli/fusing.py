@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +26,11 @@ if TYPE_CHECKING:
 
     from ..fusion.report import Facts
     from ..fusion.results import Frame
+    from ..fusion.tiles import Plan
+    from ..fusion.views import ViewFiles
+    from ..networks.pieces import Tile
+
+LOG = logging.getLogger(__name__)
 
 
 @dataclass
@@ -57,8 +63,8 @@ class Fuse:
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
     out: Out = Path("out")
-    """Folder for fused.png, confidence.png, depth.tif, depth.png, index.html (a page that shows them) and view.yaml
-    (the rig of the fused view)."""
+    """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png, index.html
+    (a page that shows them) and view.yaml (the rig of the fused view)."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
     """Receptive field in the other cameras; auto takes what the rig allows."""
@@ -77,6 +83,8 @@ class Fuse:
     """Low light: a camera's electrons at white and read noise in electrons, or estimate: views are denoised jointly."""
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
+    luminance: Literal["alpha", "mix", "beta"] = "alpha"
+    """Whose brightness the (single) fused image has: beta's, in alpha's detail, suits a near infrared alpha."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -150,9 +158,11 @@ class Fuse:
             raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
         files = options.files_by_name(self.image)
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
+        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
+        if not self.sequence:
+            warn_of_wrong_rig(views)
         if self.sequence or max(map(len, found.values())) > 1:
             return self._many(rig, found, self.alpha)
-        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
         self._one(views.developed, views, self.alpha)
 
     def _without_rig(self) -> None:
@@ -256,6 +266,7 @@ class Fuse:
                 explain=self._note,
                 noise=options.noise_of(self.noise),
                 keep_alpha=self.keep_alpha,
+                luminance=self.luminance,
                 store=store,
                 device=self.device,
             )
@@ -307,8 +318,9 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        if self.noise:
-            raise ValueError("--noise is of a single frame: fuse frames with it one by one, or use pat.fuse")
+        if self.noise or self.luminance != "alpha":
+            option = "--noise" if self.noise else "--luminance"
+            raise ValueError(f"{option} is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,
@@ -375,8 +387,30 @@ class Demo:
 
 def is_rig_file(path: Path) -> bool:
     """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
-    named = any(c in path.name for c in "*?[") or path.suffix.lower() in options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
-    return not named and not path.is_dir()
+    suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
+    return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
+
+
+def warn_of_wrong_rig(views: ViewFiles) -> None:
+    """Warn if a rig fits its images badly, with the doctor's verdict.
+
+    By a `LowConfidenceWarning` if it is wrong: mistaken by that verdict, or points are where nothing is seen. One that
+    has drifted is aligned anyway.
+    """
+    from calib.images.misfit import OUTSIDE, find_misfit
+
+    from ..fusion.checks import LowConfidenceWarning
+
+    with options.working("comparing the rig with the images"):
+        try:
+            found = find_misfit(views.developed, dict(views))
+        except (ValueError, OSError):  # of a file or an image: the fusion says so
+            return
+        verdict = found.verdict if found else ""
+    if found is not None:
+        wrong = bool(verdict) or found.outside > OUTSIDE
+        advice = f"`pat rig doctor` says: {verdict}" if verdict else "see `pat rig doctor`"
+        warnings.warn(f"{found.text}; {advice}", LowConfidenceWarning if wrong else UserWarning, stacklevel=2)
 
 
 def fuse_with_progress(
@@ -392,9 +426,22 @@ def fuse_with_progress(
     if where != "cpu":
         rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
     options.say_when_compiling()
-    bar: Any = options.progress("fusing")
-    frame = fuse(network, rig, images, progress=bar, announce=lambda p: say(f"plan: {p}"), **further)
+    with options.working("fusing") as retitle:
+
+        def announce(plan: Plan) -> None:
+            say(f"plan: {plan}")
+            retitle("fusing" if plan.seconds is None else f"fusing, about {plan.duration} in all")
+
+        frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
     return Frame(*(part.cpu() for part in frame))
+
+
+def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:
+    """The tiles, each said as it begins where there are several."""
+    for i, tile in enumerate(tiles, 1):
+        if count > 1:
+            LOG.info("tile %d of %d", i, count)
+        yield tile
 
 
 def device_of(name: str) -> str:

@@ -17,6 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
+from ..media.headers import RAW_SUFFIXES
+
 if TYPE_CHECKING:
     from rich.console import Console
     from torch import Tensor
@@ -29,6 +31,7 @@ SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
 WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
 
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
+IMAGE_SUFFIXES |= RAW_SUFFIXES
 VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
 
 
@@ -239,17 +242,39 @@ def progress(title: str) -> Callable[[Iterable[T], int], Iterable[T]]:
     return lambda items, total: track(items, title, total=total, console=console())
 
 
+LINE_EVERY = 10.0
+"""Least seconds between lines of progress where there is no terminal."""
+
+
 @contextmanager
-def working(title: str) -> Iterator[None]:
-    """A block during which the terminal shows a title and the seconds that have passed."""
+def working(title: str) -> Iterator[Callable[[str], None]]:
+    """A block during which the terminal shows a title, the step that is done, and the seconds that have passed.
+
+    Gives a function that changes the title. Where there is no terminal, steps are lines, `LINE_EVERY` seconds apart.
+    """
+    import time
+
     from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn()
-    with Progress(*columns, console=console(), transient=True) as bar:
-        bar.add_task(title, total=None)
-        yield
+    from ..support.steps import steps_shown
+
+    columns = SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), TextColumn("{task.fields[step]}")
+    terminal, printed = console().is_terminal, time.monotonic()
+    with Progress(*columns, console=console(), transient=True, disable=not terminal) as bar:
+        task = bar.add_task(title, total=None, step="")
+
+        def show(step: str) -> None:
+            nonlocal printed
+            bar.update(task, step=step)
+            if not terminal and time.monotonic() - printed > LINE_EVERY:
+                printed = time.monotonic()
+                say(f"{bar.tasks[0].description}: {step}")
+
+        with steps_shown(show):
+            yield lambda title: bar.update(task, description=title)
 
 
+@cache
 def say_when_compiling() -> None:
     """Say once, in one line, that numba compiles kernels, before it does: that takes up to a minute."""
     from numba.core import event

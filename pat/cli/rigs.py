@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
@@ -22,19 +23,20 @@ if TYPE_CHECKING:
 
 @dataclass
 class Show:
-    """Draw a rig, and the search segments of some alpha pixels in the other cameras."""
+    """Draw a rig, the search segments of some alpha pixels, and how far matched points lie from their lines."""
 
     rig: RigFile
     alpha: Annotated[str | None, optional("NAME")] = None
     """The camera whose pixels are chosen; by default the first."""
     image: Images = ()
-    """Images to draw on, if wanted."""
+    """Images to draw on, if wanted; with two or more, points are matched in them."""
     out: Out = Path("out/show")
-    """Folder for rig.png (cameras in space; if calibrated) and fields.png (search segments of some pixels)."""
+    """Folder for rig.png (cameras in space; if calibrated), fields.png (search segments of some pixels) and, with
+    images, matches.png (patches around points matched in the images, and how far they lie from their lines)."""
 
     def run(self) -> None:
         from arraygeom import Camera
-        from arraygeom.viz import draw_fields, draw_rig
+        from arraygeom.viz import draw_fields, draw_matches, draw_rig
 
         from ..media.figures import save_figure
 
@@ -49,6 +51,10 @@ class Show:
         if len(rig.names) > 1:
             fields = draw_fields(rig, alpha, _twelve_pixels(rig[alpha].hw), images=images)
             written.append(save_figure(fields, self.out / "fields.png"))
+        with options.working("matching points of the images"):
+            found = matched_points(rig, alpha, images)
+        if found:
+            written.append(save_figure(draw_matches(rig, alpha, found, images), self.out / "matches.png"))
         say(f"written: {', '.join(map(str, written))}")
 
 
@@ -58,6 +64,20 @@ def warn_of_misfit(rig: Rig, images: Mapping[str, Tensor]) -> None:
 
     if (warning := misfit_warning(rig, images)) is not None:
         say(f"pat: {warning}", style="yellow")
+
+
+def matched_points(rig: Rig, alpha: str, images: Mapping[str, Tensor]) -> dict[str, tuple[Tensor, Tensor]]:
+    """Points of alpha and of each beta that shows enough of the same and that the rig relates to alpha, by beta."""
+    from calib.images.matches import match_cameras
+    from calib.images.residuals import related
+
+    found: dict[str, tuple[Tensor, Tensor]] = {}
+    for name in rig.betas(alpha) if alpha in images else ():
+        if name in images:
+            with suppress(ValueError):
+                pair = related(rig, match_cameras({alpha: images[alpha], name: images[name]}))
+                found[name] = pair[alpha, name].alpha, pair[alpha, name].beta
+    return found
 
 
 def _twelve_pixels(hw: tuple[int, int]) -> Tensor:
@@ -87,7 +107,7 @@ class Explore:
 
     def run(self) -> None:
         try:
-            from ..explore.page import serve
+            from ..explore.serving import serve
         except ModuleNotFoundError as error:
             raise ValueError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from None
         rig = load_rig(self.rig)

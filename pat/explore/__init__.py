@@ -27,7 +27,7 @@ def __getattr__(name: str) -> Any:
     if name not in ("explorer", "serve"):
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
     try:
-        from . import page
+        from . import page, serving
     except ModuleNotFoundError as error:
         raise ModuleNotFoundError(f"the explorer needs {error.name}: pip install 'arraygeom-pat[explore]'") from error
-    return getattr(page, name)
+    return getattr(serving if name == "serve" else page, name)

@@ -2,73 +2,79 @@
 
 from __future__ import annotations
 
+import asyncio
 import html
+import io
 import math
-import re
-import socket
 from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+from typing import Any
 
+import cv2
 import numpy as np
 import panel as pn
-import torch
 from bokeh.events import Tap
-from bokeh.models import ColumnDataSource, CustomJSTickFormatter, Range1d
-from bokeh.plotting import figure
+from bokeh.models import ColumnDataSource
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
-from tornado.web import RequestHandler
 
-from arraygeom import Camera, Rig
-from arraygeom.viz import COLOURS, calibrated, extent_of, frustum_size, interactive_rig
+from arraygeom import Rig
+from arraygeom.io.native import write as rig_text
 
-from .pixel import (
-    FAMILIES,
-    BetaReport,
-    ExplorerScene,
-    ExplorerState,
-    PixelReport,
-    image_pixel,
-    inspect_pixel,
-    parameter_lengths,
+from .controls import Controls
+from .figures import (
+    beta_data,
+    beta_sources,
+    centre_patch,
+    colour_of,
+    depth_figure,
+    draw_cross,
+    draw_segment,
+    found_data,
+    image_figure,
+    no_patch,
+    patch_data,
+    patch_figure,
+    ray_trace,
+    rgba,
+    space,
 )
-
-UNITS = {
-    "rotation": (180 / math.pi, "xyz", 3.0, 0.05, "deg"),
-    "translation": (1000.0, "xyz", 50.0, 0.5, "mm"),
-    "focal": (1.0, "xy", 50.0, 0.5, "px"),
-    "centre": (1.0, "xy", 30.0, 0.5, "px"),
-    "distortion": (1.0, "", 0.2, 0.002, ""),
-}
-"""By kind of parameter: shown units per unit of the rig, names of its parts, range and step of the slider, unit."""
+from .pixel import BetaReport, ExplorerScene, ExplorerState, PixelReport, changed_rig, image_pixel, inspect_pixel
+from .theme import CARD, HEADING, TEXT, TOGGLE, WIDGET
 
 SETTLED = 150
 """Milliseconds without a change after which the rig in space is redrawn."""
-
-SHOWN_PIXELS = 2_000_000
-"""Larger images are drawn reduced; computations use them as they are."""
+EMPTY: dict[str, list[float]] = {"x": [], "y": []}
+"""Columns of nothing."""
 
 
 class Explorer:
     """Widgets and figures of an `ExplorerState`; `report` is what is drawn, `panel()` is for a page or a cell."""
 
     def __init__(self, scene: ExplorerScene, alpha: str) -> None:
-        hw = scene.rig[alpha].hw
         self.scene = scene
-        self.state = ExplorerState(alpha, image_pixel(hw[1] / 2, hw[0] / 2, hw))
+        self.state = self.initial = ExplorerState(alpha, textured_pixel(scene.guides[alpha]))
         self.betas = [n for n in scene.rig.betas(alpha) if n in scene.images]
-        self.marker = ColumnDataSource({"x": [], "y": []}, name="pixel")
+        self.marker = ColumnDataSource(dict(EMPTY), name="pixel")
+        self.backwards = ColumnDataSource(dict(EMPTY), name="backwards")
+        self.own_patch = ColumnDataSource(no_patch(), name="patch")
+        self.shown = ColumnDataSource({"image": [rgba(scene.images[alpha])]}, name="alpha image")
+        self.fused: dict[str, Tensor] = {}
         self.sources = {name: beta_sources(name) for name in self.betas}
-        self.facts = pn.pane.HTML(name="facts", sizing_mode="stretch_width", min_height=60)
-        self.space = pn.pane.Plotly(None, height=340, sizing_mode="stretch_width", config={"displaylogo": False})
+        self.facts = pn.pane.HTML(name="facts", sizing_mode="stretch_width", styles=TEXT)
+        self.captions = {n: pn.pane.HTML(sizing_mode="stretch_width", styles=TEXT) for n in (alpha, *self.betas)}
+        self.space = pn.pane.Plotly(None, height=360, sizing_mode="stretch_width", config={"displayModeBar": False})
         self.drawn: tuple[object, dict[str, Any]] = None, {}
         self.pointed: tuple[float, float] | None = None
         self.waiting: Any = None
         self.controls = Controls(scene.rig, self.state, self.update)
+        self.layer = pn.widgets.RadioButtonGroup(
+            label="layer", options=["camera", "fused"], value="camera", stylesheets=[WIDGET]
+        )
+        self.layer.param.watch(self._show_layer, "value")
         self.alpha_figure = self._alpha_figure()
         self.figures = [self._beta_figure(i, name) for i, name in enumerate(self.betas)]
-        self.depth_figure = self._depth_figure()
+        self.patches = {name: self._patch(i - 1, name) for i, name in enumerate((alpha, *self.betas))}
+        self.depth_figure = depth_figure(self.sources)
         self.report: PixelReport | None = None
         self.show(self.state)
 
@@ -79,7 +85,23 @@ class Explorer:
     def select_pixel(self, event: Any) -> None:
         """Select the alpha pixel that was clicked."""
         hw = self.scene.rig[self.state.alpha].hw
+        self.backwards.data = dict(EMPTY)
         self.update(x=image_pixel(event.x, event.y, hw))
+
+    def select_beta_pixel(self, name: str, event: Any) -> None:
+        """Draw the segment in alpha of a pixel that was clicked in a beta, and select alpha's pixel that matches it."""
+        x = image_pixel(event.x, event.y, self.scene.rig[name].hw)
+        try:
+            found = inspect_pixel(self.scene, self.state.replace(alpha=name, x=x)).betas.get(self.state.alpha)
+        except ValueError as error:
+            self._say(str(error))
+            return
+        if found is None or not bool(found.valid.any()):
+            self._say(f"no pixel of {self.state.alpha} can match ({x[0]:.0f}, {x[1]:.0f}) of {name}")
+            return
+        self.backwards.data = beta_data(found)[0]
+        best = found.xy[found.weight.argmax()].tolist()
+        self.update(x=image_pixel(best[0], best[1], self.scene.rig[self.state.alpha].hw))
 
     def show(self, state: ExplorerState) -> PixelReport | None:
         """Compute a state and draw it. For an impossible state the error is shown and the drawing stays."""
@@ -87,25 +109,123 @@ class Explorer:
         try:
             report = inspect_pixel(self.scene, state)
         except ValueError as error:
-            self.facts.object = f"<b>{html.escape(str(error))}</b>"
+            self._say(str(error))
             return None
         self.report = report
         self.marker.data = {"x": [state.x[0]], "y": [state.x[1]]}
-        for name, sources in self.sources.items():
-            for source, data in zip(sources, beta_data(report.betas.get(name))):
-                source.data = data
-        self.facts.object = facts(state, report)
+        self.own_patch.data = patch_data(self.scene.images[state.alpha], state.x)
+        centre_patch(self.patches[state.alpha], state.x)
+        for name in self.betas:
+            self._show_beta(name, report.betas.get(name))
+        self.captions[state.alpha].object = alpha_caption(state, report)
+        self._say_problems()
         self._once_settled()
         return report
+
+    def reset(self) -> None:
+        """The rig, the controls and the pixel as at the beginning."""
+        self.controls.reset()
+        self.backwards.data = dict(EMPTY)
+        self.show(self.initial)
+
+    def rig(self) -> Rig:
+        """The rig as it is moved."""
+        return changed_rig(self.scene.rig, self.state)
+
+    def panel(self) -> pn.viewable.Viewable:
+        """The page."""
+        theme = pn.widgets.Button(label="light / dark", stylesheets=[WIDGET], width=100)
+        theme.js_on_click(code=TOGGLE)
+        reset = pn.widgets.Button(label="reset", stylesheets=[WIDGET], width=80)
+        reset.on_click(lambda _: self.reset())
+        save = pn.widgets.FileDownload(
+            callback=lambda: io.StringIO(rig_text(self.rig())),
+            filename="rig_moved.yaml",
+            label="save the moved rig",
+            stylesheets=[WIDGET],
+            width=180,
+        )
+        heading = pn.pane.HTML(HEADING, sizing_mode="stretch_width", styles={"color": TEXT["color"]})
+        head = pn.Row(heading, self.layer, reset, save, theme, sizing_mode="stretch_width", align="center")
+        views = [self._view(name, drawn) for name, drawn in zip((self.state.alpha, *self.betas), self._all_figures())]
+        rows = [pn.Row(*views[i : i + 2], sizing_mode="stretch_width") for i in range(0, len(views), 2)]
+        below = pn.Row(
+            pn.Column(self.space, styles=CARD, sizing_mode="stretch_width"),
+            pn.Column(
+                pn.pane.Bokeh(self.depth_figure, sizing_mode="stretch_width"), styles=CARD, sizing_mode="stretch_width"
+            ),
+            sizing_mode="stretch_width",
+        )
+        main = pn.Column(*rows, self.facts, below, sizing_mode="stretch_width")
+        side = pn.Column(self.controls.panel(), styles=CARD)
+        return pn.Column(head, pn.Row(side, main, sizing_mode="stretch_width"), sizing_mode="stretch_width", margin=12)
+
+    def _all_figures(self) -> list[Any]:
+        return [self.alpha_figure, *self.figures]
+
+    def _view(self, name: str, drawn: Any) -> pn.viewable.Viewable:
+        """An image with its caption, the zoomed patch in a corner below."""
+        image = pn.pane.Bokeh(drawn, sizing_mode="scale_width")
+        below = pn.Row(pn.pane.Bokeh(self.patches[name]), self.captions[name], sizing_mode="stretch_width")
+        return pn.Column(image, below, sizing_mode="stretch_width", styles=CARD)
+
+    def _show_beta(self, name: str, report: BetaReport | None) -> None:
+        source = self.sources[name]
+        for part, data in zip((source.segment, source.samples, source.match), beta_data(report)):
+            part.data = data
+        source.found.data = found_data(report)
+        self.captions[name].object = beta_caption(name, report)
+        if report is None:
+            return
+        middle = report.position if report.offset is None else report.offset.position
+        x, y = middle.tolist()
+        source.patch.data = patch_data(self.scene.images[name], (x, y))
+        centre_patch(self.patches[name], (x, y))
+
+    def _say_problems(self) -> None:
+        problems = {} if self.report is None else self.report.problems
+        self.facts.object = "<br>".join(f"<b>{html.escape(n)}</b> {html.escape(text)}" for n, text in problems.items())
+
+    def _say(self, text: str) -> None:
+        self.facts.object = f"<b>{html.escape(text)}</b>"
+
+    async def _show_layer(self, event: Any) -> None:
+        """Alpha's image, or that fused with the rig as it now is."""
+        image = self.scene.images[self.state.alpha]
+        if event.new == "fused":
+            key = rig_text(self.rig())
+            if key not in self.fused:
+                self._say("fusing with the rig as it is now ...")
+                try:
+                    self.fused = {key: await asyncio.to_thread(self._fuse)}
+                except ValueError as error:
+                    self._say(str(error))
+                    return
+            image = self.fused[key]
+        self.shown.data = {"image": [rgba(image)]}
+        self._say_problems()
+
+    def _fuse(self) -> Tensor:
+        """The image fused at alpha's view."""
+        from ..fusion.fuse import fuse
+        from ..networks.weights import load_weights
+
+        images = {name: self.scene.images[name] for name in (self.state.alpha, *self.betas)}
+        coloured = any(len(images[name]) == 3 for name in self.betas) or len(self.betas) == 3
+        weights = load_weights("mono-colour" if coloured else "mono-spectral")
+        return fuse(weights, self.rig(), images, alpha=self.state.alpha, align=False).image
 
     def _once_settled(self) -> None:
         """Draw the rig in space once the controls have settled: it takes a browser longer than all else together.
 
-        At once the first time, and in a notebook, where no server can call back.
+        The first time once the page is there, and at once in a notebook, where no server can call back.
         """
         document = pn.state.curdoc
-        if self.space.object is None or document is None or document.session_context is None:
+        if document is None or document.session_context is None:
             self._show_space()
+            return
+        if self.space.object is None:
+            pn.state.onload(self._show_space)
             return
         if self.waiting is not None:
             document.remove_timeout_callback(self.waiting)
@@ -126,209 +246,71 @@ class Explorer:
         rig = self.drawn[1]
         self.space.object = {**rig, "data": [*rig["data"], *ray_trace(report.rig, state)]}
 
-    def panel(self) -> pn.viewable.Viewable:
-        """The page."""
-        images = pn.FlexBox(*map(pn.pane.Bokeh, (self.alpha_figure, *self.figures)))
-        below = pn.Row(self.space, pn.pane.Bokeh(self.depth_figure))
-        return pn.Row(self.controls.panel(), pn.Column(images, self.facts, below), sizing_mode="stretch_width")
-
     def _alpha_figure(self) -> Any:
-        name = self.state.alpha
-        drawn = image_figure(f"{name} (alpha): click a pixel", self.scene.rig[name].hw, self.scene.images[name])
-        drawn.scatter("x", "y", source=self.marker, marker="cross", size=18, color="black", line_width=4)
-        drawn.scatter("x", "y", source=self.marker, marker="cross", size=16, color="yellow", line_width=2)
+        drawn = image_figure(self.scene.rig[self.state.alpha].hw, self.shown)
+        draw_segment(drawn, self.backwards, "#d55e00")
+        draw_cross(drawn, self.marker)
         drawn.name = "alpha"
         drawn.on_event(Tap, self.select_pixel)
         return drawn
 
     def _beta_figure(self, index: int, name: str) -> Any:
-        drawn = image_figure(name, self.scene.rig[name].hw, self.scene.images[name])
-        segment, samples, match = self.sources[name]
-        colour = COLOURS[(index + 1) % len(COLOURS)]
-        drawn.line("x", "y", source=segment, color="white", line_width=7, alpha=0.85)
-        drawn.line("x", "y", source=segment, color=colour, line_width=3)
-        drawn.scatter("x", "y", source=samples, size="size", color=colour, fill_alpha=0.45, line_alpha=0.7)
-        drawn.scatter("x", "y", source=match, marker="cross", size=18, color="yellow", line_width=2)
+        image = ColumnDataSource({"image": [rgba(self.scene.images[name])]})
+        drawn = image_figure(self.scene.rig[name].hw, image)
+        source, colour = self.sources[name], colour_of(index)
+        draw_segment(drawn, source.segment, colour)
+        drawn.scatter("x", "y", source=source.samples, size="size", color=colour, fill_alpha=0.45, line_alpha=0.7)
+        draw_cross(drawn, source.match)
+        drawn.name = f"beta:{name}"
+        drawn.on_event(Tap, lambda event: self.select_beta_pixel(name, event))
         return drawn
 
-    def _depth_figure(self) -> Any:
-        drawn = figure(
-            width=440,
-            height=340,
-            title="weight against depth (m), the highest being 1",
-            x_axis_type="log",
-            y_range=Range1d(start=0, end=1.05),  # labels of changing size would lay out the whole page again
-            tools="pan,wheel_zoom,reset",
-            output_backend="canvas",
-        )
-        for index, name in enumerate(self.betas):
-            colour = COLOURS[(index + 1) % len(COLOURS)]
-            drawn.line("depth", "share", source=self.sources[name].samples, color=colour, legend_label=name)
-            drawn.scatter("depth", "share", source=self.sources[name].samples, color=colour, size=4)
-        if self.betas:
-            drawn.legend.location = "top_left"
-            drawn.legend.background_fill_alpha = 0.4
+    def _patch(self, index: int, name: str) -> Any:
+        """The zoomed patch of alpha (index -1) or of a beta."""
+        if index < 0:
+            drawn = patch_figure(self.own_patch)
+            draw_cross(drawn, self.marker, size=14)
+            return drawn
+        source = self.sources[name]
+        drawn = patch_figure(source.patch)
+        drawn.line("x", "y", source=source.segment, color=colour_of(index), line_width=2)
+        draw_cross(drawn, source.found, size=14)
         return drawn
 
 
-class Controls:
-    """Sliders that call `update` with the changed part of the state."""
-
-    def __init__(self, rig: Rig, state: ExplorerState, update: Any) -> None:
-        self.update = update
-        self.changes: dict[str, list[float]] = {name: [0.0] * n for name, n in parameter_lengths(rig).items()}
-        self.family = pn.widgets.Select(label="field", options=list(FAMILIES), value=state.family)
-        self.family.param.watch(lambda e: update(family=e.new), "value")
-        self.sliders = [*depth_sliders(rig, update), *field_sliders(update)]
-        self.numbers = {name: self._sliders_of(name) for name in self.changes}
-
-    def panel(self) -> pn.viewable.Viewable:
-        """Field and depth above, the parameters of each camera below."""
-        cameras = dict.fromkeys(name.rpartition(".")[0] for name in self.numbers)
-        groups = [
-            (
-                camera,
-                pn.Column(*(s for n, found in self.numbers.items() if n.rpartition(".")[0] == camera for s in found)),
-            )
-            for camera in cameras
-        ]
-        return pn.Column(self.family, *self.sliders, pn.Accordion(*groups, toggle=True), width=320)
-
-    def _sliders_of(self, name: str) -> list[Any]:
-        kind = name.rpartition(".")[2]
-        scale, parts, extent, step, unit = UNITS[kind]
-
-        def changed(index: int, shown: float) -> None:
-            self.changes[name][index] = shown / scale
-            self.update(changes={n: tuple(v) for n, v in self.changes.items() if any(v)})
-
-        return [
-            slider(
-                f"{name} {parts[i] if parts else i} ({unit})" if unit else f"{name} {i}",
-                (-extent, extent, step),
-                0.0,
-                lambda value, i=i: changed(i, value),
-            )
-            for i in range(len(self.changes[name]))
-        ]
+def textured_pixel(guide: Float[Tensor, "1 1 h w"]) -> tuple[float, float]:
+    """The strongest corner in the middle half of an image, where a match can be seen; its middle without any."""
+    h, w = guide.shape[-2:]
+    top, left = h // 4, w // 4
+    middle = (255 * guide[0, 0, top : h - top, left : w - left].clamp(0, 1)).byte().numpy()
+    found = cv2.goodFeaturesToTrack(np.ascontiguousarray(middle), 1, 0.01, 1)
+    x, y = (w / 2, h / 2) if found is None else (found[0, 0] + (left, top)).tolist()
+    return image_pixel(x, y, (h, w))
 
 
-class BetaSources(NamedTuple):
-    """Bokeh's data sources of one beta; the samples have depth and weight."""
-
-    segment: ColumnDataSource
-    samples: ColumnDataSource
-    match: ColumnDataSource
-
-
-def beta_sources(name: str) -> BetaSources:
-    """Empty ones, named so that a page's script can find them."""
-    return BetaSources(*(ColumnDataSource(d, name=f"{k}:{name}") for k, d in zip(BetaSources._fields, beta_data(None))))
-
-
-def beta_data(report: BetaReport | None) -> tuple[dict[str, Any], dict[str, Any], dict[str, Any]]:
-    """Columns of the segment's ends (near, far), of the samples, and of the expected match."""
-    if report is None:
-        return (
-            {"x": [], "y": []},
-            {"x": [], "y": [], "weight": [], "share": [], "depth": [], "size": []},
-            {"x": [], "y": []},
-        )
-    ends = np.empty((0, 2)) if report.ends is None else report.ends.numpy()
-    valid = report.valid
-    x, y = report.xy[valid].numpy().T
-    weight = report.weight[valid].numpy()
-    share = weight / max(float(weight.max(initial=0.0)), 1e-9)
-    size, depth = 2 + 12 * np.sqrt(share), report.depth[valid].numpy()
-    samples = {"x": x, "y": y, "weight": weight, "share": share, "depth": depth, "size": size}
-    match = [[float(v)] if bool(valid.any()) else [] for v in report.position]
-    return {"x": ends[:, 0], "y": ends[:, 1]}, samples, {"x": match[0], "y": match[1]}
-
-
-def image_figure(title: str, hw: tuple[int, int], image: Float[Tensor, "c h w"]) -> Any:
-    """An image with pixel centres at whole numbers and y downwards."""
-    h, w = hw
-    drawn = figure(
-        title=title,
-        frame_width=450,
-        frame_height=round(450 * h / w),
-        x_range=Range1d(start=-0.5, end=w - 0.5),
-        y_range=Range1d(start=h - 0.5, end=-0.5),
-        match_aspect=True,
-        tools="pan,wheel_zoom,reset",
-        active_scroll="wheel_zoom",
-    )
-    drawn.image_rgba([rgba(image)], x=-0.5, y=-0.5, dw=w, dh=h)
-    drawn.grid.visible = drawn.axis.visible = False  # measuring labels takes a third of the painting time
-    return drawn
-
-
-def rgba(image: Float[Tensor, "c h w"]) -> np.ndarray:
-    """The image as Bokeh wants it, (H, W) of 32 bits, reduced if it is very large."""
-    shrink = math.sqrt(SHOWN_PIXELS / (image.shape[1] * image.shape[2]))
-    if shrink < 1:
-        image = interpolate(image[None], scale_factor=shrink, mode="bilinear", antialias=True)[0]
-    colours = image if image.shape[0] == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
-    opaque = torch.cat([colours.clamp(0, 1), torch.ones_like(colours[:1])])
-    bytes_ = (255 * opaque).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-    return bytes_.view(np.uint32)[..., 0]
-
-
-class Slider(pn.widgets.FloatSlider):
-    """Panel's slider with a shorter debounce: the default of 50 ms is half of the time that we allow."""
-
-    _debounce: ClassVar[int] = 5
-
-
-def depth_sliders(rig: Rig, update: Any) -> list[Any]:
-    """Near and far on logarithmic scales, if the rig has them; an infinite far is shown as 1000 m until changed."""
-    if rig.depth is None:
-        return []
-    near, far = (min(float(d), 1000.0) for d in rig.depth)
-    return [
-        logarithmic("near (m)", near, (near / 4, far), lambda v: update(near=v)),
-        logarithmic("far (m)", far, (near, max(4 * far, 1000.0)), lambda v: update(far=v)),
-    ]
-
-
-def logarithmic(name: str, value: float, ends: tuple[float, float], changed: Any) -> Any:
-    """A slider of the decimal logarithm that shows the number itself."""
-    low, high = (math.log10(e) for e in ends)
-    shown = CustomJSTickFormatter(code="return (10 ** tick).toPrecision(3)")
-    made = Slider(label=name, start=low, end=high, step=0.005, value=math.log10(value), format=shown)
-    made.param.watch(lambda e: changed(10**e.new), "value")
-    return made
-
-
-def field_sliders(update: Any) -> list[Any]:
-    """Displacement, width, sharpness. A displacement of 0 covers the depth range."""
-    return [
-        slider("displacement (px; 0: the depth range)", (0, 200, 1), 0, lambda v: update(displacement=v or None)),
-        slider("widened by (px)", (0, 10, 0.5), 0, lambda v: update(across=v)),
-        slider("sharpness of the weights", (1, 100, 1), 30, lambda v: update(sharpness=v)),
-    ]
-
-
-def slider(name: str, bounds: tuple[float, float, float], value: float, changed: Any) -> Any:
-    """A slider that calls `changed` with its value."""
-    start, end, step = bounds
-    made = Slider(label=name, start=start, end=end, step=step, value=value)
-    made.param.watch(lambda e: changed(e.new), "value")
-    return made
-
-
-def facts(state: ExplorerState, report: PixelReport) -> str:
-    """A line of HTML for the pixel, and one for each beta."""
+def alpha_caption(state: ExplorerState, report: PixelReport) -> str:
+    """The pixel, its depth and its fused colour."""
     depth = f"depth {report.depth:.3g} m" if math.isfinite(report.depth) else "no depth"
-    lines = [f"<b>pixel ({state.x[0]:.0f}, {state.x[1]:.0f})</b> {depth}, fused colour {swatch(report.colour)}"]
-    for name, beta in report.betas.items():
-        length = f"length {float((beta.ends[1] - beta.ends[0]).norm()):.1f} px, " if beta.ends is not None else ""
-        lines.append(
-            f"<b>{html.escape(name)}</b> {length}{int(beta.valid.sum())} samples, peak {beta.peak:.2f}, "
-            f"deviation {beta.deviation:.1f} px, colour {swatch(beta.value)}"
-        )
-    lines += [f"<b>{html.escape(n)}</b> {html.escape(problem)}" for n, problem in report.problems.items()]
-    return "<br>".join(lines)
+    return (
+        f"<b>{html.escape(state.alpha)}</b> (alpha): click a pixel<br>pixel ({state.x[0]:.0f}, {state.x[1]:.0f})"
+        f"<br>{depth}<br>fused colour {swatch(report.colour)}"
+    )
+
+
+def beta_caption(name: str, report: BetaReport | None) -> str:
+    """How far the images' own match lies from the line, and what the samples say."""
+    head = f"<b>{html.escape(name)}</b> (beta): click goes the other way<br>"
+    if report is None:
+        return f"{head}no samples here"
+    off = "no clear match near the line"
+    if report.offset is not None:
+        distance, correlation = report.offset.distance, report.offset.correlation
+        off = f'<b style="font-size:1.25em">{distance:.1f} px off the line</b>, correlation {correlation:.2f}'
+    length = "" if report.ends is None else f"segment {float((report.ends[1] - report.ends[0]).norm()):.1f} px, "
+    return (
+        f"{head}{off}<br>{length}{int(report.valid.sum())} samples<br>peak {report.peak:.2f}, deviation "
+        f"{report.deviation:.1f} px<br>colour {swatch(report.value)}"
+    )
 
 
 def swatch(colour: Float[Tensor, "c"]) -> str:
@@ -337,47 +319,6 @@ def swatch(colour: Float[Tensor, "c"]) -> str:
     r, g, b = (round(255 * v) for v in (values if len(values) == 3 else [sum(values) / len(values)] * 3))
     square = f'<span style="display:inline-block;width:1.4em;height:1em;background:rgb({r},{g},{b})"></span>'
     return f"{square} ({', '.join(f'{v:.2f}' for v in values)})"
-
-
-def space(rig: Rig, alpha: str) -> dict[str, Any]:
-    """The rig in 3-D as plotly's plain data; nothing if no camera is calibrated."""
-    if not any(isinstance(c, Camera) for c in rig.cameras.values()):
-        return {"data": [], "layout": {"title": "no camera is calibrated: no drawing in space"}}
-    drawn = interactive_rig(rig, alpha=alpha if isinstance(rig[alpha], Camera) else None)
-    drawn.update_layout(margin={"l": 0, "r": 0, "t": 30, "b": 0}, uirevision="rig", showlegend=False)
-    drawn.update_scenes(**around_cameras(rig))
-    return drawn.to_plotly_json()
-
-
-def around_cameras(rig: Rig) -> dict[str, Any]:
-    """Ranges of plotly's axes (x, z, -y) in which the cameras are large; farther parts are cut off."""
-    cameras = calibrated(rig)
-    centres = np.stack([camera.centre.detach().double().numpy() for camera in cameras.values()])
-    room = max(extent_of(cameras), 1.5 * frustum_size(cameras))
-    (x0, y0, z0), (x1, y1, z1) = centres.min(0) - room, centres.max(0) + room
-    ranges = {"xaxis": (x0, x1), "yaxis": (z0, z1 + 2 * room), "zaxis": (-y1, -y0)}
-    return {f"{axis}_range": [float(v) for v in ends] for axis, ends in ranges.items()}
-
-
-def ray_trace(rig: Rig, state: ExplorerState) -> list[dict[str, Any]]:
-    """The pixel's ray from near to far as a trace of plotly's; empty if alpha is not calibrated."""
-    ray = pixel_ray(rig, state)
-    if ray is None:
-        return []
-    x, y, z = ray.T
-    line = {"color": "gold", "width": 6}
-    return [{"type": "scatter3d", "x": x, "y": z, "z": -y, "mode": "lines", "line": line, "name": "the pixel"}]
-
-
-def pixel_ray(rig: Rig, state: ExplorerState) -> np.ndarray | None:
-    """World points on the pixel's ray: alpha's centre, near, far (at most 40 m), (3, 3); None if they are not known."""
-    camera = rig[state.alpha]
-    if rig.depth is None or not isinstance(camera, Camera):
-        return None
-    near, far = (min(float(d), 40.0) for d in rig.depth)
-    x = torch.tensor([state.x] * 2, dtype=torch.float64)
-    ends = camera.unproject(x, torch.tensor([near, far], dtype=torch.float64))
-    return torch.cat([camera.centre[None], ends]).detach().numpy()
 
 
 def explorer(
@@ -402,81 +343,3 @@ def prepared(rig: Rig, images: Mapping[str, Tensor], alpha: str | None) -> tuple
         raise ValueError(f"no image of alpha, '{alpha}': give one, or choose another alpha")
     pn.extension("plotly")
     return ExplorerScene(rig, images), alpha
-
-
-def serve(
-    rig: Rig,
-    images: Mapping[str, Float[Tensor, "_ _ _"]],
-    *,
-    alpha: str | None = None,
-    port: int = 0,
-    browser: bool = True,
-) -> None:
-    """Serve the explorer to this machine alone until interrupted; port 0 takes a free one.
-
-    Requests for other host names than this machine's are refused, whatever their origin: a foreign page whose name is
-    made to resolve to this machine must not read the images. Raises as `explorer`, and ValueError for a port that is
-    none or in use.
-    """
-    check_port(port)
-    scene, alpha = prepared(rig, images, alpha)
-    port = port or free_port()
-    server = pn.serve(
-        {"/": lambda: Explorer(scene, alpha).panel()},
-        port=port,
-        address="localhost",
-        websocket_origin=[f"{name}:{port}" for name in OWN_NAMES],
-        show=False,
-        start=False,
-        title=f"pat explore {rig.name}".strip(),
-        verbose=False,
-    )
-    refuse_foreign_hosts(server)
-    print(f"the explorer is at http://localhost:{port} (Ctrl+C ends it)", flush=True)
-    server.start()
-    if browser:
-        server.show("/")
-    try:
-        server.io_loop.start()
-    except KeyboardInterrupt:
-        pass
-    finally:
-        server.stop()
-
-
-OWN_NAMES = ("localhost", "127.0.0.1")
-"""Host names of this machine."""
-
-
-class ForeignHost(RequestHandler):
-    """The answer to requests for another host."""
-
-    def prepare(self) -> None:
-        """Refuse."""
-        self.set_status(403)
-        self.finish("the explorer answers to localhost alone\n")
-
-
-def refuse_foreign_hosts(server: Any) -> None:
-    """Refuse every request, WebSockets included, whose Host is not this machine's, before any other rule applies."""
-    own = "|".join(map(re.escape, OWN_NAMES))
-    server._tornado.add_handlers(f"(?!(?:{own})$).*", [(r".*", ForeignHost)])
-
-
-def check_port(port: int) -> None:
-    """Raises ValueError for a number that is no port, or a port that is in use."""
-    if not 0 <= port <= 65535:
-        raise ValueError(f"--port {port}: wanted 1 to 65535, or 0 for a free one")
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("localhost", port))
-        except OSError as error:
-            raise ValueError(f"--port {port}: {error.strerror}: give another, or 0 for a free one") from None
-
-
-def free_port() -> int:
-    """A port on localhost that nothing listens at."""
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        return probe.getsockname()[1]

@@ -68,13 +68,25 @@ class ExplorerState:
         return dataclasses.replace(self, **changes)  # type: ignore[arg-type]
 
 
+class MatchOffset(NamedTuple):
+    """Where the images match best near the best sample, on the line or beside it, and how well.
+
+    position: in beta's pixels. distance: from the line, pixels. correlation: of the windows there, -1 to 1.
+    """
+
+    position: Float[Tensor, "2"]
+    distance: float
+    correlation: float
+
+
 class BetaReport(NamedTuple):
     """Sampling locations in one beta for the pixel, and the match.
 
     xy: samples in beta's pixels; `valid` marks those in the image. ends: start and end where the field is a segment.
     weight: of each sample, 1 in all. depth: of each sample in metres, NaN where there is none.
     value: beta's image, weighted. position, deviation, peak: mean position, its standard deviation (pixels) and the
-    largest weight, as in `pat.attention`.
+    largest weight, as in `pat.attention`. offset: how far the images' own match lies from the line, None without a
+    segment or a clear match.
     """
 
     xy: Float[Tensor, "l 2"]
@@ -86,6 +98,7 @@ class BetaReport(NamedTuple):
     position: Float[Tensor, "2"]
     deviation: float
     peak: float
+    offset: MatchOffset | None = None
 
 
 class PixelReport(NamedTuple):
@@ -211,7 +224,47 @@ def beta_report(scene: ExplorerScene, pair: Pair, name: str, state: ExplorerStat
         position,
         float((weight @ (xy - position).square().sum(-1)).sqrt()),
         float(weight.max()),
+        match_offset((scene.guides[state.alpha], scene.guides[name]), pair, x, (xy, weight), ends_of(found)),
     )
+
+
+ACROSS, STEP = 8, 0.25
+"""How far from the line the images' own match is sought, and to which step, pixels."""
+MOST_SAMPLES = 96
+"""Samples on the line, around that of the largest weight, from which it is sought."""
+CLEAR = 0.7
+"""Least correlation of a clear match."""
+
+
+def match_offset(
+    guides: tuple[Tensor, Tensor],
+    pair: Pair,
+    x: Float[Tensor, "1 2"],
+    samples: tuple[Float[Tensor, "l 2"], Float[Tensor, "l"]],
+    ends: Float[Tensor, "2 2"] | None,
+) -> MatchOffset | None:
+    """The images' own match near the segment, by the correlation of windows around both pixels.
+
+    Unlike the samples it may lie beside the line, and does if the rig is off.
+    """
+    xy, weight = samples
+    if ends is None or not bool((weight > 0).any()) or float((ends[1] - ends[0]).norm()) < 1e-6:
+        return None
+    along = torch.nn.functional.normalize(ends[1] - ends[0], dim=0)
+    across = torch.stack([-along[1], along[0]])
+    first = max(int(weight.argmax()) - MOST_SAMPLES // 2, 0)
+    best, score = xy[first], -1.0
+    fine = torch.arange(-1, 1 + STEP / 2, STEP)
+    stages: tuple[tuple[Tensor | None, Tensor, Tensor], ...]
+    stages = (xy[first : first + MOST_SAMPLES], torch.arange(-ACROSS, ACROSS + 1), torch.zeros(1)), (None, fine, fine)
+    for start, u, v in stages:
+        begin = best[None] if start is None else start
+        near = begin[:, None, None] + u.to(xy)[:, None, None] * across + v.to(xy)[:, None] * along
+        scores = correlations(*guides, pair, x, near.reshape(-1, 2))
+        best, score = near.reshape(-1, 2)[scores.argmax()], float(scores.max())
+    if score < CLEAR:
+        return None
+    return MatchOffset(best, abs(float((best - ends[0]) @ across)), score)
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "2 2"] | None:

@@ -42,6 +42,7 @@ from arraygeom.atomic import sweep, write_text
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
 
+from ..media.headers import RAW_SUFFIXES
 from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.video import write_video
@@ -55,7 +56,7 @@ from .results import Frame, ImageFormat, save_frame, view_of
 from .sequence import ImageFiles, KeyColour, KeyFrame, SequenceFusion
 from .views import ViewFiles
 
-IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm"}
+IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", *RAW_SUFFIXES}
 INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 

@@ -7,6 +7,7 @@ put right before the frame is fused.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -32,6 +33,8 @@ from .inputs import FrameInputs, padded
 from .misalignment import Misalignment, fit_misalignment, normals
 from .response import Given, Response, fit, stated_response
 from .results import Frame
+
+LOG = logging.getLogger(__name__)
 
 PIXELS = 400_000
 """Alpha's pixels in the pre-pass, at most."""
@@ -94,7 +97,8 @@ def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given
         return found
     small = _reduced_frame(frame)
     found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))
-    for _ in range(PASSES):
+    for i in range(PASSES):
+        LOG.info("pre-pass %d of at most %d", i + 1, PASSES)
         matches = _matches(network, small, found)
         response_now = _fitted(small, matches) if fits else found.response
         steps = [_misaligned(m) for m in matches] if align else [Misalignment()] * len(matches)
@@ -103,6 +107,11 @@ def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given
         if all(step.largest(small.hw) <= SETTLED for step in steps):
             break
     return found
+
+
+def expected_work(frame: FrameInputs, response: Given, *, align: bool) -> float:
+    """About how much work `find_corrections` is, as a share of fusing the frame: mostly two passes."""
+    return 2 * min(PIXELS / math.prod(frame.hw), 1.0) if align or response == "fit" else 0.0
 
 
 def _given(response: Given, inputs: Inputs) -> Response:

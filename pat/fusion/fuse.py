@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -14,14 +16,17 @@ from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
-from .corrections import Corrections, find_corrections
+from .corrections import Corrections, expected_work, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
 from .low_light import Noise, denoised_views
+from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
 from .response import Given
 from .results import Frame
 from .steps import steps_for
 from .tiles import Plan, fused_in_tiles, plan_frame
 from .views import Views
+
+LOG = logging.getLogger(__name__)
 
 Undo = Callable[[Frame], Frame]
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
@@ -44,6 +49,7 @@ def fuse(
     explain: Callable[[str], None] | None = None,
     noise: Noise | None = None,
     keep_alpha: bool = False,
+    luminance: Luminance = "alpha",
     progress: Progress | None = None,
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
@@ -78,6 +84,8 @@ def fuse(
         noise: the noise level of each camera that has some, or "estimate": views are denoised before they are matched,
             and jointly once they are fused.
         keep_alpha: leave alpha's values as recorded, noise included; otherwise so if alpha has no noise to speak of.
+        luminance: the image's: "alpha", which the network keeps exactly, that of "beta" in alpha's detail, where alpha
+            sees another part of the spectrum, or their "mix".
         progress: shows the tiles as they are done.
         store: a folder for finished tiles of a frame of several, so that one that was stopped goes on;
             tiles of other images, rigs or weights are not taken. Whoever gave it removes it afterwards.
@@ -98,27 +106,36 @@ def fuse(
     """
     if differentiable and not (max_memory is None and store is None):
         raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
+    check_luminance(network, luminance, noisy=noise is not None)
     limit = None if max_memory is None else parse_bytes(max_memory)
     quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     views = quiet.views
     inputs, undo = _prepared(network, views, match_levels)
-    plan = plan_frame(network, inputs, limit=limit, estimate=announce is not None, stored=store is not None)
+    LOG.info("planning")
+    before = 0.0 if corrections else expected_work(inputs, response, align=align)
+    estimate = announce is not None
+    plan = plan_frame(network, inputs, limit=limit, estimate=estimate, stored=store is not None, before=before)
     if announce:
         announce(plan)
     found = corrections or find_corrections(network, inputs, response, align=align)
     if explain:
         for line in found.described(views.betas, inputs.hw):
             explain(line)
-    inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
+    fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
+    inputs = inputs._replace(inputs=fused)
     state = network.prepare(inputs.inputs)
+    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
     with torch.set_grad_enabled(differentiable):
         wrapped = quiet.wrapped(network)
         frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
         frame, matched = quiet.split(frame, len(inputs.inputs.betas))
     warn_of_confidence(network, frame, inputs)
     frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
+    if luminance != "alpha":
+        frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
     steps = steps_for(network, normalise=match_levels)
     frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+    LOG.info("back to the pixels of %s", alpha)
     for back in undo:
         frame = back(frame)
     return frame if differentiable else Frame(*(part.detach() for part in frame))
@@ -150,6 +167,7 @@ def _prepared(network: FusionNetwork, views: Views, normalise: bool) -> tuple[Fr
     for name in views.betas:
         warn_of_grey(name, views.images[name])
     undo: list[Undo] = []
+    LOG.info("preparing %d images", len(views.betas) + 1)
     for step in steps_for(network, normalise=normalise):
         views, back = step.do(views)
         undo.insert(0, back)

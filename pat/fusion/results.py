@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Literal, NamedTuple
 
+import numpy as np
 from jaxtyping import Float
+from PIL import Image
+from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
 
 from arraygeom import Rig
@@ -16,6 +20,9 @@ from ..media.colour import linear_from_srgb
 from ..media.figures import colour_depth
 from ..media.images import write_image
 from ..media.raw import developed
+
+MOST = 65535
+"""The largest count of 16 bits."""
 
 ImageFormat = Literal["png", "tif", "exr"]
 
@@ -30,7 +37,8 @@ def save_frame(
     rig: Rig | None = None,
     name: str = "",
 ) -> list[Path]:
-    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown) and depth.png (red is near).
+    """Write fused.png, confidence.png, depth.tif (metres, float; NaN where unknown), depth_16.png (`write_depth`) and
+    depth.png (red is near).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
     rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml. With a `name` the
@@ -45,6 +53,8 @@ def save_frame(
         write_image(folder / f"{prefix}confidence.png", frame.confidence[None])
         if frame.depth.isfinite().any():
             write_image(folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True)
+            near = view.depth[0] if view is not None and view.depth else None
+            write_depth(folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near))
             write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth))
         if view is not None:
             view.save(folder / "view.yaml")
@@ -55,11 +65,30 @@ def save_frame(
             for i, band in enumerate(image, 1):
                 write_image(folder / f"{prefix}fused_{i}.{kind}", band[None], bits=bits)
             image = image.mean(0, keepdim=True)
-        write_image(folder / last, image, bits=bits)
+        write_image(folder / last, image, bits=bits, profile=bits != 32)
         names = {file.name for file in folder.iterdir()} - {last}
-    for stale in {f"{prefix}depth.tif", f"{prefix}depth.png"} - names:
+    for stale in {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png")} - names:
         (out / stale).unlink(missing_ok=True)
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
+
+
+def depth_scale(near: float) -> float:
+    """Counts a metre in a depth image of 16 bits: the power of ten with which `near` is at most a twentieth of them."""
+    return 10.0 ** math.floor(math.log10(MOST / 20 / near))
+
+
+def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None = None) -> float:
+    """Write depth as a PNG file of 16 bits; returns its counts a metre, by `near` (metres; else the nearest depth).
+
+    The scale is in the file's text chunk "Description". 0 is unknown, 65535 that far or farther.
+    """
+    known = depth.isfinite() & (depth > 0)
+    scale = depth_scale(near or float(depth[known].min()))
+    counts = np.where(known.numpy(), np.rint(depth.double().numpy() * scale).clip(1, MOST), 0).astype(np.uint16)
+    said = PngInfo()
+    said.add_text("Description", f"depth: {scale:g} counts a metre; 0 is unknown, {MOST} that far or farther")
+    Image.fromarray(counts).save(path, format="PNG", pnginfo=said)
+    return scale
 
 
 def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:

@@ -10,6 +10,7 @@ and a frame depends on nothing but images: any one can be made alone, in any ord
 from __future__ import annotations
 
 import dataclasses
+import logging
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -47,6 +48,8 @@ class Frames(Protocol):
         """One of them."""
         ...
 
+
+LOG = logging.getLogger(__name__)
 
 SYNCHRONOUS = 0.05
 """Gaps shorter than this part of alpha's frame time count as none."""
@@ -252,6 +255,7 @@ class SequenceFusion:
         nearness = max(1 - gap / (INTERVALS * self.timeline.interval), 1e-3)
         if key.alpha == i:
             return KeyContribution(nearness, *colour)
+        LOG.info("motion of frame %d", i)
         flow = flow_between(own, self.grey(key.alpha))
         moved = warped(torch.cat([colour.added, colour.confidence[None], colour.inverse_depth[None]]), flow.step)
         return KeyContribution(nearness, moved[:-2], moved[-2] * flow.weight, moved[-1])
@@ -269,6 +273,7 @@ class SequenceFusion:
             return field, weight
         other = min(max(index + (round(steps) or (1 if steps > 0 else -1)), 0), count - 1)
         other = other if other != index else index - (1 if steps > 0 else -1)
+        LOG.info("motion of key frame %d", index)
         flow = flow_between(self.grey(index), self.grey(other))
         step = flow.step * (steps / (other - index))
         return Moved(Widened(field, along=self._room(step, time - self._time(index))), step), flow.weight
@@ -302,6 +307,7 @@ class SequenceFusion:
         that did not record at alpha's time are not aligned: motion too moves points off their segments.
         """
         keys = self.timeline.key_frames()
+        LOG.info("corrections of the sequence")
         for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
             try:
                 return self._found_at(key)

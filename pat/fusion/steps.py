@@ -35,7 +35,7 @@ from arraygeom import (
 )
 from arraygeom.fields.default import default_field
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
-from arraygeom.undistortion import pixels_between
+from arraygeom.undistortion import pixels_between, sampled_between
 
 from ..media.images import Images
 from ..media.raw import as_bright
@@ -258,8 +258,9 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
         return frame
     added = frame.image - straight
     inverse = (1 / frame.depth).nan_to_num(0.0)
-    back = resampled(torch.cat([added, frame.confidence[None]]), pinhole, lens, interpolation="bilinear").values[0]
-    depth = 1 / resampled(inverse[None], pinhole, lens, interpolation="nearest").values[0, 0]
+    where = pixels_between(pinhole, lens)
+    back = sampled_between(torch.cat([added, frame.confidence[None]]), pinhole, where, "bilinear").values[0]
+    depth = 1 / sampled_between(inverse[None], pinhole, where, "nearest").values[0, 0]
     return Frame(own + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
 
 

@@ -50,23 +50,32 @@ class Plan(NamedTuple):
     seconds: float | None
     pieces: int = 1
 
+    @property
+    def duration(self) -> str:
+        """The time in words; empty if it was not estimated."""
+        seconds = self.seconds
+        return "" if seconds is None else f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
+
     def __str__(self) -> str:
         many = "1 piece" if len(self.tiles) == 1 else f"{len(self.tiles)} tiles"
         matching = "" if self.pieces == 1 else f" after matching in {self.pieces} pieces"
-        time = "" if self.seconds is None else f", about {_duration(self.seconds)}"
+        time = "" if self.seconds is None else f", about {self.duration}"
         return f"{many}{matching}, {self.memory / 2**30:.2f} GiB in all{time}"
 
 
-def _duration(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 100 else f"{seconds / 60:.0f} min"
-
-
 def plan_frame(
-    network: FusionNetwork, frame: FrameInputs, *, limit: float | None, estimate: bool, stored: bool
+    network: FusionNetwork,
+    frame: FrameInputs,
+    *,
+    limit: float | None,
+    estimate: bool,
+    stored: bool,
+    before: float = 0.0,
 ) -> Plan:
     """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a piece.
 
-    `stored` says that finished tiles are stored on disk until all are there. Raises ValueError as `tiles_within`.
+    `before` is the share of the frame's work that is done beforehand, by which the time is longer. `stored` says that
+    finished tiles are stored on disk until all are there. Raises ValueError as `tiles_within`.
     """
     pieces = matching_pieces(frame.hw, network.multiple)
     large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
@@ -75,7 +84,8 @@ def plan_frame(
     matching = 0.0 if probe and not probe.state else MATCHING_BYTES * max(area(tile.outer) for tile in pieces)
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
-    return Plan(tiles, SLACK * (held + work), probe.seconds(pieces, tiles) if probe else None, len(pieces))
+    seconds = (1 + before) * probe.seconds(pieces, tiles) if probe else None
+    return Plan(tiles, SLACK * (held + work), seconds, len(pieces))
 
 
 def tiles_within(

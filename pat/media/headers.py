@@ -8,6 +8,9 @@ from typing import NamedTuple
 
 HW = tuple[int, int]
 
+RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"}
+"""Of cameras' raw files."""
+
 _SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}
 """Codes of TIFF's unsigned types."""
 _WIDTH, _HEIGHT, _BITS, _ORIENTATION = 256, 257, 258, 274

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 
-from .headers import HW, ImageHeader, image_header
+from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
+from .profiles import in_srgb, with_srgb_profile
 
 _ROWS = 256
 """Rows processed at once, to limit memory."""
@@ -70,7 +71,9 @@ def read_image(
 ) -> Float[Tensor, "c h w"]:
     """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
-    HEIC, which needs the extra `heic`, has 8 bits here.
+    HEIC, which needs the extra `heic`, has 8 bits here. Raw files of cameras (DNG and others), which need the extra
+    `raw`, are developed to sRGB by LibRaw. An image of 8 bits with another colour profile is converted to sRGB, with a
+    warning; its profile is ignored with `orientation="ignore"`, and so are those of images of 16 bits.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
     must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
@@ -86,7 +89,10 @@ def read_image(
     label = f"{name}: {path}" if name else f"{path}"
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
-    content = path.read_bytes()
+    if path.suffix.lower() in RAW_SUFFIXES:
+        content = _png_of_raw(path, label)
+    else:
+        content = path.read_bytes()
     if content[4:12] in _HEIF:
         content = _png_of_heif(path, label)
     header = image_header(content)
@@ -95,8 +101,9 @@ def read_image(
     applied = _applied(header, orientation, label)
     _check_header(header.upright if applied > 1 else header.hw, hw, label)
     values, packed = _decode(content, header, label)
-    values = _upright(values, applied)
-    values = _opaque(values, label)
+    values = _opaque(_upright(values, applied), label)
+    if orientation == "apply":
+        values = in_srgb(values, content, label)
     planes = values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)
     return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
 
@@ -108,10 +115,12 @@ def write_image(
     bits: int = 8,
     coverage: Float[Tensor, "1 h w"] | None = None,
     unknown: bool = False,
+    profile: bool = False,
 ) -> None:
     """Write a grey or RGB image atomically, in the format its name ends in (.png, .tif, .jpg, .exr).
 
     8 and 16 bits are rounded, after values are clipped to 0..1; 32 bits (.tif and .exr only) keep floats as they are.
+    With `profile`, PNG and JPEG files in colour say by an ICC profile that they are sRGB.
     `coverage` makes the image RGBA (.png and .exr). An .exr file needs the extra `synthesis`. Raises ValueError for
     an image with another number of channels or with values that are not finite (allowed with `unknown`, for maps of 32
     bits in which some pixels are not known), and for a format that cannot hold it.
@@ -130,6 +139,7 @@ def write_image(
         return _write_exr(path, planes, bits)
     order = [2, 1, 0, 3] if coverage is not None else slice(None, None, -1)
     content = _encode(path, np.ascontiguousarray(planes[order].transpose(1, 2, 0)), bits)
+    content = with_srgb_profile(content, path.suffix.lower()) if profile else content
     with write_atomically(path) as temporary:
         temporary.write_bytes(content)
 
@@ -147,6 +157,22 @@ def _png_of_heif(path: Path, label: str) -> bytes:
     except (OSError, ValueError) as error:
         raise ValueError(f"{label}: not a HEIC image that can be read ({error}): save it as PNG") from None
     return cv2.imencode(".png", image if image.ndim == 2 else image[..., [2, 1, 0]])[1].tobytes()
+
+
+def _png_of_raw(path: Path, label: str) -> bytes:
+    """A camera's raw file, developed to sRGB in 16 bits with the camera's white balance and upright, as a PNG file."""
+    try:
+        import rawpy
+    except ImportError:
+        raise ValueError(
+            f"{label}: reading raw files needs the package rawpy: pip install 'arraygeom-pat[raw]', or save it as TIFF"
+        ) from None
+    try:
+        with rawpy.imread(str(path)) as raw:
+            colours = raw.postprocess(use_camera_wb=True, no_auto_bright=True, output_bps=16, gamma=(2.4, 12.92))
+    except (rawpy.LibRawError, OSError) as error:
+        raise ValueError(f"{label}: not a raw file that can be read ({error}): save it as TIFF") from None
+    return cv2.imencode(".png", colours[..., ::-1])[1].tobytes()
 
 
 def _applied(header: ImageHeader, orientation: str, label: str) -> int:

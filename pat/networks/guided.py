@@ -186,7 +186,7 @@ class GuidedPAT(nn.Module):
         used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
-            residual = residual - luminance(residual)
+            residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
         return (output if parts else output._replace(overall=used[0].confidence)), estimates
 

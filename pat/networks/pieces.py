@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from arraygeom.pixels import HW
 from ..support.memory import give_back
 from .protocol import Inputs
 from .semi_global import SemiGlobalMatches
+
+LOG = logging.getLogger(__name__)
 
 MATCHING_HALO = 256
 """The halo of the pieces in which large frames are matched, pixels."""
@@ -120,5 +123,8 @@ def prepared(
     """`common` of each beta, and by that its matches. Each beta for itself."""
     betas = [inputs.of_beta(i) for i in range(len(inputs.betas))]
     facts = tuple(common(one) for one in betas)
-    found = (matched_in_pieces(one, lambda piece, f=f: match(piece, f)) for one, f in zip(betas, facts))
+    found = []
+    for i, (one, known) in enumerate(zip(betas, facts), 1):
+        LOG.info("matching beta %d of %d", i, len(betas))
+        found.append(matched_in_pieces(one, lambda piece, f=known: match(piece, f)))
     return Prepared(tuple(found), facts)

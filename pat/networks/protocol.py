@@ -34,13 +34,15 @@ class Beta:
 class Inputs:
     """Alpha's image (B, C, H, W) and the betas, which may be of any sizes.
 
-    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments.
+    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments. `luminance`
+    is alpha's share of the result's, for networks that keep it; the rest is beta's.
     """
 
     alpha: Float[Tensor, "b c h w"]
     betas: tuple[Beta, ...]
     multiple: int = 1
     beta_halo: int = 0
+    luminance: float = 1.0
 
     @classmethod
     def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:

@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from .steps import steps_shown
+
 if TYPE_CHECKING:
     from distributed import Client, Future
 
@@ -193,15 +195,16 @@ def followed(
     further = (TextColumn("left:"), TimeRemainingColumn(), TextColumn("{task.fields[status]}"))
     with Progress(*columns, *further, console=console, disable=not console.is_terminal) as bar:
         shown = bar.add_task(title, total=total, completed=done, status="")
-        for outcome in outcomes:
-            done += 1
-            text = status(outcome)
-            bar.update(shown, completed=done, status=text)
-            if not console.is_terminal and time.monotonic() - printed > LINE_EVERY:
-                printed = time.monotonic()
-                line = f"{title}: {done} of {total}" + (f": {text}" if text else "")
-                console.print(line, soft_wrap=True, highlight=False, markup=False)
-            yield outcome
+        with steps_shown(lambda step: bar.update(shown, status=step)):
+            for outcome in outcomes:
+                done += 1
+                text = status(outcome)
+                bar.update(shown, completed=done, status=text)
+                if not console.is_terminal and time.monotonic() - printed > LINE_EVERY:
+                    printed = time.monotonic()
+                    line = f"{title}: {done} of {total}" + (f": {text}" if text else "")
+                    console.print(line, soft_wrap=True, highlight=False, markup=False)
+                yield outcome
 
 
 def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:

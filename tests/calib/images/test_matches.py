@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
+from calib.images import matches
 from calib.images.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
 from tests.calib.scenes import texture
 
@@ -92,3 +93,14 @@ def test_depths_need_points_that_fit():
     few = seen_points(rig, count=ENOUGH - 1)
     with pytest.raises(ValueError, match=f"only {ENOUGH - 1} points"):
         seen_depths(rig.pair("left", "right"), few)
+
+
+def test_features_are_matched_as_by_opencv():
+    rng = np.random.default_rng(0)
+    b = rng.integers(0, 256, (700, 128)).astype(np.float32)
+    a = np.concatenate([b[rng.permutation(700)[:300]] + rng.integers(-30, 30, (300, 128)), b[:50] / 2]).clip(0, 255)
+    a = np.rint(a).astype(np.float32)
+    found = matches._nearest(a, b).tolist()
+    pairs = cv2.BFMatcher().knnMatch(a, b, k=2)
+    assert found == [m.trainIdx if m.distance < matches.RATIO * second.distance else -1 for m, second in pairs]
+    assert 250 < sum(i >= 0 for i in found) < len(a)

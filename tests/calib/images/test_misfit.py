@@ -4,7 +4,8 @@ import re
 
 import torch
 
-from calib.images.misfit import misfit_warning
+from arraygeom import Pose
+from calib.images.misfit import find_misfit, misfit_warning
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
@@ -20,6 +21,19 @@ def test_a_drifted_rig_is_named():
     assert found is not None
     assert 5.5 < float(re.search(r"lie ([\d.]+) px", found)[1]) < 6.6
     assert "pat rig doctor" in found
+
+
+def test_points_behind_the_cameras_and_wrong_units_are_named():
+    """Lines stay where they are under both."""
+    rig, images = rectified_pair(), rectified_images()
+    right = rig["right"]
+    for factor in (-1.0, 1000.0):
+        pose = Pose(right.R, right.t * factor)
+        wrong = rig.with_camera("right", right.replace(cam_from_world=pose)).replace(depth=rig.depth or (0.5, 50.0))
+        found = find_misfit(wrong, images)
+        assert found is not None
+        assert found.outside > 0.9
+        assert "behind the cameras or outside the depth range" in found.text
 
 
 def test_nothing_is_said_where_nothing_can_be():

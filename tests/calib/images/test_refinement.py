@@ -17,11 +17,10 @@ from calib.images.refinement import (
     polish,
     refine,
     refine_matches,
-    sampson,
     solve,
 )
 from calib.images.remedies import swap
-from calib.images.residuals import epipolar_residuals
+from calib.images.residuals import epipolar_residuals, sampson
 from pat.attention import attend_with_statistics
 from pat.cli.main import main
 from pat.media.images import write_image

@@ -60,6 +60,7 @@ def test_fuse_writes_everything(small):
         "confidence.png",
         "depth.png",
         "depth.tif",
+        "depth_16.png",
         "fused.png",
         "index.html",
         "view.yaml",

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 from torch.nn.functional import avg_pool2d
 
-from arraygeom import Camera, Rig
+from arraygeom import Camera, Pose, Rig
 from pat import fuse, load_weights
 from pat.cli.from_images import camera_names
 from pat.cli.main import main
@@ -18,7 +18,8 @@ from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 
-ALL = ["confidence.png", "depth.png", "depth.tif", "fused.png", "index.html", "rig.yaml", "view.yaml"]
+ALL = [*(f"{n}.png" for n in ("confidence", "depth")), "depth.tif", "depth_16.png", "fused.png", "index.html"]
+ALL += ["rig.yaml", "view.yaml"]
 
 
 @pytest.fixture(scope="module")
@@ -157,3 +158,24 @@ def test_a_dark_image_is_brought_to_an_ordinary_brightness():
     for image in (dark, bright):
         corrected = linear_from_srgb(exposed(image, exposure_gain(image)))
         assert float(corrected.quantile(0.99)) == pytest.approx(0.8, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"), [(-1.0, "translation of all cameras with the wrong sign"), (1e3, "millim")]
+)
+def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
+    factor, said, halved, folder, tmp_path, capsys
+):
+    rig = halved[0]
+    wrong = {n: c.replace(cam_from_world=Pose(c.R, factor * c.t)) for n, c in rig.cameras.items()}
+    rig.replace(cameras=wrong).save(tmp_path / "wrong.yaml")
+    images = [f"--image={name}={folder / name}.png" for name in rig.names]
+    with pytest.raises(SystemExit) as stop:
+        main(
+            ["fuse", str(tmp_path / "wrong.yaml"), "--alpha", "mono", *images, "--strict", "-o", str(tmp_path / "out")]
+        )
+    assert stop.value.code == 3
+    text = " ".join(capsys.readouterr().err.split())
+    assert "behind the cameras or outside the depth range" in text
+    assert said in text
+    assert not (tmp_path / "out").exists()

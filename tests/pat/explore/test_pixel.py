@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch.nn.functional import interpolate
 
-from arraygeom import Curved, Distortion, Epipolar, HomographyDisplacement, Link, Rig, View, depth_of
+from arraygeom import Curved, Distortion, Epipolar, HomographyDisplacement, Link, Rig, View, depth_of, epipolar_distance
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
 from pat.explore import FAMILIES, ExplorerScene, ExplorerState, inspect_pixel
@@ -158,3 +158,35 @@ def test_an_answer_for_images_of_megapixels_takes_milliseconds(sample):
         inspect_pixel(scene, state().replace(x=(400.0 + 50 * i, 500.0)))
         times.append(time.process_time() - start)
     assert sorted(times)[4] < 0.1
+
+
+def test_a_moved_rig_puts_the_match_off_the_line_by_as_much_as_it_says():
+    sample = load_sample()
+    scene, state = ExplorerScene(sample.rig, sample.images), ExplorerState("mono", (334.0, 133.0))
+    here = inspect_pixel(scene, state).betas["colour"].offset
+    assert here is not None
+    assert here.distance < 0.3
+    for angle in (0.003, -0.006):
+        moved = state.replace(changes={"colour.rotation": (angle, 0.0, 0.0)})
+        report = inspect_pixel(scene, moved)
+        off = report.betas["colour"].offset
+        assert off is not None
+        x = torch.tensor([state.x], dtype=torch.float64)
+        F = report.rig.pair("mono", "colour").fundamental
+        true = float(epipolar_distance(F, x, here.position[None]).abs())
+        assert true > 1
+        assert abs(off.distance - true) < 0.3
+    assert inspect_pixel(scene, state.replace(x=(320.0, 200.0))).betas["colour"].offset is None  # without texture
+
+
+def test_the_moved_rig_is_what_is_saved():
+    pytest.importorskip("panel", reason="the extra 'explore' is not installed")
+    from pat.explore.page import Explorer
+
+    sample = load_sample()
+    made = Explorer(ExplorerScene(sample.rig, sample.images), "mono")
+    made.update(changes={"colour.translation": (0.01, 0.0, 0.0)}, near=2.0)
+    torch.testing.assert_close(made.rig()["colour"].t, sample.rig["colour"].t + torch.tensor([0.01, 0, 0]).double())
+    assert float(made.rig().depth[0]) == 2.0
+    made.reset()
+    torch.testing.assert_close(made.rig()["colour"].t, sample.rig["colour"].t)

@@ -1,12 +1,15 @@
 """Files of a fusion: bands that no image holds together are written one by one."""
 
 import resource
+from io import BytesIO
 
+import numpy as np
 import pytest
 import tifffile
 import torch
+from PIL import Image, ImageCms
 
-from pat.fusion.results import Frame, save_frame
+from pat.fusion.results import Frame, depth_scale, save_frame, write_depth
 from pat.media.images import read_image
 
 
@@ -51,6 +54,22 @@ def test_a_full_disk_leaves_the_former_files_all_of_one_frame(tmp_path):
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert caught.value.filename == str(tmp_path / "fused.tif")
     assert {p.name: p.read_bytes() for p in tmp_path.iterdir()} == before
+
+
+def test_depth_in_16_bits_says_its_scale(tmp_path):
+    depth = torch.tensor([[1.2343, 7.0, torch.nan, 1e9]])
+    assert write_depth(tmp_path / "d.png", depth, near=1.0) == 1000
+    with Image.open(tmp_path / "d.png") as image:
+        assert image.text["Description"].startswith("depth: 1000 counts a metre; 0 is unknown")
+        assert np.asarray(image).astype(int).tolist() == [[1234, 7000, 0, 65535]]
+    assert (depth_scale(0.3), depth_scale(5.0), depth_scale(50.0)) == (10000, 100, 10)
+
+
+def test_fused_images_say_that_they_are_srgb(tmp_path):
+    save_frame(frame_of(3), tmp_path)
+    with Image.open(tmp_path / "fused.png") as image:
+        assert "sRGB" in ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(BytesIO(image.info["icc_profile"])))
+    read_image(tmp_path / "fused.png")  # without a warning
 
 
 def test_depth_of_a_former_frame_does_not_stay_beside_one_without(tmp_path):

@@ -1,0 +1,83 @@
+"""Colour profiles (ICC): images are converted to sRGB when they are read, and say that they are sRGB when written."""
+
+from __future__ import annotations
+
+import io
+import struct
+import warnings
+import zlib
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageCms
+
+_JPEG_PART = 65_000
+"""Bytes of a profile in one segment of a JPEG file, at most."""
+
+
+@cache
+def srgb_profile() -> bytes:
+    """The ICC profile of sRGB."""
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def in_srgb(values: NDArray, content: bytes, label: str) -> NDArray:
+    """Values (H, W) or (H, W, 3; blue first) of the image file `content`, converted to sRGB if it has another profile.
+
+    Warns that they were; or that they were not, for 16 bits and for profiles that cannot be used.
+    """
+    profile = _embedded(content)
+    if profile is None:
+        return values
+    try:
+        opened = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = ImageCms.getProfileDescription(opened).strip()
+        if "srgb" in name.lower():
+            return values
+        if values.dtype != np.uint8:
+            text = f"{label}: colour profile '{name}' is ignored, as values have 16 bits: save it in sRGB"
+            warnings.warn(text, stacklevel=3)
+            return values
+        converted = _converted(values, opened)
+    except (ImageCms.PyCMSError, OSError, ValueError) as error:
+        warnings.warn(f"{label}: its colour profile cannot be used ({error}): save it in sRGB", stacklevel=3)
+        return values
+    warnings.warn(f"{label}: converted from colour profile '{name}' to sRGB", stacklevel=3)
+    return converted
+
+
+def _embedded(content: bytes) -> bytes | None:
+    """The ICC profile in an image file; None without one."""
+    if not any(mark in content for mark in (b"iCCP", b"ICC_PROFILE", b"ICCP", b"acsp")):
+        return None
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(io.BytesIO(content)) as image:
+                return image.info.get("icc_profile")
+    except (OSError, SyntaxError, ValueError, TypeError, struct.error, Image.DecompressionBombError):
+        return None
+
+
+def _converted(values: NDArray, profile: ImageCms.ImageCmsProfile) -> NDArray:
+    grey = values.ndim == 2
+    image = Image.fromarray(values if grey else np.ascontiguousarray(values[..., ::-1]))
+    srgb = ImageCms.createProfile("sRGB")
+    intent = ImageCms.Intent.RELATIVE_COLORIMETRIC
+    done = ImageCms.profileToProfile(image, profile, srgb, intent, outputMode="RGB")
+    colours = np.asarray(done)
+    return colours[..., 1].copy() if grey else colours[..., ::-1]
+
+
+def with_srgb_profile(content: bytes, suffix: str) -> bytes:
+    """The bytes of a PNG or JPEG file in colour with the profile of sRGB; of other files as they are."""
+    if suffix == ".png" and content[25] in (2, 6):
+        body = b"iCCP" + b"sRGB\0\0" + zlib.compress(srgb_profile())
+        chunk = struct.pack(">I", len(body) - 4) + body + struct.pack(">I", zlib.crc32(body))
+        return content[:33] + chunk + content[33:]
+    if suffix in (".jpg", ".jpeg"):
+        part = b"ICC_PROFILE\0\1\1" + srgb_profile()
+        assert len(part) < _JPEG_PART
+        return content[:2] + b"\xff\xe2" + struct.pack(">H", len(part) + 2) + part + content[2:]
+    return content
