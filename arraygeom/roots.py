@@ -19,6 +19,8 @@ def first_root(coefficients: Tensor) -> Tensor:
     """
     a = coefficients[..., 1:]
     n = a.shape[-1]
+    if a.numel() > n and not traced() and bool((a == a.reshape(-1, n)[0]).all()):
+        return first_root(coefficients.reshape(-1, n + 1)[0]).expand(a.shape[:-1])  # copies of one lens
     finite = a.isfinite().all(-1)
     a = torch.where(finite[..., None], a, 0.0)
     powers = torch.arange(1, n + 1).to(a)

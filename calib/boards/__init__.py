@@ -1,8 +1,9 @@
 """Calibration from images of a board: from its specification to a rig with covariance and report.
 
-`target` (boards) -> `photos`, `detect`, `corners`, `collect` (detections) -> `intrinsics` (one camera) -> `poses`
-(initial rig) -> `bundle`, `observability` (adjustment) -> `rig` (calibration) -> `coverage`, `covariance`, `report`.
-`run` does all of it from files to files, `simulation` renders the images that a planned rig would take.
+`target`, `printing` (boards) -> `photos`, `detect`, `corners`, `collect` (detections) -> `intrinsics` (one camera) ->
+`poses` (initial rig) -> `bundle`, `observability`, `shape` (adjustment) -> `rig` (calibration) -> `validation`,
+`lens_comparison`, `coverage`, `covariance`, `adequacy`, `report`. `run` does all of it from files to files, `watch`
+guides while images are taken, `simulation` renders the images that a planned rig would take.
 """
 
 from .. import _lazy
@@ -19,5 +20,6 @@ __getattr__ = _lazy(
         "simulate_photos": "simulation",
         "write_board": "run",
     },
-    {name: f"{__name__}.target.{name}" for name in ("Board", "Charuco", "Chessboard", "Circles", "draw_board")},
+    {name: f"{__name__}.target.{name}" for name in ("Board", "Charuco", "Chessboard", "Circles")}
+    | {"draw_board": f"{__name__}.printing.draw_board"},
 )

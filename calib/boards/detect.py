@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from .corners import monomials, refine_corners
-from .target import Board, Charuco, Chessboard, Circles, marker_dictionary
+from .target import AprilGrid, Board, Charuco, Chessboard, Circles, MarkedBoard, marker_dictionary
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -111,6 +111,43 @@ def _charuco(grey: Grey, board: Charuco) -> Detection | None:
     return Detection(ids.reshape(-1).astype(np.int64), corners.reshape(-1, 2).astype(np.float64))
 
 
+def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
+    seen = _tags(grey, board.dictionary, board.border)
+    tags = np.array([i for i in seen if i in board.markers], dtype=int)
+    if 4 * len(tags) < FEWEST:
+        return None
+    x = np.array([seen[i] for i in tags.tolist()])
+    tags -= board.first
+    points = board.corners[tags].reshape(-1)
+    # tags stand on their heads in Kalibr's files, and otherwise in others'
+    turned = [np.roll(x, k, 1).reshape(-1, 2).astype(np.float64) for k in range(4)]
+    return Detection(points, min(turned, key=lambda x: _distance_from_plane(board.points[points, :2], x)))
+
+
+def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
+    """The four corners of each visible marker, by number.
+
+    AprilTags touch other squares at their corners: OpenCV's way of finding them and that of their authors miss others.
+    """
+    found: dict[int, np.ndarray] = {}
+    april = [cv2.aruco.CORNER_REFINE_APRILTAG] if dictionary.startswith("april") else []
+    for method in (cv2.aruco.CORNER_REFINE_SUBPIX, *april):
+        parameters = cv2.aruco.DetectorParameters()
+        parameters.markerBorderBits, parameters.cornerRefinementMethod = border, method
+        corners, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary), parameters).detectMarkers(grey)
+        numbers = [] if ids is None else ids.reshape(-1).tolist()
+        found |= {number: x.reshape(4, 2) for number, x in zip(numbers, corners)}
+    return found
+
+
+def _distance_from_plane(p: np.ndarray, x: np.ndarray) -> float:
+    """The median distance of pixels from a homography of the points on the board."""
+    H, _ = cv2.findHomography(p, x, cv2.LMEDS)
+    if H is None:
+        return float("inf")
+    return float(np.median(np.linalg.norm(cv2.perspectiveTransform(p[:, None], H)[:, 0] - x, axis=-1)))
+
+
 def _circles(grey: Grey, board: Circles) -> Detection | None:
     kind = cv2.CALIB_CB_ASYMMETRIC_GRID if board.asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
     for flags in (kind, kind | cv2.CALIB_CB_CLUSTERING):
@@ -124,6 +161,7 @@ def _circles(grey: Grey, board: Circles) -> Detection | None:
 _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
     Chessboard: _chessboard,
     Charuco: _charuco,
+    AprilGrid: _april_grid,
     Circles: _circles,
 }
 
@@ -135,13 +173,23 @@ def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
     """
     if isinstance(board, Circles):
         return found
-    clear = (1 - board.marker / board.spacing) / 2 if isinstance(board, Charuco) else 0.5
+    clear = _clear(board)
     x, good = refine_corners(grey, found.x, board.points[found.ids, :2] / board.spacing, clear=clear)
     if good.mean() < ENOUGH:
         return Detection(found.ids, _by_gradients(grey, found.x, 0.9 * clear))
-    if isinstance(board, Charuco):
+    if isinstance(board, MarkedBoard):
         return Detection(found.ids[good], x[good])
     return Detection(found.ids, np.where(good[:, None], x, _by_gradients(grey, x, 0.3)))
+
+
+def _clear(board: Board) -> float:
+    """How far from a corner's edges there is nothing but its own squares, as a share of `spacing`."""
+    if isinstance(board, Charuco):
+        return (1 - board.marker / board.spacing) / 2
+    if isinstance(board, AprilGrid):
+        black = board.border * board.tag / (marker_dictionary(board.dictionary).markerSize + 2 * board.border)
+        return min(black, board.gap) / board.spacing
+    return 0.5
 
 
 def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
@@ -179,7 +227,7 @@ def _reason(grey: Grey, board: Board) -> str:
     low, high = np.percentile(grey, (2, 98))
     if high - low < 40:
         return "the images have hardly any contrast: expose them longer, or light the board"
-    if isinstance(board, Charuco) and (reason := _charuco_reason(grey, board)):
+    if isinstance(board, MarkedBoard) and (reason := _marker_reason(grey, board)):
         return reason
     if other := other_size([grey], board):
         return f"a chessboard with {other} inner corners is visible: is the board's size right?"
@@ -187,33 +235,40 @@ def _reason(grey: Grey, board: Board) -> str:
         return "it is found once the image is mirrored: save the images as captured, not mirrored"
     if cv2.Laplacian(grey, cv2.CV_64F).std() < 4:
         return "the images are blurred: focus, and hold the board still"
-    margin = "" if isinstance(board, Charuco) else " completely and with its white margin"
+    margin = "" if isinstance(board, MarkedBoard) else " completely and with its white margin"
     return f"no such board is visible{margin}: check the board's name, and that it is in the image, large and lit"
 
 
-def _charuco_reason(grey: Grey, board: Charuco) -> str | None:
-    needed = (board.columns + 1) * (board.rows + 1) // 2
-    ids = _markers(grey, board.dictionary)
-    if len(ids) >= 4 and max(ids) >= needed:
-        return f"markers up to number {max(ids)} are visible and the board has 0 to {needed - 1}: is its size right?"
-    if len(ids) >= 4:
+def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
+    border = board.border if isinstance(board, AprilGrid) else 1
+    ids, last = _markers(grey, board.dictionary, border), board.markers[-1]
+    if isinstance(board, AprilGrid) and len(_markers(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
+        other = f"border{3 - border}"
+        return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
+    if len(ids) >= 4 and max(ids) > last:
         return (
-            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (squares across x "
-            "down)? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
+            f"markers up to number {max(ids)} are visible and the board has {board.first} to {last}: is its size right?"
+        )
+    if len(ids) >= 4:
+        legacy = ""
+        if isinstance(board, Charuco):
+            legacy = "? A board drawn by OpenCV before 4.6 needs ':legacy' at the end of its name"
+        return (
+            f"{len(ids)} of its markers are visible, but not at their positions: is the size right (across x down)"
+            f"{legacy}"
         )
     for name in OTHER_DICTIONARIES:
         if len(seen := _markers(grey, name)) >= 6:
             return f"{len(seen)} markers of the dictionary {name} are visible, not of {board.dictionary}: name that one"
-    if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary)) >= 4:
+    if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
         return "its markers are found once the image is mirrored: save the images as captured, not mirrored"
     return None
 
 
-def _markers(grey: Grey, dictionary: str) -> list[int]:
+def _markers(grey: Grey, dictionary: str, border: int = 1) -> list[int]:
     if not hasattr(cv2.aruco, f"DICT_{dictionary.upper()}"):
         return []
-    _, ids, _ = cv2.aruco.ArucoDetector(marker_dictionary(dictionary)).detectMarkers(grey)
-    return [] if ids is None else [int(i) for i in ids.reshape(-1)]
+    return list(_tags(grey, dictionary, border))
 
 
 def _grid_size(grey: Grey) -> tuple[int, int] | None:

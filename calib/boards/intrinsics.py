@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 import torch
+from jaxtyping import Float
 
 from arraygeom import Camera, Distortion, Pose
 from arraygeom.pixels import HW
@@ -17,7 +18,9 @@ from .detect import Detection
 from .photos import FrameKey
 from .target import Board
 
-Lens = Literal["brown-conrady", "kannala-brandt", "none"]
+Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"]
+COEFFICIENTS: dict[Lens, int] = {"brown-conrady": 5, "rational": 8, "thin-prism": 12, "tilted": 14}
+"""Coefficients of the lens models of Brown and Conrady, each with all terms of the former."""
 FEWEST_IMAGES = 3
 FEWEST_POINTS = 6
 """Points of an image below which none is left out."""
@@ -37,6 +40,7 @@ class BoardViews:
     seen: Mapping[FrameKey, Detection]
 
 
+Points = Float[np.ndarray, "n 3"]
 Solved = tuple[np.ndarray, np.ndarray, list[np.ndarray], list[np.ndarray]]
 
 
@@ -61,10 +65,10 @@ def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens =
     plausible = BoardViews(views.hw, {key: near_homography(d, board) for key, d in views.seen.items()})
     camera, poses = _solved(name, plausible, board, lens)
     for _ in range(2):
-        plausible = without_outliers(views, camera, poses, board)
+        plausible = without_outliers(views, camera, poses, board.points)
         camera, poses = _solved(name, plausible, board, lens)
     check_tilts(name, poses)
-    rms = {key: _rms(camera, pose, plausible.seen[key], board) for key, pose in poses.items()}
+    rms = {key: _rms(camera, pose, plausible.seen[key], board.points) for key, pose in poses.items()}
     return InitialCamera(camera, poses, rms)
 
 
@@ -81,14 +85,14 @@ def near_homography(found: Detection, board: Board) -> Detection:
 
 
 def without_outliers(
-    views: BoardViews, camera: Camera, poses: Mapping[FrameKey, Pose], board: Board, *, sigma: float | None = None
+    views: BoardViews, camera: Camera, poses: Mapping[FrameKey, Pose], points: Points, *, sigma: float | None = None
 ) -> BoardViews:
     """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
 
-    `sigma` is along x or y, pixels; by default estimated from the median of all distances. Images without a pose, or
-    with fewer than `FEWEST_POINTS` points left, keep all of theirs.
+    `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
+    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points left, keep all of theirs.
     """
-    off = {key: _distances(camera, poses[key], d, board) for key, d in views.seen.items() if key in poses}
+    off = {key: _distances(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
     sigma = sigma or max(MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), 0.02)
     kept = {key: _only(views.seen[key], r < OUTLIER * sigma) for key, r in off.items()}
     return BoardViews(
@@ -102,14 +106,15 @@ def _only(found: Detection, mask: np.ndarray) -> Detection:
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
-    fisheye = lens == "kannala-brandt"
+    solve = _pinhole if lens in COEFFICIENTS or lens == "none" else _fisheye
     try:
-        K, coefficients, rotations, translations = _fisheye(views, board) if fisheye else _pinhole(views, board, lens)
+        K, coefficients, rotations, translations = solve(views, board, lens)
     except cv2.error as error:
         raise ValueError(
             f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same board?"
         ) from None
-    distortion = None if lens == "none" else Distortion(lens, torch.tensor(coefficients))
+    model = "brown-conrady" if lens in COEFFICIENTS else "kannala-brandt"
+    distortion = None if lens == "none" else Distortion(model, torch.tensor(coefficients))
     camera = Camera(K=torch.tensor(K), cam_from_world=Pose.identity(), hw=views.hw, distortion=distortion)
     return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
 
@@ -138,7 +143,7 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
 
 
 def _pinhole(views: BoardViews, board: Board, lens: Lens) -> Solved:
-    """Two radial terms suffice initially: (K, k1 k2 p1 p2 k3, rotations, translations)."""
+    """Two radial terms suffice initially: (K, coefficients, rotations, translations)."""
     points = [board.points[d.ids].astype(np.float32) for d in views.seen.values()]
     pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
     h, w = views.hw
@@ -146,10 +151,13 @@ def _pinhole(views: BoardViews, board: Board, lens: Lens) -> Solved:
     if lens == "none":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
     _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), np.eye(3), np.zeros(5), flags=flags)
-    return K, c.reshape(-1)[:5], list(rotations), list(translations)
+    coefficients = np.zeros(COEFFICIENTS.get(lens, 5))
+    coefficients[:2] = c.reshape(-1)[:2]
+    return K, coefficients, list(rotations), list(translations)
 
 
-def _fisheye(views: BoardViews, board: Board) -> Solved:
+def _fisheye(views: BoardViews, board: Board, lens: Lens) -> Solved:
+    del lens
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw
@@ -159,13 +167,13 @@ def _fisheye(views: BoardViews, board: Board) -> Solved:
     return K, c.reshape(-1), list(rotations), list(translations)
 
 
-def _distances(camera: Camera, pose: Pose, found: Detection, board: Board) -> np.ndarray:
-    projected = camera.project_local(pose.apply(torch.from_numpy(board.points[found.ids]))).x.numpy()
+def _distances(camera: Camera, pose: Pose, found: Detection, points: Points) -> np.ndarray:
+    projected = camera.project_local(pose.apply(torch.from_numpy(points[found.ids]))).x.numpy()
     return np.linalg.norm(projected - found.x, axis=-1)
 
 
-def _rms(camera: Camera, pose: Pose, found: Detection, board: Board) -> float:
-    return float(np.sqrt((_distances(camera, pose, found, board) ** 2).mean()))
+def _rms(camera: Camera, pose: Pose, found: Detection, points: Points) -> float:
+    return float(np.sqrt((_distances(camera, pose, found, points) ** 2).mean()))
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

@@ -15,7 +15,7 @@ from arraygeom import Camera, Pose
 from .detect import Detection
 from .intrinsics import BoardViews, board_pose
 from .photos import FrameKey
-from .target import Board, Charuco
+from .target import Board
 
 TOLERANCE = 0.03
 """A frame agrees with a pose if it predicts the board to this share of the image width: one view of a small board
@@ -234,7 +234,7 @@ def _connection_error(
 
 def _explain_contradiction(a: CalibratedViews, b: CalibratedViews, board: Board) -> str:
     """What would make two cameras' frames agree: mirroring one, or shifting it by a few frames."""
-    for mirrored, other in () if isinstance(board, Charuco) else ((b, a), (a, b)):
+    for mirrored, other in () if board.identified else ((b, a), (a, b)):
         if (found := pair_pose(other, _mirrored(mirrored, board), board)) and found.consistent:
             return f"they agree once {mirrored.name} is mirrored: save its images as captured, not mirrored"
     for shift in (1, -1, 2, -2, 3, -3):

@@ -19,9 +19,13 @@ from torch import Tensor
 from arraygeom import Camera, Rig
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
+from .adequacy import intrinsics_of, next_views
+from .adequacy_figures import draw_adequacy, draw_worst_images
 from .covariance import RigCovariance, baseline_deviation, beta_covariance
 from .coverage import CELLS, Coverage, coverage
+from .intrinsics import BoardViews
 from .observability import LENS_TERMS
+from .photos import Photos
 from .rig import Calibration
 
 STYLE = """
@@ -32,10 +36,20 @@ h2 { margin-top: 2em; font-size: 1.15em } img { max-width: 100% } .note { color:
 """
 
 
-def report_html(calibration: Calibration, *, title: str = "Calibration", notes: Sequence[str] = ()) -> str:
-    """The report: accuracy by camera, pair and image, coverage, residual fields, uncertainties, the rig."""
+def report_html(
+    calibration: Calibration,
+    *,
+    title: str = "Calibration",
+    notes: Sequence[str] = (),
+    detected: Mapping[str, BoardViews] | None = None,
+    photos: Photos | None = None,
+) -> str:
+    """The report: accuracy by camera, pair and image, coverage, residual fields, uncertainties, the rig.
+
+    With the points `detected` in `photos`, the images that fit worst are drawn.
+    """
     covers = coverages(calibration)
-    advice = [*notes, *calibration.notes, *(f"{n}: {m}" for n, c in covers.items() for m in c.missing)]
+    advice = [*notes, *calibration.notes, *coverage_advice(calibration, covers)]
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<p>{escape(summary(calibration))}</p>",
@@ -50,10 +64,25 @@ def report_html(calibration: Calibration, *, title: str = "Calibration", notes: 
         "<h2>Residuals of each image</h2><p>Root mean square, pixels.</p>",
         image(draw_by_image(calibration)),
     ]
+    worst = draw_worst_images(calibration, detected, photos) if detected and photos else None
+    if worst is not None:
+        parts += [
+            "<h2>Images that fit worst</h2><p>Points used (dots), left out (red circles), residuals (enlarged).</p>",
+            image(worst),
+        ]
     for name in calibration.views:
         parts += [
             f"<h2>{escape(name)}: coverage and residuals</h2>",
             image(draw_camera(calibration, name, covers[name])),
+        ]
+    if calibration.fit.covariance is not None:
+        parts += [
+            "<h2>Adequacy of each camera</h2>",
+            "<p>Left, middle: standard deviation (pixels, worst direction) of the projection of points at the nearest "
+            "and the furthest depth of the boards, after the motion of the camera that compensates best. Right: how "
+            "far cameras fitted to every other frame differ: where that is much more, the lens model or the boards are "
+            "inadequate.</p>",
+            image(draw_adequacy(calibration, depths(covers.values()))),
         ]
     if len(calibration.views) > 1 and calibration.fit.covariance is not None:
         near, far = depths(covers.values())
@@ -90,6 +119,22 @@ def coverages(calibration: Calibration) -> dict[str, Coverage]:
     for name, views in calibration.views.items():
         poses = {key: problem.cameras[name].cam_from_world @ boards[key] for key in views.seen}
         found[name] = coverage(views, poses, calibration.board)
+    return found
+
+
+def coverage_advice(calibration: Calibration, covers: Mapping[str, Coverage]) -> list[str]:
+    """What each camera's images lack, and, where that is something, which views would help most."""
+    found = []
+    for name, covered in covers.items():
+        found += [f"{name}: {text}" for text in covered.missing]
+        if not covered.missing or calibration.fit.covariance is None:
+            continue
+        known = intrinsics_of(calibration.fit, name)
+        if len(known.covariance):
+            views = next_views(known, calibration.board, float(np.mean(covered.depths)))
+            listed = "; then ".join(view.text for view in views)
+            gain = f"uncertainty from {views[0].before:.2g} to {views[-1].after:.2g} px"
+            found.append(f"{name}: two more views would help most: {listed} ({gain})")
     return found
 
 

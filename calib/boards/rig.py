@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import combinations
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from arraygeom import Camera, Pose, Rig, epipolar_distance
+from arraygeom import Camera, Pose, Rig
 
 from .bundle import (
     BoardPoses,
     BundleProblem,
     BundleResult,
+    Free,
     IntrinsicsPrior,
     Observations,
     adjust,
     intrinsic_values,
     jackknife,
+    loss,
     noise,
     parameter_names,
 )
@@ -29,11 +31,11 @@ from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check
 from .observability import gate, typical_prior
 from .photos import FrameKey
 from .poses import CalibratedViews, initial_rig
+from .shape import LEAST_GAIN, BoardShape, described, is_significant
 from .target import Board
+from .validation import epipolar_errors, held_out_errors, misfit_notes
 
 SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
-FEWEST_TO_HOLD_OUT = 8
-"""Frames are held out from this many on that two cameras share."""
 INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
 FEWEST_TO_JACKKNIFE = 6
@@ -41,8 +43,6 @@ CONSIDERABLE = 1.3
 """Standard deviations are raised if the jackknife's are larger by this."""
 ROUNDS = 3
 """Times that parameters and outliers may return."""
-HOLD_OUT_EVERY = 5
-"""One frame in this many is held out."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ class Calibration:
 
     fit: result of the bundle adjustment; its blocks are `frames` in order.
     single: each camera's reprojection error (RMS, px) when it is calibrated by itself.
-    views: the detections used, numbered consistently in all cameras. held_out: epipolar errors of held-out frames, px.
+    views: the detections used, numbered consistently in all cameras.
     raised: the factor by which the covariance's standard deviations were raised to those of a jackknife over frames.
     """
 
@@ -62,7 +62,6 @@ class Calibration:
     views: Mapping[str, BoardViews]
     single: Mapping[str, float]
     epipolar: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
-    held_out: Mapping[tuple[str, str], Float[np.ndarray, "_"]]
     notes: tuple[str, ...] = field(default=())
     raised: float = 1.0
 
@@ -70,6 +69,11 @@ class Calibration:
     def rms(self) -> float:
         """The reprojection error of all points of all images, pixels, outliers included."""
         return self.fit.problem.rms()
+
+    @cached_property
+    def held_out(self) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
+        """By pair: epipolar errors (pixels) of all frames, each by a rig calibrated without it; empty if too few."""
+        return held_out_errors(self.fit, self.frames, self.views)
 
     def deviations(self) -> dict[str, float]:
         """The standard deviation of each free parameter by name ("left.focal.0"), in its own unit."""
@@ -93,7 +97,8 @@ def calibrate(
         [CalibratedViews(name, a.camera, a.views, a.cam_from_board) for name, a in single.items()], board
     )
     cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
-    together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), single)
+    flat = _flat(board, initial.world_from_board, initial.views)
+    together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), flat, single)
     together, factor = _scaled_covariance(together)
     rig = Rig(together.fit.problem.cameras)
     return Calibration(
@@ -104,8 +109,13 @@ def calibrate(
         views=initial.views,
         single={name: a.fit.problem.rms() for name, a in single.items()},
         epipolar=epipolar_errors(rig, initial.views),
-        held_out=_held_out(cameras, initial.world_from_board, initial.views, board, together),
-        notes=(*_images_left_out(views, single, initial.left_out), *together.notes, *_noted(factor)),
+        notes=(
+            *_images_left_out(views, single, initial.left_out),
+            *together.notes,
+            *together.shape_notes(board),
+            *misfit_notes(together.fit, tuple(initial.world_from_board)),
+            *_noted(factor),
+        ),
         raised=factor,
     )
 
@@ -141,11 +151,15 @@ def calibrate_single(
     if len(kept.seen) < len(views.seen):
         start = calibrate_camera(name, kept, board, lens=lens)
     camera, poses = start.camera, start.cam_from_board
-    used = without_outliers(kept, camera, poses, board)
+    used = without_outliers(kept, camera, poses, board.points)
+    flat = _flat(board, poses, {name: kept})
+    shape = None
     for _ in range(ROUNDS):
-        fit, _, notes = _fitted(_problem({name: camera}, poses, {name: used}, board), final=final)
-        camera, poses = fit.problem.cameras[name], fit.problem.board_poses(poses)
-        before, used = used, without_outliers(kept, camera, poses, board, sigma=fit.sigma[name])
+        problem = replace(_problem({name: camera}, poses, {name: used}, board), shape=shape)
+        fit, _, notes = _fitted(problem, flat, final=final)
+        camera, poses, shape = fit.problem.cameras[name], fit.problem.board_poses(poses), fit.problem.shape
+        points = board.points if shape is None else shape.deformed(board.points, board.part)
+        before, used = used, without_outliers(kept, camera, poses, points, sigma=fit.sigma[name])
         if _count_points(used) == _count_points(before):
             break
     found = SingleCalibration(fit, before, tuple(poses), tuple(notes))
@@ -154,18 +168,26 @@ def calibrate_single(
 
 
 def _scaled_covariance(together: _JointFit) -> tuple[_JointFit, float]:
-    """The fit with its covariance raised to that of the jackknife over frames, if considerably larger; and the factor.
+    """The fit with its covariance raised if frames disagree considerably; and the factor of its deviations (median).
 
-    The factor is that of the standard deviations, in the mean over all directions.
+    The raised covariance is the mean of the jackknife's, which few frames make noisy, and of that of the points' noise,
+    scaled to the jackknife's level.
     """
     fit = together.fit
     if fit.covariance is None or not len(fit.covariance) or len(fit.problem.structure) < FEWEST_TO_JACKKNIFE:
         return together, 1.0
-    found = jackknife(fit.problem, together.fitted(), fit.sigma)
-    factor = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found)) / len(found)))
-    if factor < CONSIDERABLE:
+    found = jackknife(fit.problem, fit.free(), fit.sigma)
+    disagreement = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found.covariance)) / len(fit.covariance)))
+    if disagreement < CONSIDERABLE:
         return together, 1.0
-    return together._replace(fit=fit._replace(covariance=factor**2 * fit.covariance)), factor
+    level = max(disagreement, float(np.median(_ratio(found.left_out, fit.covariance))))
+    raised = (level**2 * fit.covariance + found.left_out) / 2
+    return together._replace(fit=fit._replace(covariance=raised)), float(np.median(_ratio(raised, fit.covariance)))
+
+
+def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Of the standard deviations of two covariances."""
+    return np.asarray(np.sqrt(a.diagonal() / b.diagonal()))
 
 
 def _noted(factor: float) -> list[str]:
@@ -178,46 +200,42 @@ def _noted(factor: float) -> list[str]:
 
 
 class _JointFit(NamedTuple):
-    """The fit of all cameras, its free parameters, notes, and whether all cameras shared one noise."""
+    """The fit of all cameras, its free parameters and notes."""
 
     fit: BundleResult
     free: dict[str, np.ndarray]
     notes: list[str]
-    equal_noise: bool = False
 
-    def fitted(self) -> dict[str, np.ndarray]:
-        """The masks of the parameters that `fit` has covariances of."""
-        named = set(self.fit.names)
-        return {
-            name: np.array([f"{name}.{entry}" in named for entry in parameter_names(camera)])
-            for name, camera in self.fit.problem.cameras.items()
-        }
-
-    def refit(self, problem: BundleProblem) -> BundleResult:
-        """The same adjustment of other frames."""
-        return adjust(replace(problem, priors=self.fit.problem.priors), self.free, equal_noise=self.equal_noise)
+    def shape_notes(self, board: Board) -> list[str]:
+        """What the boards were found to be shaped like, if not flat."""
+        problem = self.fit.problem
+        if problem.shape is None:
+            return []
+        covariance = jackknife(problem, self.fit.free(), self.fit.sigma).shapes
+        deviations = np.sqrt(covariance.diagonal()).reshape(problem.shape.values.shape)
+        return described(problem.shape, deviations, board.extents)
 
 
-def _joint_fit(problem: BundleProblem, single: Mapping[str, SingleCalibration]) -> _JointFit:
+def _joint_fit(problem: BundleProblem, flat: BoardShape, single: Mapping[str, SingleCalibration]) -> _JointFit:
     """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
 
     Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
     """
     if len(problem.cameras) == 1:
         (only,) = single.values()
-        fixed = {name: _free(c, False, lens=0) for name, c in problem.cameras.items()}
+        fixed = {name: np.zeros(len(parameter_names(c)), dtype=bool) for name, c in problem.cameras.items()}
         return _JointFit(only.fit, fixed, list(only.notes))
-    fit, free, notes = _fitted(problem)
+    fit, free, notes = _fitted(problem, flat)
     if not (doubts := _inconsistent_cameras(fit, single)):
         return _JointFit(fit, free, notes)
     priors = {name: _as_prior(name, a) for name, a in single.items()}
     free = {name: priors[name].information.diagonal() > 0 for name in problem.cameras}
     for index, mask in enumerate(free.values()):
         mask[:6] = index > 0
-    fit = adjust(replace(problem, priors=priors), free, equal_noise=True)
+    fit = adjust(replace(problem, priors=priors, shape=fit.problem.shape), free, equal_noise=True)
     kept = "so each camera's intrinsics keep close to its own calibration"
     notes = [note for a in single.values() for note in a.notes]
-    return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"], equal_noise=True)
+    return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"])
 
 
 def _as_prior(name: str, single: SingleCalibration) -> IntrinsicsPrior:
@@ -228,35 +246,6 @@ def _as_prior(name: str, single: SingleCalibration) -> IntrinsicsPrior:
     if fit.covariance is not None:
         information[np.ix_(free, free)] = np.linalg.inv(fit.covariance)
     return IntrinsicsPrior(intrinsic_values(single.camera), information)
-
-
-def epipolar_errors(rig: Rig, views: Mapping[str, BoardViews]) -> dict[tuple[str, str], Float[np.ndarray, "_"]]:
-    """By pair: distances in undistorted pixels from beta's points to the lines of alpha's, and the reverse."""
-    found = {}
-    for a, b in combinations(views, 2):
-        xa, xb = _common(views[a], views[b])
-        if len(xa):
-            found[a, b] = _symmetric_distance(rig, a, b, xa, xb)
-    return found
-
-
-def _symmetric_distance(rig: Rig, a: str, b: str, xa: np.ndarray, xb: np.ndarray) -> np.ndarray:
-    pair, reverse = rig.pair(a, b), rig.pair(b, a)
-    (pa, va), (pb, vb) = pair.alpha.undistort(torch.from_numpy(xa)), pair.beta.undistort(torch.from_numpy(xb))
-    forward = epipolar_distance(pair.fundamental, pa, pb).abs()
-    backward = epipolar_distance(reverse.fundamental, pb, pa).abs()
-    return ((forward + backward) / 2)[va & vb].numpy()
-
-
-def _common(a: BoardViews, b: BoardViews) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (n, 2) of the points both cameras observed in the same frames."""
-    parts: list[tuple[np.ndarray, np.ndarray]] = [(np.zeros((0, 2)), np.zeros((0, 2)))]
-    for key in a.seen:
-        if key in b.seen:
-            _, i, j = np.intersect1d(a.seen[key].ids, b.seen[key].ids, return_indices=True)
-            parts.append((a.seen[key].x[i], b.seen[key].x[j]))
-    xa, xb = (np.concatenate(part) for part in zip(*parts))
-    return xa, xb
 
 
 def _count_points(views: BoardViews) -> int:
@@ -280,25 +269,34 @@ def _problem(
     )
 
 
+def _flat(board: Board, boards: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardShape:
+    """Flat boards, in the order of the blocks."""
+    first = {key: d.ids[0] for v in views.values() for key, d in v.seen.items()}
+    return BoardShape.flat(board.points, board.part, board.part[[first[key] for key in boards]])
+
+
 def _observations(views: BoardViews, index: Mapping[FrameKey, int], board: Board) -> Observations:
     parts = [(np.full(len(d.ids), index[key]), board.points[d.ids], d.x) for key, d in views.seen.items()]
     return Observations(*(np.concatenate(part) for part in zip(*parts)))
 
 
-def _fitted(problem: BundleProblem, *, final: bool = True) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
+def _fitted(
+    problem: BundleProblem, flat: BoardShape, *, final: bool = True
+) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
     """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
-    Parameters fixed before the fit, when the noise was overestimated, may return after it.
+    Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that are clearly
+    neither `flat` nor printed true get a shape.
     """
-    full = {name: _free(camera, index > 0, lens=5) for index, (name, camera) in enumerate(problem.cameras.items())}
+    full = {name: _free(camera, index > 0) for index, (name, camera) in enumerate(problem.cameras.items())}
     problem, free, notes = gate(problem, full, noise(problem, 0), final=False)
-    fit = adjust(problem, free)
+    fit = _with_shape(adjust(problem, free), free, flat)
     for _ in range(ROUNDS):
         returned, more, changed = gate(fit.problem, full, fit.sigma, final=False)
         if all((more[name] == free[name]).all() for name in free):
             break
         problem, free, notes = returned, more, changed
-        fit = adjust(problem, free)
+        fit = _with_shape(adjust(problem, free), free, flat)
     while True:
         problem, free, dropped = gate(fit.problem, free, fit.sigma, final=final)
         if not dropped:
@@ -306,33 +304,27 @@ def _fitted(problem: BundleProblem, *, final: bool = True) -> tuple[BundleResult
         notes, fit = notes + dropped, adjust(problem, free)
 
 
-def _free(camera: Camera, posed: bool, *, lens: int) -> np.ndarray:
-    """A mask of the camera's parameters: its pose if `posed`, K, and the first `lens` distortion terms."""
-    names = parameter_names(camera)
-    mask = np.ones(len(names), dtype=bool)
+def _with_shape(fit: BundleResult, free: Free, flat: BoardShape) -> BundleResult:
+    """The fit with the boards' shapes as unknowns if they matter, by the points and by how frames agree on them."""
+    if fit.problem.shape is not None:
+        return fit
+    trial = replace(fit.problem, shape=flat)
+    try:
+        found = jackknife(trial, free, fit.sigma)
+    except np.linalg.LinAlgError:  # some parameters are not observable yet
+        return fit
+    if not is_significant(found.step, found.shapes, len(flat.part)):
+        return fit
+    shaped = adjust(trial, free)
+    gain = loss(fit.problem, shaped.sigma) - loss(shaped.problem, shaped.sigma)
+    return shaped if gain > LEAST_GAIN else fit
+
+
+def _free(camera: Camera, posed: bool) -> np.ndarray:
+    """A mask of the camera's parameters: its pose if `posed`, K and the lens."""
+    mask = np.ones(len(parameter_names(camera)), dtype=bool)
     mask[:6] = posed
-    mask[10 + lens :] = False
     return mask
-
-
-def _held_out(
-    cameras: Mapping[str, Camera],
-    boards: Mapping[FrameKey, Pose],
-    views: Mapping[str, BoardViews],
-    board: Board,
-    together: _JointFit,
-) -> dict[tuple[str, str], np.ndarray]:
-    """Epipolar errors on one frame in five of a rig calibrated with the others; empty if there are too few."""
-    shared = [key for key in boards if sum(key in v.seen for v in views.values()) > 1]
-    if len(shared) < FEWEST_TO_HOLD_OUT:
-        return {}
-    out = set(shared[HOLD_OUT_EVERY // 2 :: HOLD_OUT_EVERY])
-    used = {name: BoardViews(v.hw, {k: d for k, d in v.seen.items() if k not in out}) for name, v in views.items()}
-    kept = {name: BoardViews(v.hw, {k: d for k, d in v.seen.items() if k in out}) for name, v in views.items()}
-    if any(len(v.seen) < 3 for v in used.values()):
-        return {}
-    problem = _problem(cameras, {k: p for k, p in boards.items() if k not in out}, used, board)
-    return epipolar_errors(Rig(together.refit(problem).problem.cameras), kept)
 
 
 def _images_left_out(

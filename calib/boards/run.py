@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from matplotlib import rc_context
 
@@ -13,9 +13,11 @@ from arraygeom.rig import depth_range
 
 from .collect import Progress, collect_folder
 from .intrinsics import Lens
-from .report import coverages, report_html, rig_covariance, summary
+from .lens_comparison import compare_lenses
+from .printing import draw_board
+from .report import coverage_advice, coverages, report_html, rig_covariance, summary
 from .rig import calibrate
-from .target import draw_board, parse_board
+from .target import parse_board, parse_boards
 
 
 class CalibrationOutput(NamedTuple):
@@ -27,46 +29,58 @@ class CalibrationOutput(NamedTuple):
 
 def calibrate_photos(
     photos: Path,
-    board: str,
+    board: str | Sequence[str],
     out: Path,
     *,
     patterns: Mapping[str, str] | None = None,
-    lens: Lens = "brown-conrady",
+    lens: Lens | Literal["auto"] = "brown-conrady",
     depth: tuple[float, float] | None = None,
     progress: Progress | None = None,
 ) -> CalibrationOutput:
     """Calibrate from a folder of images; write the rig file, its report and its covariance, the rig last.
 
+    Several boards may be in the images at once. The lens "auto" is, for each camera, the model that its images support.
     Raises ValueError and OSError for unusable images, and then writes nothing.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"{out}: a rig file's name ends in .yaml")
     if depth is not None:
         depth_range(*depth)
-    target = parse_board(board)
+    target = parse_boards([board] if isinstance(board, str) else board)
     found = collect_folder(photos, target, patterns=patterns, progress=progress)
-    calibration = calibrate(found.views, target, lens=lens)
+    comparisons = compare_lenses(found.views, target) if lens == "auto" else {}
+    chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in found.views}
+    calibration = calibrate(found.views, target, lens=chosen)
+    lenses = [f"{name}: {c.advice}" for name, c in comparisons.items()]
     rig = calibration.rig.replace(depth=depth, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
+    report = report_html(
+        calibration,
+        title=f"Calibration of {out.name}",
+        notes=[*lenses, *found.notes],
+        detected=found.views,
+        photos=found.photos,
+    )
     covariance = rig_covariance(calibration)
     sweep(out.parent, out.stem)
     with write_together(out.parent, last=out.name, stale=[path.name for path in written[:2]]) as folder:
-        write_text(
-            folder / written[0].name, report_html(calibration, title=f"Calibration of {out.name}", notes=found.notes)
-        )
+        write_text(folder / written[0].name, report)
         if covariance is not None:
             covariance.save(folder / written[1].name)
         rig.save(folder / out.name)
-    advice = [f"{name}: {text}" for name, c in coverages(calibration).items() for text in c.missing]
-    messages = [summary(calibration), *found.notes, *calibration.notes, *advice]
+    advice = coverage_advice(calibration, coverages(calibration))
+    messages = [summary(calibration), *lenses, *found.notes, *calibration.notes, *advice]
     return CalibrationOutput(messages, [path for path in written if path.exists()])
 
 
-def write_board(board: str, out: Path) -> Path:
-    """Write a board as a PDF or SVG of its true size. Raises ValueError for another ending."""
+def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:
+    """Write a board as a PDF or SVG of its true size, on a sheet of paper if given.
+
+    Raises ValueError for another ending, and if the board does not fit on the sheet.
+    """
     if out.suffix.lower() not in (".pdf", ".svg"):
         raise ValueError(f"{out}: a board is written as .pdf or .svg, which keep its true size")
-    figure = draw_board(parse_board(board))
+    figure = draw_board(parse_board(board), paper=paper)
     with write_atomically(out) as temporary, rc_context({"svg.fonttype": "path"}):
         figure.savefig(temporary)
     return out

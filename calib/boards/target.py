@@ -6,7 +6,11 @@ A board is specified by a short text:
 - ``charuco:8x6:30mm``: squares across x down, side of a square; then, if wanted, the markers' side and their
   dictionary, ``charuco:8x6:30mm:22mm:5x5``, and ``legacy`` for boards drawn by OpenCV before 4.6;
 - ``circles:7x5:20mm``: circles across x down, distance between centres;
-- ``acircles:4x11:20mm``: circles in every row x rows, distance between rows (OpenCV's asymmetric grid).
+- ``acircles:4x11:20mm``: circles in every row x rows, distance between rows (OpenCV's asymmetric grid);
+- ``aprilgrid:6x6:88mm:0.3``: tags across x down, side of a tag, space between tags as a share of it (Kalibr's layout,
+  tag family 36h11; ``border1`` for tags with one black bit around them instead of two); or Kalibr's own target file.
+
+``from24`` at the end of a board with markers: its first marker has this number, so that several boards differ.
 
 Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the origin.
 """
@@ -15,19 +19,25 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import Any, ClassVar
 
 import cv2
 import numpy as np
+import yaml
 from jaxtyping import Float, Int
-from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
-FORMS = "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm or acircles:4x11:20mm"
+FORMS = (
+    "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, acircles:4x11:20mm or "
+    "aprilgrid:6x6:88mm:0.3 (tags)"
+)
 LARGEST = 100
+APRIL_TAGS, APRIL_BITS = "apriltag_36h11", 6
 
 
 @dataclass(frozen=True)
@@ -37,6 +47,13 @@ class Board(ABC):
     columns: int
     rows: int
     spacing: float
+    identified: ClassVar[bool] = False
+    """Whether points are identified one by one, by markers."""
+
+    @property
+    def members(self) -> tuple[Board, ...]:
+        """The boards, if there are several."""
+        return (self,)
 
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
@@ -61,9 +78,24 @@ class Board(ABC):
         return tuple(found)
 
     @property
+    def part(self) -> Int[np.ndarray, " n"]:
+        """The board that each point is on: 0, unless several boards are used at once."""
+        return np.zeros(len(self.points), dtype=int)
+
+    @property
+    def extents(self) -> list[tuple[float, float]]:
+        """`extent` of each board."""
+        return [self.extent]
+
+    @property
     def extent(self) -> tuple[float, float]:
         """Width and height of the print without its margin, metres: the squares around the corners."""
         return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
+
+    @property
+    def offset(self) -> float:
+        """Distance of the first point from the upper and the left edge of the print without its margin, metres."""
+        return self.spacing
 
     @abstractmethod
     def _draw(self, axes: Any) -> None:
@@ -85,32 +117,51 @@ class Chessboard(Board):
 
 
 @dataclass(frozen=True)
-class Charuco(Board):
-    """A chessboard with markers in its white squares; `columns` x `rows` counts its inner corners.
+class MarkedBoard(Board):
+    """A board whose points are identified individually: a part of it is enough, its orientation is unambiguous.
 
-    Corners are identified individually: a part of the board is enough, and its orientation is unambiguous.
+    first: the number of its first marker.
     """
 
-    marker: float
     dictionary: str
-    legacy: bool = False
-
-    @cached_property
-    def opencv(self) -> cv2.aruco.CharucoBoard:
-        """OpenCV's board, lengths in metres."""
-        size = self.columns + 1, self.rows + 1
-        board = cv2.aruco.CharucoBoard(size, self.spacing, self.marker, marker_dictionary(self.dictionary))
-        board.setLegacyPattern(self.legacy)
-        return board
+    first: int
+    identified: ClassVar[bool] = True
 
     @property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:  # type: ignore[override]
         """The identity alone."""
         return (np.arange(len(self.points)),)
 
+    @property
+    @abstractmethod
+    def markers(self) -> range:
+        """The numbers of its markers."""
+
+
+@dataclass(frozen=True)
+class Charuco(MarkedBoard):
+    """A chessboard with markers in its white squares; `columns` x `rows` counts its inner corners."""
+
+    marker: float
+    legacy: bool = False
+
+    @property
+    def markers(self) -> range:
+        """The numbers of its markers."""
+        return range(self.first, self.first + (self.columns + 1) * (self.rows + 1) // 2)
+
+    @cached_property
+    def opencv(self) -> cv2.aruco.CharucoBoard:
+        """OpenCV's board, lengths in metres."""
+        size = self.columns + 1, self.rows + 1
+        ids = np.array(self.markers)
+        board = cv2.aruco.CharucoBoard(size, self.spacing, self.marker, marker_dictionary(self.dictionary), ids)
+        board.setLegacyPattern(self.legacy)
+        return board
+
     def __str__(self) -> str:
         squares = f"{self.columns + 1}x{self.rows + 1}"
-        tail = ":legacy" if self.legacy else ""
+        tail = (":legacy" if self.legacy else "") + (f":from{self.first}" if self.first else "")
         lengths = f"{_millimetres(self.spacing)}:{_millimetres(self.marker)}"
         return f"charuco:{squares}:{lengths}:{self.dictionary.lower()}{tail}"
 
@@ -120,21 +171,108 @@ class Charuco(Board):
         for corners, number in zip(np.array(self.opencv.getObjPoints()), np.array(self.opencv.getIds()).reshape(-1)):
             left, top = (1e3 * float(v) for v in corners[:, :2].min(0))
             white.add((int(left // side), int(top // side)))
-            self._draw_marker(axes, int(number), left, top, marker)
+            _draw_marker(axes, self.dictionary, int(number), left, top, marker)
         for column, row in np.ndindex(self.columns + 1, self.rows + 1):
             if (column, row) not in white:
                 axes.add_patch(_black(column * side, row * side, side, side))
 
-    def _draw_marker(self, axes: Any, number: int, left: float, top: float, side: float) -> None:
-        """Runs of black bits as one rectangle each: no hairlines between bits."""
-        dictionary = marker_dictionary(self.dictionary)
-        bits = dictionary.markerSize + 2
-        black = np.asarray(cv2.aruco.generateImageMarker(dictionary, number, bits) == 0)
-        step = side / bits
-        for row, line in enumerate(black):
-            edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
-            for begin, end in edges.reshape(-1, 2).tolist():
-                axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
+
+@dataclass(frozen=True)
+class AprilGrid(MarkedBoard):
+    """Kalibr's grid of AprilTags; `columns` x `rows` counts the corners of all tags, `spacing` is twice the gap.
+
+    tag: side of a tag, metres; border: black bits around its code. Tags are numbered row by row from below.
+    """
+
+    tag: float
+    border: int = 2
+
+    @property
+    def gap(self) -> float:
+        """The space between two tags, metres."""
+        return self.spacing / 2
+
+    @property
+    def markers(self) -> range:
+        """The numbers of its tags."""
+        return range(self.first, self.first + self.columns * self.rows // 4)
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """Positions of the tags' corners on the board, metres, row by row."""
+        grid = _grid(self.columns, self.rows)
+        return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
+
+    @cached_property
+    def corners(self) -> Int[np.ndarray, "m 4"]:
+        """The points at the upper left, upper right, lower right and lower left corner of each tag."""
+        index = np.arange(self.columns * self.rows).reshape(self.rows, self.columns)
+        a, b = index[::2][::-1], index[1::2][::-1]
+        return np.stack([a[:, ::2], a[:, 1::2], b[:, 1::2], b[:, ::2]], -1).reshape(-1, 4)
+
+    @property
+    def extent(self) -> tuple[float, float]:
+        """Width and height of the print without its margin, metres: the small squares at the tags' corners."""
+        width, height = (float(v) + 2 * self.gap for v in self.points[:, :2].max(0))
+        return width, height
+
+    @property
+    def offset(self) -> float:
+        """The gap, metres."""
+        return self.gap
+
+    def __str__(self) -> str:
+        tail = (":border1" if self.border == 1 else "") + (f":from{self.first}" if self.first else "")
+        return (
+            f"aprilgrid:{self.columns // 2}x{self.rows // 2}:{_millimetres(self.tag)}:{self.gap / self.tag:.6g}{tail}"
+        )
+
+    def _draw(self, axes: Any) -> None:
+        tag, gap = 1e3 * self.tag, 1e3 * self.gap
+        for number, corners in zip(self.markers, self.corners):
+            left, top = 1e3 * self.points[corners[0], :2] + gap
+            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, turns=2)
+        for column, row in np.ndindex(self.columns // 2 + 1, self.rows // 2 + 1):
+            axes.add_patch(_black(column * (tag + gap), row * (tag + gap), gap, gap))
+
+
+@dataclass(frozen=True)
+class Boards(Board):
+    """Several boards seen at once, each with poses of its own; their points in one list."""
+
+    boards: tuple[Board, ...] = ()
+    identified: ClassVar[bool] = True
+
+    @property
+    def members(self) -> tuple[Board, ...]:
+        """The boards."""
+        return self.boards
+
+    @cached_property
+    def points(self) -> Float[np.ndarray, "n 3"]:
+        """The points of all boards, each in its own frame, metres."""
+        return np.concatenate([b.points for b in self.boards])
+
+    @cached_property
+    def part(self) -> Int[np.ndarray, " n"]:
+        """The board that each point is on."""
+        return np.repeat(np.arange(len(self.boards)), [len(b.points) for b in self.boards])
+
+    @property
+    def extents(self) -> list[tuple[float, float]]:
+        """`extent` of each board."""
+        return [b.extent for b in self.boards]
+
+    @property
+    def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:  # type: ignore[override]
+        """The identity alone."""
+        return (np.arange(len(self.points)),)
+
+    def __str__(self) -> str:
+        return " and ".join(map(str, self.boards))
+
+    def _draw(self, axes: Any) -> None:
+        raise ValueError("several boards are printed one by one")
 
 
 @dataclass(frozen=True)
@@ -161,6 +299,11 @@ class Circles(Board):
         return 0.3 * self.spacing * (2**0.5 if self.asymmetric else 1)
 
     @property
+    def offset(self) -> float:
+        """A circle's radius, metres."""
+        return self.radius
+
+    @property
     def extent(self) -> tuple[float, float]:
         """Width and height of the print without its margin, metres."""
         width, height = (float(v) + 2 * self.radius for v in self.points[:, :2].max(0))
@@ -174,10 +317,14 @@ class Circles(Board):
 
 def parse_board(text: str) -> Board:
     """The board that a text specifies, such as ``charuco:8x6:30mm``; see the module. Raises ValueError."""
+    if text.lower().endswith((".yaml", ".yml")):
+        text = _kalibr_target(Path(text))
     kind, _, rest = text.strip().lower().partition(":")
     parts = rest.split(":")
-    if kind not in ("chessboard", "charuco", "circles", "acircles") or len(parts) < 2:
+    if kind not in ("chessboard", "charuco", "circles", "acircles", "aprilgrid") or len(parts) < 2:
         raise ValueError(f"board '{text}' is not recognised: write it like {FORMS}")
+    if kind == "aprilgrid":
+        return _april_grid(text, parts)
     columns, rows = _counts(text, parts[0])
     spacing = _length(text, parts[1])
     if kind == "charuco":
@@ -189,21 +336,24 @@ def parse_board(text: str) -> Board:
     return Circles(columns, rows, spacing, asymmetric=kind == "acircles")
 
 
-def draw_board(board: Board, *, margin: float = 0.012) -> Figure:
-    """The board as a figure whose size in inches is its true size, with a white margin (metres) and a ruler below.
-
-    Saved as PDF or SVG it prints at true size; the ruler serves to check it.
-    """
-    width, height = (1e3 * v for v in board.extent)
-    edge, below = 1e3 * margin, 14.0
-    total = width + 2 * edge, height + 2 * edge + below
-    figure = Figure(figsize=(total[0] / 25.4, total[1] / 25.4), facecolor="white")
-    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    axes.set(xlim=(-edge, width + edge), ylim=(height + edge + below, -edge))
-    axes.set_axis_off()
-    board._draw(axes)
-    _draw_ruler(axes, str(board), width, height + edge + 2)
-    return figure
+def parse_boards(texts: Sequence[str]) -> Board:
+    """One board, or several at once, which need markers with numbers of their own. Raises ValueError."""
+    boards = [parse_board(text) for text in texts]
+    if len(boards) == 1:
+        return boards[0]
+    used: dict[str, set[int]] = {}
+    for board in boards:
+        if not isinstance(board, MarkedBoard):
+            raise ValueError(f"board '{board}': several boards at once need markers: use charuco or aprilgrid")
+        taken = used.setdefault(board.dictionary, set())
+        if taken & set(board.markers):
+            raise ValueError(
+                f"board '{board}': its markers are on another board too: print it with ':from{max(taken) + 1}' at the "
+                "end of its name, or with another dictionary"
+            )
+        taken |= set(board.markers)
+    first = boards[0]
+    return Boards(first.columns, first.rows, first.spacing, tuple(boards))
 
 
 def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
@@ -211,14 +361,18 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
 
 
-def _draw_ruler(axes: Any, text: str, width: float, y: float) -> None:
-    """A line of a whole number of centimetres with a tick at each, and the board's name."""
-    length = max(10.0, 10 * (min(width, 100.0) // 10))
-    axes.plot([0, length], [y, y], color="0.4", lw=0.6)
-    for x in np.arange(0, length + 1, 10):
-        axes.plot([x, x], [y, y + 2], color="0.4", lw=0.6)
-    note = f"{length:g} mm; print at 100 %, glue it flat, then measure this line.  {text}"
-    axes.text(0, y + 4, note, fontsize=min(7.0, 0.045 * width), color="0.4", va="top", family="sans-serif")
+def _draw_marker(
+    axes: Any, dictionary: str, number: int, left: float, top: float, side: float, *, border: int = 1, turns: int = 0
+) -> None:
+    """Runs of black bits as one rectangle each: no hairlines between bits. `turns` are quarters."""
+    known = marker_dictionary(dictionary)
+    bits = known.markerSize + 2 * border
+    black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, turns)
+    step = side / bits
+    for row, line in enumerate(black):
+        edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
+        for begin, end in edges.reshape(-1, 2).tolist():
+            axes.add_patch(_black(left + begin * step, top + row * step, (end - begin) * step, step))
 
 
 def _black(x: float, y: float, width: float, height: float) -> Rectangle:
@@ -234,6 +388,7 @@ def _grid(columns: int, rows: int) -> np.ndarray:
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
     lengths = [o for o in options if re.fullmatch(r"[\d.]+ *[a-z]+", o)]
     names = [o for o in options if re.fullmatch(r"\d+x\d+(_\d+)?", o) or o.startswith("aruco") or o.startswith("april")]
+    first, options = _first_marker(options)
     recognised = {*lengths[:1], *names[:1], "legacy"}
     if rest := [o for o in options if o not in recognised]:
         raise ValueError(f"board '{text}': '{rest[0]}' is not recognised; write it like charuco:8x6:30mm:22mm:4x4_50")
@@ -242,8 +397,45 @@ def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[s
         raise ValueError(
             f"board '{text}': markers of {_millimetres(marker)} do not fit into squares that are no larger"
         )
-    name = _dictionary_name(text, names[0] if names else "4x4", (columns * rows + 1) // 2)
-    return Charuco(columns - 1, rows - 1, spacing, marker=marker, dictionary=name, legacy="legacy" in options)
+    name = _dictionary_name(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
+    return Charuco(columns - 1, rows - 1, spacing, name, first, marker=marker, legacy="legacy" in options)
+
+
+def _first_marker(options: list[str]) -> tuple[int, list[str]]:
+    """The number in an option such as "from24", and the other options."""
+    numbers = [int(o.removeprefix("from")) for o in options if re.fullmatch(r"from\d{1,4}", o)]
+    return sum(numbers[:1]), [o for o in options if not re.fullmatch(r"from\d{1,4}", o)]
+
+
+def _april_grid(text: str, parts: list[str]) -> AprilGrid:
+    columns, rows = _counts(text, parts[0], fewest=2)
+    first, options = _first_marker(parts[2:])
+    ratios = [o for o in options if re.fullmatch(r"\d*\.?\d+", o) and 0.05 <= float(o) <= 1]
+    if rest := [o for o in options if o not in {*ratios[:1], "border1", "border2"}]:
+        raise ValueError(f"board '{text}': '{rest[0]}' is not recognised; write it like aprilgrid:6x6:88mm:0.3")
+    if first + columns * rows > len(marker_dictionary(APRIL_TAGS).bytesList):
+        raise ValueError(f"board '{text}': the tag family 36h11 has no {first + columns * rows} tags")
+    tag = _length(text, parts[1])
+    gap = tag * float(ratios[0] if ratios else 0.3)
+    border = 1 if "border1" in options else 2
+    return AprilGrid(2 * columns, 2 * rows, 2 * gap, APRIL_TAGS, first, tag=tag, border=border)
+
+
+def _kalibr_target(path: Path) -> str:
+    """The board of Kalibr's target file as text. Raises ValueError, FileNotFoundError."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file of a target")
+    try:
+        target = yaml.safe_load(path.read_text(encoding="utf-8"))
+        if target["target_type"] == "aprilgrid":
+            size, ratio = 1e3 * float(target["tagSize"]), float(target["tagSpacing"])
+            return f"aprilgrid:{target['tagCols']}x{target['tagRows']}:{size:.6f}mm:{ratio:.6f}"
+        if target["target_type"] == "checkerboard" and target["rowSpacingMeters"] == target["colSpacingMeters"]:
+            size = 1e3 * float(target["rowSpacingMeters"])
+            return f"chessboard:{target['targetCols']}x{target['targetRows']}:{size:.6f}mm"
+    except (KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
+        pass
+    raise ValueError(f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares")
 
 
 def _dictionary_name(text: str, name: str, markers: int) -> str:
@@ -255,12 +447,12 @@ def _dictionary_name(text: str, name: str, markers: int) -> str:
     raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4")
 
 
-def _counts(text: str, part: str) -> tuple[int, int]:
+def _counts(text: str, part: str, *, fewest: int = 3) -> tuple[int, int]:
     if not (match := re.fullmatch(r"(\d+)x(\d+)", part)):
         raise ValueError(f"board '{text}': '{part}' is not a count like 8x6; write it like {FORMS}")
     columns, rows = int(match[1]), int(match[2])
-    if not (3 <= columns <= LARGEST and 3 <= rows <= LARGEST):
-        raise ValueError(f"board '{text}': {columns}x{rows} is out of range; both are 3 to {LARGEST}")
+    if not (fewest <= columns <= LARGEST and fewest <= rows <= LARGEST):
+        raise ValueError(f"board '{text}': {columns}x{rows} is out of range; both are {fewest} to {LARGEST}")
     return columns, rows
 
 

@@ -11,13 +11,11 @@ from tyro.conf import Positional, UseAppendAction, arg
 from . import options
 from .options import Depth, Out, say
 
-BoardName = Annotated[
-    str,
-    arg(
-        metavar="BOARD",
-        help="charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm or acircles:4x11:20mm.",
-    ),
-]
+BOARDS = (
+    "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
+    "aprilgrid:6x6:88mm:0.3 (tags), or Kalibr's target file."
+)
+BoardName = Annotated[str, arg(metavar="BOARD", help=BOARDS)]
 
 
 @dataclass
@@ -30,21 +28,31 @@ class Calibrate:
 
     photos: Annotated[Positional[Path], arg(metavar="FOLDER")]
     """Folder with the images (or videos) of all cameras."""
-    board: BoardName
+    board: UseAppendAction[
+        Annotated[tuple[str, ...], arg(metavar="BOARD", help=f"Once for each board in the images: {BOARDS}")]
+    ] = ()
     out: Out = Path("rig.yaml")
     """The rig file; its report (.html) and covariance (.covariance.json) are written beside it."""
     camera: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=PATTERN")]] = ()
     """Once for each camera, such as left='left*.jpg', where names of folders and files do not show the camera."""
-    lens: Literal["brown-conrady", "kannala-brandt", "none"] = "brown-conrady"
-    """Lens model; kannala-brandt for fisheyes."""
+    lens: Literal["auto", "brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"] = (
+        "brown-conrady"
+    )
+    """Lens model; kannala-brandt for fisheyes. auto compares them on held-out frames and takes what they support."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
+    watch: bool = False
+    """While images are taken: a page (.watch.html) with what was detected and which view would help most."""
 
     def run(self) -> None:
         from calib.boards.run import calibrate_photos
 
+        if not self.board:
+            raise ValueError("which board is in the images? Give it, such as --board charuco:8x6:30mm")
         options.writable(self.out)
         patterns = options.files_by_name(self.camera, "--camera")
+        if self.watch:
+            self._watch({name: str(pattern) for name, pattern in patterns.items()})
         found = calibrate_photos(
             self.photos,
             self.board,
@@ -57,6 +65,18 @@ class Calibrate:
         print("\n".join(found.messages))
         say(f"written: {', '.join(map(str, found.written))}")
 
+    def _watch(self, patterns: dict[str, str]) -> None:
+        from calib.boards.target import parse_boards
+        from calib.boards.watch import watch
+
+        page = self.out.with_suffix(".watch.html")
+        say(f"open {page} in a browser; Ctrl-C calibrates with all images and ends")
+        lens = "brown-conrady" if self.lens == "auto" else self.lens
+        try:
+            watch(self.photos, parse_boards(self.board), page, patterns=patterns, lens=lens)
+        except KeyboardInterrupt:
+            say("")
+
 
 @dataclass
 class PrintBoard:
@@ -68,8 +88,13 @@ class PrintBoard:
     board: Positional[BoardName]
     out: Out = Path("board.pdf")
     """File to write, ending in .pdf or .svg."""
+    paper: Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None = None
+    """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:
+        from calib.boards.printing import page_note
         from calib.boards.run import write_board
+        from calib.boards.target import parse_board
 
-        say(f"written: {write_board(self.board, options.writable(self.out))}")
+        say(f"written: {write_board(self.board, options.writable(self.out), paper=self.paper)}")
+        say(page_note(parse_board(self.board)))

@@ -96,7 +96,7 @@ def test_the_report_holds_the_figures_and_escapes_names(found):
     assert "<title>&lt;b&gt;&amp;</title>" in text
     assert "<script>" not in text
     assert f"{found.rms:.3f} px (RMS)" in text
-    assert text.count("data:image/png;base64,") == 5
+    assert text.count("data:image/png;base64,") == 6
 
 
 def test_chessboards_that_are_numbered_from_either_end(pair):

@@ -1,0 +1,129 @@
+"""Uncertainty of projection, halves of the frames, proposed views, lens models, the page for watching a folder."""
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, Rig
+from calib.boards.adequacy import (
+    half_difference,
+    intrinsics_of,
+    next_views,
+    proposed_views,
+    uncertainty,
+)
+from calib.boards.bundle import camera_jacobian, parameter_names
+from calib.boards.lens_comparison import LensComparison, compare_lenses
+from calib.boards.rig import calibrate
+from calib.boards.simulation import simulate_photos
+from calib.boards.target import parse_board
+from calib.boards.watch import watch
+from tests.calib.board_scenes import BOARD, board_poses, camera, see
+
+TRUE = camera(700.0, (480, 640), lens=(-0.2, 0.05, 0.0, 0.0, 0.0))
+
+
+@pytest.fixture(scope="module")
+def found():
+    return calibrate(see(Rig({"cam": TRUE}), board_poses(12, spread=0.4), noise=0.2), BOARD)
+
+
+def test_projections_are_off_by_what_is_said(found):
+    known = intrinsics_of(found.fit, "cam")
+    x, deviation = uncertainty(known, 1.5)
+    X = known.camera.unproject(torch.from_numpy(x), torch.full((len(x),), 1.5, dtype=torch.float64))
+    true = TRUE.replace(cam_from_world=Pose.identity())
+    off = (true.project_local(X).x.numpy() - x).ravel()
+    pose = camera_jacobian(known.camera, X.numpy())[..., :6].reshape(len(off), 6)
+    off = np.linalg.norm((off - pose @ np.linalg.lstsq(pose, off, rcond=None)[0]).reshape(-1, 2), axis=1)
+    assert 0.1 < np.median(off / deviation) < 2.5
+    assert deviation[0] > np.median(deviation)
+
+
+def test_halves_differ_by_no_more_than_their_uncertainty(found):
+    (x, off), (_, deviation) = half_difference(found.fit, 1.5)["cam"], uncertainty(intrinsics_of(found.fit, "cam"), 1.5)
+    assert len(x) == len(off)
+    assert 0.3 < np.median(np.linalg.norm(off, axis=1)) / np.median(deviation) < 6
+
+
+def test_views_are_proposed_where_they_are_missing():
+    """Boards at the left only: the next view is at the right."""
+    poses = board_poses(10, spread=0.1, depth=(1.0, 1.4))
+    left = Pose(poses.R, poses.t - torch.tensor([0.35, 0.0, 0.0], dtype=torch.float64))
+    fit = calibrate(see(Rig({"cam": TRUE}), left, noise=0.1), BOARD).fit
+    first, second = next_views(intrinsics_of(fit, "cam"), BOARD, 1.2)
+    assert "right, " in first.text
+    assert first.after < 0.6 * first.before
+    assert second.before == first.after > second.after
+
+
+def test_tilts_are_named_by_the_edge_that_is_nearer():
+    views = proposed_views(TRUE, BOARD)
+    edges = {
+        "left": BOARD.points[:, 0] == 0,
+        "right": BOARD.points[:, 0] == BOARD.points[:, 0].max(),
+        "upper": BOARD.points[:, 1] == 0,
+        "lower": BOARD.points[:, 1] == BOARD.points[:, 1].max(),
+    }
+    for text, X in views.items():
+        nearest = min(edges, key=lambda edge: X[edges[edge], 2].mean())
+        assert text.endswith(f"{nearest} edge nearer")
+        side = {"left": X[:, 0].mean() < 0, "right": X[:, 0].mean() > 0}
+        assert all(is_there for name, is_there in side.items() if name in text.split(",")[0])
+
+
+def test_the_simplest_of_equal_lenses_is_advised():
+    g = np.random.default_rng(0)
+    base = g.uniform(0.9, 1.1, 20)
+    errors = {"none": 4 * base, "brown-conrady": base + g.normal(0, 1e-3, 20), "rational": base, "tilted": 1.2 * base}
+    assert LensComparison(errors).advised == "brown-conrady"
+    assert LensComparison({**errors, "rational": 0.8 * base}).advised == "rational"
+    assert "brown-conrady 1.0" in LensComparison(errors).advice
+    assert "too few frames" in LensComparison({}).advice
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("lens", "advised"),
+    [((-0.2, 0.05, 0.0, 0.0, 0.0), "brown-conrady"), ((-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1), "rational")],
+)
+def test_the_lens_that_the_images_support_is_advised(lens, advised):
+    views = see(
+        Rig({"c": camera(420.0, (480, 640), lens=lens)}),
+        board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6)),
+        noise=0.05,
+    )
+    assert compare_lenses(views, BOARD)["c"].advised == advised
+
+
+def test_rational_lenses_are_fitted():
+    true = camera(420.0, (480, 640), lens=(-2.0, 1.5, 0.001, -0.001, 0.05, -1.6, 1.2, 0.1))
+    views = see(Rig({"c": true}), board_poses(12, seed=3, spread=0.7, depth=(0.6, 1.6)), noise=0.05)
+    rational, brown = (calibrate(views, BOARD, lens=lens) for lens in ("rational", "brown-conrady"))
+    assert len(parameter_names(rational.rig["c"])) == 18
+    assert rational.rms == pytest.approx(0.05 * 2**0.5, rel=0.1)
+    assert brown.rms > 2 * rational.rms
+
+
+def test_a_folder_is_watched(tmp_path):
+    """Images arrive by and by: the page says what is missing, then what would help most."""
+    board, source, folder = parse_board("charuco:9x7:60mm"), tmp_path / "all", tmp_path / "photos"
+    simulate_photos(Rig({"a": camera(330.0, (240, 320))}), board, source, count=5)
+    (folder / "a").mkdir(parents=True)
+    pages, page = [], tmp_path / "page.html"
+
+    def finished():
+        if page.exists():
+            pages.append(page.read_text())
+        arrived = len(list((folder / "a").iterdir()))
+        for image in sorted((source / "a").iterdir())[arrived : arrived + (2, 3)[arrived > 0]]:
+            (folder / "a" / image.name).write_bytes(image.read_bytes())
+        return len(pages) == 4
+
+    session = watch(folder, board, page, interval=0.0, finished=finished)
+    assert len(session.seen) == 5
+    assert "0 images" in pages[0]
+    assert "the board is found in 2 of its images" in pages[1]
+    assert "Next: the board at the" in pages[2]
+    assert 'http-equiv="refresh"' in pages[2]
+    assert pages[3] == pages[2]
