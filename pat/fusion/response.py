@@ -43,6 +43,8 @@ class ResponseSettings(NamedTuple):
     shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
     sensor: weights of a usual unfiltered sensor, which sees more blue than Rec. 601.
+    greenest: share of green beyond which weights are of no sensor, where they have less blue than Rec. 601's and alpha is
+        brighter than luma where a sensor would be darker, or the other way round.
     """
 
     prior: float = 0.15
@@ -58,6 +60,7 @@ class ResponseSettings(NamedTuple):
     shading: tuple[float, float] = (0.08, 0.7)
     explained: float = 0.5
     sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
+    greenest: float = 0.62
 
 
 SETTINGS = ResponseSettings()
@@ -221,9 +224,11 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         return Response(rec601, explained=found.explained)
     weights = found.weights / gain
     change = gain * float(((weights - rec601) @ x).square().mean().sqrt())
-    if change < settings.least_change[gamma != 1 or (exposed and unknown)]:
+    unlike, share = _unlike_sensors(x, y, found, settings), weights / weights.sum()
+    no_sensor = unlike and bool((share[1] > settings.greenest) & (share[2] < rec601[2]))
+    if no_sensor or change < settings.least_change[gamma != 1 or (exposed and unknown)]:
         return Response(rec601, _ratio(y, rec601 @ x, found) if exposed else 1.0, gamma, found.explained)
-    if unknown and not exposed and _unlike_sensors(x, y, found, settings):
+    if unknown and not exposed and unlike:
         halfway = (weights / weights.sum() + rec601) / 2
         return Response(halfway, math.sqrt(_ratio(y, rec601 @ x, found)), gamma, found.explained)
     return Response(weights, gain, gamma, found.explained)
