@@ -43,8 +43,8 @@ class ResponseSettings(NamedTuple):
     shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
     sensor: weights of a usual unfiltered sensor, which sees more blue than Rec. 601.
-    greenest: share of green beyond which weights are of no sensor, where they have less blue than Rec. 601's and alpha is
-        brighter than luma where a sensor would be darker, or the other way round.
+    greenest: share of green beyond which weights are of no sensor, where they have less blue than Rec. 601's and alpha
+        is brighter than luma where a sensor would be darker, or the other way round.
     """
 
     prior: float = 0.15
