@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .lenses.brown import brown_distort, brown_undistort
+from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
 from .lenses.central import (
     DOUBLE_SPHERE,
     EXTENDED_UNIFIED,
@@ -45,7 +45,7 @@ from .lenses.central import (
     central_unproject,
 )
 from .lenses.common import WIDEST, finite_points, homogeneous, unit
-from .lenses.fisheye import fisheye_project, fisheye_unproject
+from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
@@ -154,9 +154,9 @@ class Distortion(Batched):
 
     @property
     def squared_limit(self) -> float:
-        """Up to where one lens is valid: a squared normalised radius, or a squared angle (Kannala-Brandt)."""
+        """Up to where one lens is valid: a squared normalised radius (Brown-Conrady), or angle (Kannala-Brandt)."""
         c = self.coefficients.detach()
-        return float(_fisheye_limit(c) if self.model == KANNALA_BRANDT else _brown_limit(_Brown.named(c)))
+        return float(fisheye_limit(c) if self.model == KANNALA_BRANDT else brown_limit(Brown.named(c)))
 
     def _lifted(self, points: Tensor) -> Tensor:
         """Coefficients (*b, 1.., n): the batch axes in front, one axis of length 1 for each further axis."""

@@ -163,8 +163,8 @@ class _Curve(NamedTuple):
         lens = self.beta.distortion
         numbers = [self.first, self.last, self.beta.K, *([] if lens is None else [lens.coefficients])]
         free = torch.is_grad_enabled() and any(t.requires_grad for t in numbers)
-        tilted = lens is not None and lens.coefficients.shape[-1] == 14
-        return not free and not tilted and not self.beta.batch_shape and compilable(self.first)
+        known = lens is None or (lens.model in COMPILED_LENSES and lens.coefficients.shape[-1] < 14)
+        return not free and known and not self.beta.batch_shape and compilable(self.first)
 
     def positions(self, nodes: int, samples: int) -> Positions:
         """What `Curved` gives, by a compiled loop in float64."""
@@ -207,8 +207,12 @@ class _Curve(NamedTuple):
         return (1 - u) * torch.sinc((1 - u) * angle / math.pi) * r1, u * torch.sinc(u * angle / math.pi) * r0
 
 
+COMPILED_LENSES = {"brown-conrady": 1, "kannala-brandt": 2}
+"""Lens models that the compiled loop knows (those of a tilted sensor excepted), by its numbers."""
+
+
 class LensNumbers(NamedTuple):
-    """A camera as the compiled loop knows it: 0 pinhole, 1 Brown-Conrady, 2 Kannala-Brandt; float64."""
+    """A camera as the compiled loop knows it: 0 pinhole, else `COMPILED_LENSES`; float64."""
 
     model: int
     c: NDArray[np.float64]
@@ -225,7 +229,7 @@ class LensNumbers(NamedTuple):
         c = lens.coefficients.detach().double()
         padded = np.zeros(14)
         padded[: len(c)] = c.numpy()
-        return cls(1 + (lens.model == KANNALA_BRANDT), padded, lens.squared_limit, np.ascontiguousarray(K), wide)
+        return cls(COMPILED_LENSES[lens.model], padded, lens.squared_limit, np.ascontiguousarray(K), wide)
 
 
 PIECE = 1 << 12
