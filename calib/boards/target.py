@@ -426,7 +426,7 @@ def _kalibr_target(path: Path) -> str:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file of a target")
     try:
-        target = yaml.safe_load(path.read_text(encoding="utf-8"))
+        target = load_yaml(path.read_text(encoding="utf-8"))
         if target["target_type"] == "aprilgrid":
             size, ratio = 1e3 * float(target["tagSize"]), float(target["tagSpacing"])
             return f"aprilgrid:{target['tagCols']}x{target['tagRows']}:{size:.6f}mm:{ratio:.6f}"

@@ -88,7 +88,9 @@ class PrintBoard:
     board: Positional[BoardName]
     out: Out = Path("board.pdf")
     """File to write, ending in .pdf or .svg."""
-    paper: Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None = None
+    paper: Annotated[
+        Literal["A4", "letter", "A3", "A2", "A1", "A0"] | None, options.optional("{A4,letter,A3,A2,A1,A0}")
+    ] = None
     """Sheet to centre the board on; without it the page is as large as the board with its margin."""
 
     def run(self) -> None:

@@ -42,8 +42,8 @@ COARSE = 4
 LEAST_WEIGHT = 1e-3
 """The least weight of a pixel in propagation."""
 CONFIDENCE_OFFSET = 1.0
-"""Added to the logit of the confidence where colour is blended, and twice as much to that of taking what was matched:
-matches have become better since the weights were trained. Chosen on Middlebury's pairs of the tune half."""
+"""Added to the logit of the confidence where colour is blended: matches have become better since the weights were trained.
+Chosen on Middlebury's pairs of the tune half."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
 
@@ -236,7 +236,7 @@ class GuidedPAT(nn.Module):
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, found.matched, (exact + 2 * CONFIDENCE_OFFSET).sigmoid())
+        colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
         position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
         return BetaEstimate(attended, colour, found.colour, logit, choice, position)
 

