@@ -31,6 +31,8 @@ import yaml
 from jaxtyping import Float, Int
 from matplotlib.patches import Circle, Rectangle
 
+from arraygeom.safe_yaml import load_yaml
+
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
     "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, acircles:4x11:20mm or "

@@ -42,7 +42,7 @@ COARSE = 4
 LEAST_WEIGHT = 1e-3
 """The least weight of a pixel in propagation."""
 CONFIDENCE_OFFSET = 1.0
-"""Added to the logit of the confidence where colour is blended: matches have become better since the weights were trained.
+"""Added to the logit of the confidence where colour is blended: matches are better than when the weights were trained.
 Chosen on Middlebury's pairs of the tune half."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
