@@ -8,12 +8,13 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme conditions test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
 	@echo "make readme     run both and put what they print into docs/results.md"
+	@echo "make conditions measure other responses, low light and misalignment into docs/results.md; half an hour"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
 	@echo "make check      format, lint and types"
@@ -45,6 +46,11 @@ readme: demo showcase
 	@echo "== bringing docs/results.md and docs/demo.jpg up to date"
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block demo=out/demo/demo.md --block showcase=out/showcase/showcase.md \
 		--image out/demo/demo.png docs/demo.jpg
+
+conditions: $(READY)
+	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --conditions --half report --out out/conditions
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block conditions=out/conditions/conditions.md \
+		--image out/conditions/conditions.png docs/conditions.jpg
 
 test: $(READY)
 	@echo "== tests"
