@@ -13,17 +13,15 @@ from pat.attention.kernels import compiled, separate_cache
 from .semi_global_kernels import (
     FARTHEST,
     HALF,
-    LEVELS,
     MOST,
     NOWHERE,
     ONE,
     SMALL,
-    TRUNCATED,
     UNSEEN,
     _between,
-    _count,
     _jump,
     _pixel,
+    dissimilarity,
 )
 
 RUN = 5
@@ -53,9 +51,8 @@ def band_costs(own, own_bits, other, other_bits, end, along, length, cut, low, h
                 elif column < 0 or row < 0 or column >= columns or row >= rows:
                     out[y, x, k] = NOWHERE
                 else:
-                    unlike = min(abs(own[y, x] - other[row, column]) * LEVELS, TRUNCATED)
-                    different = _count(own_bits[y, x] ^ other_bits[row, column])
-                    out[y, x, k] = np.uint8(different) + np.uint8(unlike)
+                    place = row, column
+                    out[y, x, k] = dissimilarity(own[y, x], own_bits[y, x], other[place], other_bits[place])
 
 
 @compiled(inline="always")

@@ -58,6 +58,12 @@ def _pixel(end, along, label):
     return int(np.floor(end[0] + disparity * along[0] + HALF)), int(np.floor(end[1] + disparity * along[1] + HALF))
 
 
+@compiled(inline="always")
+def dissimilarity(own, own_bits, other, other_bits):
+    """Of two pixels, by brightness and census."""
+    return np.uint8(_count(own_bits ^ other_bits)) + np.uint8(min(abs(own - other) * LEVELS, TRUNCATED))
+
+
 @compiled(nogil=True, cache=True)
 def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
     """Dissimilarity of alpha's pixel (own) and beta's (other) at each label: out (h, w, labels).
@@ -78,9 +84,10 @@ def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
                 elif column < 0 or row < 0 or column >= columns or row >= rows:
                     out[y, x, label] = NOWHERE
                 else:
-                    unlike = min(abs(own[y, x] - other[row, column]) * LEVELS, TRUNCATED)
-                    different = _count(own_bits[y, x] ^ other_bits[row, column])
-                    out[y, x, label] = np.uint8(different) + np.uint8(unlike)
+                    place = row, column
+                    out[y, x, label] = dissimilarity(
+                        own[y, x], own_bits[y, x], other[row, column], other_bits[row, column]
+                    )
 
 
 @compiled(inline="always")
