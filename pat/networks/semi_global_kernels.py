@@ -85,9 +85,7 @@ def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
                     out[y, x, label] = NOWHERE
                 else:
                     place = row, column
-                    out[y, x, label] = dissimilarity(
-                        own[y, x], own_bits[y, x], other[row, column], other_bits[row, column]
-                    )
+                    out[y, x, label] = dissimilarity(own[y, x], own_bits[y, x], other[place], other_bits[place])
 
 
 @compiled(inline="always")
