@@ -49,14 +49,18 @@ class UncalibratedRig(NamedTuple):
 
 
 def rig_from_images(
-    images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None
+    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    *,
+    focal: Mapping[str, float] | None = None,
+    alpha: str | None = None,
 ) -> UncalibratedRig:
     """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
 
-    F of every two cameras with a common field of view, by MAGSAC++ (Barath et al. 2020), and a rough map. With rough
-    focal lengths, in pixels, of both cameras an essential matrix is fitted too, with five degrees of freedom instead
-    of seven: it is used where it fits held-out points better. All F are then fitted jointly, with lenses, and accepted
-    on the same condition. Raises ValueError, one line: fewer than two images, equal ones, too few points, a focal
+    F of every two cameras with a common field of view (of `alpha` and each other one, if it is given) by MAGSAC++
+    (Barath et al. 2020), and a rough map. With rough focal lengths, in pixels, of both cameras an essential matrix is
+    fitted too, with five degrees of freedom instead of seven: it is used where it fits held-out points better. All F
+    are then fitted jointly, with lenses, and accepted on the same condition. Raises ValueError, one line: fewer than
+    two images, equal ones, too few points, a focal
     length of no camera.
     """
     focal = dict(focal or {})
@@ -66,7 +70,7 @@ def rig_from_images(
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
     found = UncalibratedRig(
-        Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, match_cameras(images)
+        Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, match_cameras(images, alpha=alpha)
     )
     links, matched = {}, found.matches
     for names, matches in matched.items():

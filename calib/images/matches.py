@@ -120,9 +120,12 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.ones_like(deviation, dtype=np.bool_)
 
 
-def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[str, str], Matches]:
+def match_cameras(
+    images: Mapping[str, Float[Tensor, "_ _ _"]], *, alpha: str | None = None
+) -> dict[tuple[str, str], Matches]:
     """Matches between the images of every two cameras that are consistent with some fundamental matrix.
 
+    With `alpha`, only between that camera's image and each of the others, alpha first.
     Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with fewer than
     20 are left out. Raises ValueError, one line, if no pair is left, for fewer than two images, and for equal ones.
     """
@@ -136,7 +139,8 @@ def match_cameras(images: Mapping[str, Float[Tensor, "_ _ _"]]) -> dict[tuple[st
         if len(own.points) < ENOUGH:
             raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
     found = {}
-    for a, b in combinations(images, 2):
+    pairs = combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha)
+    for a, b in pairs:
         LOG.info("matching %s and %s", a, b)
         found[a, b] = _agreeing(features[a], features[b], images[b])
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}

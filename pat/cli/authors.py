@@ -178,8 +178,10 @@ class SystemsRun:
     """One of the names that `pat systems list` prints."""
     full: bool = False
     """At the full size of the paper's cameras; by default reduced, minutes on two cores."""
+    scene: Literal["layered", "rendered"] = "layered"
+    """Photographs on planes; or a still life (a landscape for visible-nir) rendered with Blender, as one sees it."""
     photos: MaybePath = None
-    """Folder of photographs for the scene's surfaces; by default patterns and images that scikit-image ships."""
+    """Folder of photographs for the layers' surfaces; by default patterns and images that scikit-image ships."""
     recording: MaybePath = None
     """For fast-slow: the paper's own frames in place of a rendered scene, a folder with pillow_1 and the matrices."""
     out: MaybeOut = None
@@ -195,6 +197,7 @@ class SystemsRun:
         out = writable(self.out or Path("out/systems") / self.name, folder=True)
         if self.recording is None:
             further: dict[str, Any] = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
+            further["scene"] = self.scene
             result = run_system(self.name, out, weights=self.weights, say=say, **further)
         elif self.name == "fast-slow":
             result = run_recorded(self.recording, out, weights=self.weights, say=say)
@@ -202,7 +205,7 @@ class SystemsRun:
             raise ValueError(f"--recording is of fast-slow, not of '{self.name}'")
         print(result.table, end="")
         expected = load_system(self.name).expected
-        if expected and self.recording is None and not self.full:
+        if expected and self.recording is None and self.scene == "layered" and not self.full:
             say(f"\nexpected:\n{expected}")
         say(f"written: {', '.join(map(str, result.written))}")
 

@@ -75,7 +75,7 @@ def array_of(
         notes.append(line)
         say(line)
 
-    images = {name: _read(name, path) for name, path in files.items()}
+    images = {name: _read(name, path, note) for name, path in files.items()}
     alpha = _chosen_alpha(images, alpha, note)
     names = _ordered_betas(images, alpha, note)
     bands = [len(images[name]) for name in names]
@@ -132,7 +132,8 @@ def found_rig(
     """
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: _scaled(image, factors[name]) for name, image in images.items()}
-    found = rig_from_images(reduced, focal={name: length * factors[name] for name, length in focal.items()})
+    lengths = {name: length * factors[name] for name, length in focal.items()}
+    found = rig_from_images(reduced, focal=lengths, alpha=alpha)
     betas = [name for name in images if (alpha, name) in found.rig.links]
     if not betas:
         raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME")
@@ -229,8 +230,14 @@ def _scaled(image: Float[Tensor, "c h w"], factor: float) -> Float[Tensor, "c h2
     return interpolate(image[None], size=hw, mode="bicubic", antialias=True, align_corners=False)[0].clamp(0, 1)
 
 
-def _read(name: str, path: Path) -> Float[Tensor, "c h w"]:
-    image = read_image(path, name=name)
+def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        image = read_image(path, name=name)
+    for warning in caught:
+        rotated = "orientation tag" in str(warning.message)
+        h, w = image.shape[-2:]
+        note(f"{name}: rotated as its EXIF orientation says, to {w}x{h}" if rotated else str(warning.message))
     if float(image.flatten(1).std(-1).amax()) < EVEN:
         raise ValueError(f"{name}: {path}: is of one colour: there is nothing to match or to fuse")
     return image[:1] if len(image) == 3 and equal_bands(image) else image

@@ -283,7 +283,9 @@ class Fuse:
             if self.report:
                 facts = self._facts(found, time.monotonic() - begin)
                 written.append(write_report(self.out / "index.html", frame, images, rig, alpha, facts))
-        say(f"written: {', '.join(map(str, written))}")
+        say(f"written to {self.out}: {', '.join(path.name for path in written)}")
+        if self.report:
+            say(f"to see the result, open {self.out / 'index.html'} in a browser")
 
     def _facts(self, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""

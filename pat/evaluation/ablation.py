@@ -205,11 +205,17 @@ def _recorded(name: str, rig: Rig, ground_truth: Tensor, seen: Tensor, depth: Te
 
 
 def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
-    """The photographs that scikit-image ships, and `count` patterns drawn by the seed."""
-    from ..data.make_sample import photographs
+    """The photographs that scikit-image ships, and `count` patterns drawn by the seed.
+
+    They are free to use (astronaut: NASA; chelsea, coffee and rocket: CC0).
+    """
+    from skimage import io
+    from skimage.data import data_dir
+
     from ..synthesis.patterns import patterns
 
-    images = photographs()
+    names = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")
+    images = [io.imread(Path(data_dir) / name)[..., :3] for name in names]
     return PhotoBank(images + patterns(np.random.default_rng(seed), count), photos=len(images))
 
 

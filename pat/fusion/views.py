@@ -81,7 +81,8 @@ class Views:
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
     """Alpha's image in grey. Warns if it was in colour."""
     if len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2])):
-        warnings.warn(f"the image of alpha, '{name}', is in colour: only its luminance is used", stacklevel=2)
+        text = f"the image of alpha, '{name}', is in colour: only its luminance is used, colours come from the betas"
+        warnings.warn(text, stacklevel=2)
     return grey(image)
 
 

@@ -22,7 +22,9 @@ from ..media.colour import linear_from_srgb
 from ..media.headers import image_header
 from ..media.images import MOST_PIXELS, decoded
 from .furnish import Setting, furnished, seeded, vec
+from .landscape import landscape
 from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
+from .still_life import still_life
 
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff"}
 
@@ -81,7 +83,13 @@ def board(poses: Sequence[Pose], spec: BoardObject, *, seed: int = 0) -> Scene:
     )
 
 
-GENERATORS: dict[str, Callable[..., Scene]] = {"abstract": abstract, "photographs": photographs, "board": board}
+GENERATORS: dict[str, Callable[..., Scene]] = {
+    "abstract": abstract,
+    "photographs": photographs,
+    "board": board,
+    "still-life": still_life,
+    "landscape": landscape,
+}
 """By name. All take a seed; "abstract" and "photographs" a rig."""
 
 

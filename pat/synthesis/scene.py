@@ -25,7 +25,7 @@ from arraygeom.safe_yaml import load_yaml
 from ..support.schema import from_document, to_document
 
 Vec3 = tuple[float, float, float]
-Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "room"]
+Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "lathe", "room"]
 TextureKind = Literal["plain", "voronoi", "magic", "brick", "checker", "noise", "wave", "image", "board"]
 
 FORMAT = "pat-scene 1"
@@ -172,8 +172,9 @@ class Relief:
 class Object:
     """A shape with a material, and perhaps a relief.
 
-    A "room" is a cube seen from inside; it casts no shadow. Object `i` of a scene has the index i + 1 in rendered
-    index images.
+    A "room" is a cube seen from inside; it casts no shadow. A "lathe" is the surface that `profile` sweeps around the
+    y axis: from its top, pairs of a radius (0..0.5) and a y (-0.5..0.5). Object `i` of a scene has the index i + 1 in
+    rendered index images.
     """
 
     name: str
@@ -181,6 +182,11 @@ class Object:
     motion: Motion
     material: Material = field(default_factory=Material)
     relief: Relief | None = None
+    profile: tuple[tuple[float, float], ...] = ()
+
+    def __post_init__(self) -> None:
+        if (self.shape == "lathe") != (len(self.profile) > 1):
+            raise ValueError(f"'{self.name}': a lathe, and nothing else, needs a profile of two points or more")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,9 +53,10 @@ def mesh(item: Object) -> Mesh:
     Patches of a plain shape do not share corners, so that edges between them are sharp; those of a relief do.
     """
     extent = np.asarray(item.motion.keys[0].extent)
-    parts = [_part(s, extent, item.relief) for s in SURFACES[item.shape]]
+    surfaces = (_lathe(item.profile),) if item.shape == "lathe" else SURFACES[item.shape]
+    parts = [_part(s, extent, item.relief) for s in surfaces]
     if item.relief is None:
-        return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, SURFACES[item.shape])])
+        return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, surfaces)])
     return _with_relief(_welded(_joined(parts), extent), item.relief)
 
 
@@ -175,6 +176,18 @@ def _torus(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
     azimuth, tube = 2 * np.pi * s, 2 * np.pi * t
     radius = 0.5 * (1 - TORUS) + 0.5 * TORUS * np.cos(tube)
     return radius * np.cos(azimuth), 0.5 * np.sin(tube), radius * np.sin(azimuth)
+
+
+def _lathe(profile: tuple[tuple[float, float], ...]) -> _Surface:
+    """The surface that a profile sweeps around the y axis; corners of the profile are points of it."""
+    radii, heights = np.array(profile).T
+
+    def patch(s: NDArray, t: NDArray) -> tuple[NDArray, NDArray, NDArray]:
+        at, azimuth = t * (len(radii) - 1), 2 * np.pi * s
+        radius = np.interp(at, np.arange(len(radii)), radii)
+        return radius * np.cos(azimuth), np.interp(at, np.arange(len(radii)), heights), radius * np.sin(azimuth)
+
+    return _Surface(patch, (_ROUND, len(radii) - 1))
 
 
 _CUBE = (

@@ -25,6 +25,11 @@ BAND = 4_000_000
 """Samples (pixels times oversampling) rendered at once: about 1.5 GiB with ten layers."""
 
 
+def purpose_generator(seed: int, purpose: str) -> Generator:
+    """Randomness for one purpose in a scene of a seed, the same each time."""
+    return Generator().manual_seed(seed * 1_000_003 + sum(ord(c) * 31**i for i, c in enumerate(purpose)))
+
+
 class SystemScene(LayeredScenes):
     """A scene in front of a rig's alpha, between two depths in metres.
 
@@ -44,7 +49,7 @@ class SystemScene(LayeredScenes):
 
     def generator(self, purpose: str) -> Generator:
         """Randomness for one purpose, the same each time."""
-        return Generator().manual_seed(self.seed * 1_000_003 + sum(ord(c) * 31**i for i, c in enumerate(purpose)))
+        return purpose_generator(self.seed, purpose)
 
     def camera(self, name: str) -> Camera:
         """A camera of the rig as a batch of one, in alpha's frame."""

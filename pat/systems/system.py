@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -41,6 +41,7 @@ from pat.support.memory import watch_peak
 from pat.support.tensor_files import write_tensors
 from pat.systems.hdr import merged, usable_range
 
+SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
 
 
@@ -123,6 +124,7 @@ def run_system(
     *,
     full: bool = False,
     scale: float = 1.0,
+    scene: SceneKind = "layered",
     photos: Path | None = None,
     weights: str = "mono-colour",
     max_memory: str | None = None,
@@ -131,11 +133,12 @@ def run_system(
     """Render, record, fuse and compare; inputs, images, figure.png and scores.md go to `out`.
 
     At `full` size, or at `scale` times the reduced one, which is minutes on two cores; half of it is seconds.
-    `photos` is a folder of images for the scene's textures; without, patterns and scikit-image's images are used.
+    `scene` is layered photographs, or a believable one rendered with Blender. `photos` is a folder of images for the
+    layers' textures; without, patterns and scikit-image's images are used.
     """
     system = load_system(name)
     rig = system.sized(full, scale=scale)
-    recording, files = recorded(system, rig, out / "inputs", photos=photos, say=say)
+    recording, files = recorded(system, rig, out / "inputs", scene=scene, photos=photos, say=say)
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
     how = FusionOptions(weights, max_memory, say)
@@ -155,13 +158,17 @@ class FusionOptions(NamedTuple):
 
 
 def recorded(
-    system: ArraySystem, rig: Rig, out: Path, *, photos: Path | None, say: Callable[[str], None]
+    system: ArraySystem,
+    rig: Rig,
+    out: Path,
+    *,
+    scene: SceneKind = "layered",
+    photos: Path | None,
+    say: Callable[[str], None],
 ) -> tuple[SystemRecording, dict[str, list[Path]]]:
     """The recording of the system's scene, and its files; rendered unless it was before with the same settings."""
-    from .stage import SystemScene
-
     module, cache = system.module, out / "recorded.safetensors"
-    key = f"{system.name}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
+    key = f"{system.name}, {scene}, seed {module.SEED}, textures {photos or 'our own'}\n{rig_text(rig)}"
     if cache.is_file():
         with safe_open(cache, "pt") as file:
             if file.metadata()["key"] == key:
@@ -170,12 +177,26 @@ def recorded(
                 return SystemRecording.of({name: file.get_tensor(name) for name in file.keys()}), _files(out, counts)  # noqa: SIM118
     say(f"rendering and recording {', '.join(f'{n} {rig[n].hw[1]}x{rig[n].hw[0]}' for n in rig.names)}")
     cache.unlink(missing_ok=True)
-    stage = SystemScene(rig, system.alpha, depths=module.DEPTHS, layers=module.LAYERS, photos=photos, seed=module.SEED)
-    recording = module.record_scene(stage)
+    recording = module.record_scene(_stage(system, rig, scene, photos))
     write_recording(recording, rig, out)
     counts = {name: len(images) for name, images in recording.raw.items()}
     write_tensors(cache, recording.reference, {"key": key, "counts": json.dumps(counts)})
     return recording, _files(out, counts)
+
+
+def _stage(system: ArraySystem, rig: Rig, scene: SceneKind, photos: Path | None) -> Any:
+    """The scene before the cameras, with what a system's module asks of it."""
+    from .rendered import RenderedScene
+    from .stage import SystemScene
+
+    module = system.module
+    if scene == "layered":
+        depths, layers = module.DEPTHS, module.LAYERS
+        return SystemScene(rig, system.alpha, depths=depths, layers=layers, photos=photos, seed=module.SEED)
+    frames, rate = getattr(module, "FRAMES", 1), rig[system.alpha].sensor.frame_rate or 1.0
+    duration = 0.0 if frames == 1 else frames / rate
+    moving, infrared = getattr(module, "MOVING", 0.0), "nir" in rig.names
+    return RenderedScene(rig, module.GENERATOR, module.SEED, infrared=infrared, moving=moving, duration=duration)
 
 
 def _files(out: Path, counts: Mapping[str, int]) -> dict[str, list[Path]]:

@@ -13,6 +13,7 @@ from arraygeom import Band
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.media.raw import light_of
 from pat.sensors import Clip, Noise, Spectral, record
+from pat.systems.rendered import RenderedScene
 from pat.systems.stage import SystemScene
 from pat.systems.system import SystemRecording
 
@@ -25,9 +26,12 @@ DARKEST = 0.004
 """Light on the darkest surface, as part of that on the brightest."""
 OVER = 3.0
 """How far above alpha's white the brightest surface is."""
+GENERATOR = "still-life"
+GAIN = 2.6
+"""Light of the rendered scene: the lamp is above alpha's white then."""
 
 
-def record_scene(stage: SystemScene) -> SystemRecording:
+def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """One frame. The ground truth is in alpha's exposure, not clipped at white."""
     rig, alpha = stage.rig, stage.alpha
     raw, bands, lights = {}, {}, {}
@@ -43,8 +47,10 @@ def record_scene(stage: SystemScene) -> SystemRecording:
     return SystemRecording(raw, [srgb_from_linear(torch.cat([bands[name] for name in rig.betas(alpha)]))], lights)
 
 
-def light(stage: SystemScene, name: str) -> Tensor:
+def light(stage: SystemScene | RenderedScene, name: str) -> Tensor:
     """Linear colours of what a camera sees, 1 being alpha's white."""
+    if isinstance(stage, RenderedScene):
+        return GAIN * stage.light(name)
     count, g = stage.scene.present.shape[1], stage.generator("light")
     lit = DARKEST ** torch.rand(count, generator=g)
     lit[1], lit[2] = 1.0, DARKEST

@@ -5,12 +5,15 @@ No two clocks agree. Every frame of alpha gets colour from the slow frames neare
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import torch
 from torch import Tensor
 
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, Noise, record
 from pat.systems.exposures import banded
+from pat.systems.rendered import RenderedScene
 from pat.systems.stage import SystemScene
 from pat.systems.system import SystemRecording
 
@@ -20,24 +23,39 @@ DEPTHS, LAYERS, SEED = (2.2, 9.0), 9, 14
 FRAMES = 11
 SPEED = 18.0
 """Of the object, per cent of alpha's width in the time of a slow frame."""
+GENERATOR = "still-life"
+MOVING = 0.12
+"""Seconds in which the ball of the rendered scene crosses the image."""
 
 
-def record_scene(stage: SystemScene) -> SystemRecording:
+def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """Eleven frames of alpha, and of each beta those of that time."""
     rig, generator = stage.rig, stage.generator("record")
-    times = {name: frame_times(stage, name) for name in rig.names}
-    velocity, layer = object_velocity(stage)
     raw: dict[str, list[Tensor]] = {name: [] for name in rig.names}
     ground_truth = []
-    for name in rig.names:
-        for time in times[name]:
-            lit = linear_from_srgb(stage.seen(name, stage.moved(layer, velocity * time))[0])
+    for name, frames in lights(stage).items():
+        for lit in frames:
             own = luminance(lit) if name == stage.alpha else banded(lit, rig[name].sensor.response)
             raw[name].append(record(own, (Noise(8_000, 4), Clip()), generator).image[0])
             if name == stage.alpha:
                 bands = [banded(lit, rig[b].sensor.response)[0] for b in rig.betas(name)]
                 ground_truth.append(srgb_from_linear(torch.cat(bands)))
     return SystemRecording(raw, ground_truth)
+
+
+def lights(stage: SystemScene | RenderedScene) -> dict[str, Iterator[Tensor]]:
+    """The linear colours that each camera receives, frame by frame."""
+    if isinstance(stage, RenderedScene):
+        return {
+            name: (stage.light(name, i).clamp(0, 1) for i in range(len(stage.frames[name]))) for name in stage.rig.names
+        }
+    velocity, layer = object_velocity(stage)
+
+    def layered(name: str) -> Iterator[Tensor]:
+        for time in frame_times(stage, name):
+            yield linear_from_srgb(stage.seen(name, stage.moved(layer, velocity * time))[0])
+
+    return {name: layered(name) for name in stage.rig.names}
 
 
 def frame_times(stage: SystemScene, name: str) -> list[float]:

@@ -11,6 +11,7 @@ import torch
 
 from pat.media.colour import from_luma_chroma, linear_from_srgb, srgb_from_linear, to_luma_chroma
 from pat.sensors import Clip, Noise, record
+from pat.systems.rendered import RenderedScene
 from pat.systems.stage import SystemScene
 from pat.systems.system import SystemRecording
 
@@ -19,12 +20,16 @@ REDUCED = 1 / 5
 DEPTHS, LAYERS, SEED = (12.0, 150.0), 10, 10
 HAZE = 0.002
 """Part of the light lost in a metre."""
+GENERATOR = "landscape"
 
 
-def record_scene(stage: SystemScene) -> SystemRecording:
+def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """One frame."""
     generator = stage.generator("record")
-    infrared = linear_from_srgb(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1])
+    if isinstance(stage, RenderedScene):
+        infrared = stage.infrared("nir")
+    else:
+        infrared = linear_from_srgb(stage.seen("nir", stage.mixed(infrared_weights(stage)))[0][:, :1])
     own, other = (hazed(*stage.seen(name)) for name in ("nir", "colour"))
     nir = record(infrared, (Noise(8_000, 4), Clip()), generator).image
     colour = record(other, (Noise(6_000, 3), Clip()), generator).image

@@ -12,6 +12,7 @@ from torch import Tensor
 from arraygeom import Rig
 from pat.media.colour import linear_from_srgb, luminance, srgb_from_linear
 from pat.sensors import Clip, DecodeSRGB, GaussianBlur, Mosaic, Noise, record
+from pat.systems.rendered import RenderedScene
 from pat.systems.stage import SystemScene
 from pat.systems.system import SystemRecording
 
@@ -19,9 +20,10 @@ TITLE = "mono telephoto, and a wide colour camera with 10 times fewer pixels on 
 REDUCED = 1 / 8
 DEPTHS, LAYERS, SEED = (4.5, 30.0), 10, 13
 FOCUS, FOCAL_LENGTH, F_NUMBER, PITCH = 7.0, 0.025, 4.0, 1.85e-6
+GENERATOR = "still-life"
 
 
-def record_scene(stage: SystemScene) -> SystemRecording:
+def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     """One frame."""
     image, depth = stage.seen("narrow")
     generator = stage.generator("record")
