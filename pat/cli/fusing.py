@@ -201,7 +201,7 @@ class Fuse:
         self.sequence, self.video = self.sequence or bool(rates), rates.get(array.alpha, self.video)
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
         rig.save(self.out / "rig.yaml")
-        say(f"written: {self.out / 'rig.yaml'}")
+        say(f"the rig that was found: {self.out / 'rig.yaml'}")
 
     @contextmanager
     def _judged(self) -> Iterator[list[str]]:
@@ -343,7 +343,8 @@ class Fuse:
             video=self.video if self.sequence and self.video and self.bits != 32 else None,
             console=options.console(),
         )
-        say(f"{self.out}: {report}")
+        video = self.out / "fused.mp4"
+        say(f"{self.out}: {report}" + f", and {video.name}" * (self.sequence and video.is_file()))
         if report.failed:
             sys.exit(1)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from arraygeom import Camera, Rig, pixel_grid, sample
 
 from ..fusion.results import Frame
-from ..media.colour import linear_from_srgb, srgb_from_linear
+from ..media.colour import linear_from_srgb, luminance, srgb_from_linear
 from ..media.raw import light_of
 
 WHITE = 0.97
@@ -125,3 +125,34 @@ def usable_range(
     if not best:
         raise ValueError("the image measures no light within that error")
     return DynamicRange(2 ** (best[0] / 2), 2 ** ((best[-1] + 1) / 2))
+
+
+def tone_curve(like: Float[Tensor, "3 h w"]) -> Callable[[Tensor], Tensor]:
+    """A function that shows images (sRGB, above 1 too) of the range of light of `like`: Reinhard et al. 2002.
+
+    The logarithmic mean of the light becomes a middle grey, the brightest white; hues stay.
+    """
+    light = luminance(linear_from_srgb(like.clamp(min=0))[None])
+    gain = MIDDLE_GREY / float(light.clamp(min=1e-4).log().mean().exp())
+    white = gain * float(light.max())
+
+    def shown(image: Tensor) -> Tensor:
+        linear = gain * linear_from_srgb(image.clamp(min=0))
+        bright = luminance(linear[None])[0] if len(linear) == 3 else linear
+        return srgb_from_linear(linear * (1 + bright / white**2) / (1 + bright)).clamp(0, 1)
+
+    return shown
+
+
+MIDDLE_GREY = 0.18
+CLIPPED = 0.1
+"""Light, 1 is alpha's white, above which an error is no noise."""
+
+
+def missed(image: Float[Tensor, "1 h w"], light: Float[Tensor, "1 h w"], *, within: float = 0.25) -> Tensor:
+    """A camera's image (3, H, W): red where it is clipped, and measures less of its light by more than that part; blue
+    where noise exceeds it."""
+    value = linear_from_srgb(image)
+    wrong, clipped = (value - light).abs() > within * light, (value < light) & (value > CLIPPED)
+    red, blue = image.new_tensor([0.9, 0.1, 0.1])[:, None, None], image.new_tensor([0.15, 0.35, 0.95])[:, None, None]
+    return torch.where(wrong & clipped, red, torch.where(wrong, blue, image.expand(3, -1, -1)))

@@ -39,7 +39,7 @@ from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.support.memory import watch_peak
 from pat.support.tensor_files import write_tensors
-from pat.systems.hdr import merged, usable_range
+from pat.systems.hdr import merged, missed, tone_curve, usable_range
 
 SceneKind = Literal["layered", "rendered"]
 NAMES = ("wide-narrow", "visible-nir", "exposures", "fast-slow")
@@ -253,7 +253,12 @@ def _still(
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
     white = 1.0 if not recording.light else float(ground_truth.max())
     panels = {f"{n}{' (alpha)' if n == alpha else ''}": images[n] for n in rig.names}
-    panels |= {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
+    panels |= {
+        f"{n}: clipped red, noisy blue": missed(images[n], recording.light[n]) for n in rig.names if recording.light
+    }
+    compared = {"ground truth": ground_truth, **{n: p for n, p in rows.items() if n != "alpha alone"}}
+    shown = tone_curve(ground_truth) if recording.light else torch.Tensor.clone
+    panels |= {name: shown(image) for name, image in compared.items()}
     panels |= {"depth (red is near)": colour_depth(frame.depth), "confidence": frame.confidence[None]}
     return [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth), *extra, *memory], panels
 

@@ -27,7 +27,7 @@ DARKEST = 0.004
 OVER = 3.0
 """How far above alpha's white the brightest surface is."""
 GENERATOR = "still-life"
-GAIN = 2.6
+GAIN = 1.5
 """Light of the rendered scene: the lamp is above alpha's white then."""
 
 

@@ -1,17 +1,19 @@
 """Tasks: once each, resumed, in other processes with the same results; killed workers and commands lose nothing."""
 
 import os
+import re
 import signal
 import subprocess
 import sys
 import threading
 import time
+from itertools import accumulate
 from pathlib import Path
 
 import pytest
 
 from arraygeom.atomic import write_text
-from pat.support.jobs import JobError, Task, Workers, run_tasks
+from pat.support.jobs import JobError, Task, Workers, run_tasks, time_left
 from tests.pat.fusion.test_batch import contents, material  # noqa: F401  (a fixture)
 
 
@@ -146,3 +148,16 @@ def test_workers_of_a_scheduler_elsewhere_do_the_work(tmp_path):
         report = run_tasks(tasks(tmp_path, "a", "b", "bad"), workers=there, on_error="skip")
     assert len(report.made) == 2
     assert str(os.getpid()) not in (tmp_path / "a.calls").read_text().split()
+
+
+@pytest.mark.parametrize("seconds", [[40, 10, 11, 9, 10, 12, 10, 9], [8, 10, 9, 11, 10, 10], [3, 3]])
+def test_the_time_left_is_right_within_half_once_two_tasks_are_done(seconds):
+    """The first task of a process may take far longer, as it compiles."""
+    ends = [0.0, *accumulate(seconds)]
+    for done in range(2, len(seconds)):
+        said = time_left(ends[: done + 1], len(seconds) - done)
+        left = sum(seconds[done:])
+        assert left / 1.5 <= float(re.search(r"about (\d+) s left", said)[1]) <= 1.5 * left
+    assert time_left(ends, 0) == ""
+    assert time_left(ends[:1], 3) == ""
+    assert time_left([0, 600], 2) == "about 20 min left"
