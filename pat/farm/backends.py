@@ -76,7 +76,7 @@ class BlenderSettings:
     `photos` is the folder of images for the generator "photographs".
     """
 
-    generator: Literal["abstract", "photographs"] = "abstract"
+    generator: Literal["abstract", "photographs", "still-life", "landscape"] = "abstract"
     photos: Path | None = None
     preset: Literal["fast", "paper"] = "fast"
     settings: Mapping[str, Any] = field(default_factory=dict)

@@ -8,7 +8,7 @@ from pat.media.images import write_image
 from pat.synthesis.boards import PIXELS, draw_board, inner_corners, opencv_board
 from pat.synthesis.furnish import Setting
 from pat.synthesis.generators import GENERATORS, abstract, board, photographs, random_board_poses
-from pat.synthesis.scene import BoardObject, Scene
+from pat.synthesis.scene import BoardObject, Key, Motion, Object, Scene
 from pat.synthesis.shapes import inside, mesh
 from tests.pat.synthesis.scenes import posed, unlike_cameras
 
@@ -54,6 +54,47 @@ def test_a_rig_without_depths_gets_those_of_the_paper():
     assert abstract(0, Rig({"a": camera}, depth=(1.0, torch.inf))).depth == (1.0, 10.0)
 
 
+@pytest.mark.parametrize(
+    ("generator", "focal", "bounds"), [("still-life", 820.0, (1.4, 20)), ("landscape", 1990, (9, 250))]
+)
+def test_arranged_scenes_fill_the_first_image_wherever_the_rig_stands(generator, focal, bounds):
+    camera = Camera(K=intrinsics(focal, (400, 640)), cam_from_world=posed(), hw=(400, 640))
+    rig = Rig({"a": camera}, depth=bounds)
+    scene = GENERATORS[generator](1, rig)
+    assert Scene.from_yaml(scene.to_yaml()) == scene != GENERATORS[generator](2, rig)
+    assert all(o.motion.still for o in scene.objects)
+    seen = depths(scene, camera)
+    assert len(seen) > 5000
+    assert float(seen.quantile(0.02)) > bounds[0]
+    assert float(seen.max()) < bounds[1]
+    up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
+    sun = torch.tensor(scene.lights[0].direction, dtype=torch.float64)
+    assert float((camera.R @ sun) @ up) < 0, "the light comes from above"
+
+
+def test_the_ball_is_thrown_in_the_time_that_is_given():
+    camera = Camera(K=intrinsics(820.0, (400, 640)), cam_from_world=posed(), hw=(400, 640))
+    scene = GENERATORS["still-life"](1, Rig({"a": camera}), moving=0.5)
+    (ball,) = (o for o in scene.objects if not o.motion.still)
+    assert ball.motion.keys[-1].time == 0.5
+    x = camera.project(torch.tensor([k.position for k in ball.motion.keys], dtype=torch.float64)).x
+    assert bool(camera.contains(x).all())
+    assert bool((x[1:, 0] > x[:-1, 0] + 20).all())
+
+
+def test_a_lathe_is_what_its_profile_sweeps():
+    """A profile that is a half circle makes a sphere, with the outside outside."""
+    angles = np.linspace(0, np.pi, 33)
+    profile = tuple((float(0.5 * np.sin(a)), float(-0.5 * np.cos(a))) for a in angles)
+    key = Key(position=(0, 0, 0), extent=(2.0, 2.0, 2.0))
+    surface = mesh(Object(name="o", shape="lathe", motion=Motion((key,)), profile=profile))
+    np.testing.assert_allclose(np.linalg.norm(surface.vertices, axis=1), 1, atol=1e-6)
+    a, b, c, d = (surface.vertices[surface.faces[:, i]] for i in range(4))
+    assert ((np.cross(c - a, d - b) * (a + b + c + d)).sum(-1) > 0).all()
+    with pytest.raises(ValueError, match="a lathe, and nothing else, needs a profile"):
+        Object(name="o", shape="cube", motion=Motion((key,)), profile=profile)
+
+
 def test_photographs_come_from_the_folder(tmp_path):
     for name in ("a", "b"):
         write_image(tmp_path / f"{name}.png", torch.rand(3, 40, 60))
@@ -71,7 +112,7 @@ def test_what_cannot_be_generated_is_said(tmp_path):
         board([], BOARD)
     with pytest.raises(ValueError, match="unknown marker dictionary 'DICT_9'"):
         draw_board(BoardObject(dictionary="DICT_9"))
-    assert set(GENERATORS) == {"abstract", "photographs", "board"}
+    assert set(GENERATORS) == {"abstract", "photographs", "board", "still-life", "landscape"}
 
 
 def test_the_drawn_board_is_the_one_opencv_knows():
