@@ -42,8 +42,8 @@ COARSE = 4
 LEAST_WEIGHT = 1e-3
 """The least weight of a pixel in propagation."""
 CONFIDENCE_OFFSETS = 0.3, 1.5
-"""Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's,
-and where it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
+"""Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's, and where
+it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
 LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
 NOWHERE = -10.0
