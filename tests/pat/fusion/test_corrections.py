@@ -6,13 +6,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pat.data.sample_array import ALPHA, BETA, load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import corrections_of, fuse
 from pat.fusion.misalignment import Misalignment, fit_misalignment
 from pat.fusion.sequence import SequenceFusion
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
+from tests.pat.layered_array import ALPHA, BETA, load_sample
 
 
 @pytest.fixture(scope="module")

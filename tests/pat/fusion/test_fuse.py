@@ -25,7 +25,6 @@ from arraygeom import (
 )
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
-from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import FrameInputs
@@ -41,6 +40,7 @@ from pat.networks.paper import PAT, PATConfig
 from pat.networks.pieces import Tile, matching_pieces, tiles_of
 from pat.networks.protocol import Inputs
 from pat.networks.weights import load_weights
+from tests.pat.layered_array import load_sample
 
 
 def rig_of(hw, beta_hw, focal=300.0, beta_focal=200.0) -> Rig:

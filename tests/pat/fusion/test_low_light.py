@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from arraygeom.distortion import Distortion
-from pat.data.sample_array import ALPHA, BETA, load_sample
 from pat.evaluation.baseline import classical
 from pat.evaluation.low_light import non_local_means
 from pat.evaluation.metrics import score
@@ -16,6 +15,7 @@ from pat.networks import denoiser
 from pat.networks.denoiser import NoisyView
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
+from tests.pat.layered_array import ALPHA, BETA, load_sample
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from pat.data.sample_array import ALPHA, load_sample
 from pat.fusion.fuse import fuse
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
+from tests.pat.layered_array import ALPHA, load_sample
 
 
 @pytest.fixture(scope="module")

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from pat.data.sample_array import ALPHA, BETA, load_sample
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.response import Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
+from tests.pat.layered_array import ALPHA, BETA, load_sample
 
 WEIGHTS = (0.2, 0.4, 0.4)
 

@@ -3,12 +3,12 @@
 import pytest
 import torch
 
-from pat.data.sample_array import load_sample
 from pat.evaluation.low_light import non_local_means
 from pat.media.colour import luminance
 from pat.networks.denoiser import DenoiserConfig, LowLightNetwork, NoisyView
 from pat.networks.weights import DENOISER, SHIPPED, load_denoiser, load_weights, save_weights
 from pat.sensors import NoiseLevel, generator_for
+from tests.pat.layered_array import load_sample
 
 
 def psnr(image, ideal):

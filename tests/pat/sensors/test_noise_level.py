@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from pat.data.sample_array import load_sample
 from pat.sensors import Clip, DecodeSRGB, EncodeSRGB, Noise, NoiseLevel, generator_for, record
+from tests.pat.layered_array import load_sample
 
 LEVELS = {
     "200 electrons": NoiseLevel.of_electrons(200, 2),
