@@ -191,7 +191,7 @@ class Explorer:
 
     async def _show_layer(self, event: Any) -> None:
         """Alpha's image, or that fused with the rig as it now is."""
-        image = self.scene.images[self.state.alpha]
+        document, wanted, text = pn.state.curdoc, self.scene.images[self.state.alpha], ""
         if event.new == "fused":
             key = rig_text(self.rig())
             if key not in self.fused:
@@ -199,11 +199,18 @@ class Explorer:
                 try:
                     self.fused = {key: await asyncio.to_thread(self._fuse)}
                 except ValueError as error:
-                    self._say(str(error))
-                    return
-            image = self.fused[key]
-        self.shown.data = {"image": [rgba(image)]}
-        self._say_problems()
+                    text = str(error)
+            wanted = self.fused.get(key, wanted)
+
+        def draw() -> None:
+            if self.layer.value == event.new:
+                self.shown.data = {"image": [rgba(wanted)]}
+                self._say(text) if text else self._say_problems()
+
+        if document is None or document.session_context is None:
+            draw()
+        else:  # after waiting, the document is no longer locked for this callback
+            document.add_next_tick_callback(draw)
 
     def _fuse(self) -> Tensor:
         """The image fused at alpha's view."""

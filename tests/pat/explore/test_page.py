@@ -182,6 +182,23 @@ def press(driver, label):
     driver.execute_script(button, label).click()
 
 
+def test_the_fused_image_is_a_layer(page):
+    """In colour, and the camera's own image again afterwards."""
+    channels = (
+        SCRIPT
+        + """
+        const image = find('alpha image').data.image[0], pixels = new Uint32Array(image.buffer ? image.buffer : image);
+        const coloured = pixels.filter((p) => Math.abs((p & 255) - ((p >> 16) & 255)) > 12);
+        return coloured.length / pixels.length;
+        """
+    )
+    assert page.execute_script(channels) == 0
+    press(page, "fused")
+    until(page, channels.replace("return coloured", "return 0.2 < coloured"), seconds=240)
+    press(page, "camera")
+    until(page, channels.replace("return coloured", "return 0 == coloured"), seconds=20)
+
+
 def test_light_and_dark(page):
     colour = "return getComputedStyle(document.body).backgroundColor"
     before = page.execute_script(colour)
