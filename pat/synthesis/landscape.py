@@ -33,7 +33,7 @@ def landscape(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     objects = [*_ground(rng), *_washing(), *_fence(), *_house(), *_trees(rng), *_beds(rng)]
     distance = WIDE * float(camera.K[0, 0]) / camera.hw[1]
     sky = World((0.30, 0.47, 0.75), 0.16)
-    return arranged("landscape", seed, rig, objects, _LIGHTS, sky, aim=(0, -1.75, 0), distance=distance, pitch=1.5)
+    return arranged("landscape", seed, rig, objects, _LIGHTS, sky, aim=(0, -1.75, 0), distance=distance, down=1.5)
 
 
 def _leafy(dark: Vec3, light: Vec3, scale: float, kind: TextureKind = "noise") -> Material:

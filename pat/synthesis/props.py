@@ -41,13 +41,13 @@ def arranged(
     *,
     aim: Vec3,
     distance: float,
-    pitch: float,
+    down: float,
 ) -> Scene:
     """Objects and lights before the first camera of a rig: `aim` in the middle of its image, at a distance in metres.
 
-    The camera faces downwards by `pitch` degrees.
+    The camera faces downwards by `down` degrees.
     """
-    R = torch.from_numpy(Rotation.from_euler("x", pitch, degrees=True).as_matrix())
+    R = torch.from_numpy(Rotation.from_euler("x", down, degrees=True).as_matrix())
     cam_from_stage = Pose(R, R.new_tensor([0.0, 0.0, distance]) - R @ R.new_tensor(aim))
     world_from_stage = first_camera(rig).cam_from_world.inverse() @ cam_from_stage
     near, far = (float(d) for d in rig.depth) if rig.depth is not None else DEPTHS

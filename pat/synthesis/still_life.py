@@ -22,7 +22,7 @@ from .scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, 
 
 VIEW = 1.4
 """Metres of the still life that the first camera's image is wide."""
-PITCH = 13.0
+DOWNWARDS = 13.0
 """Degrees by which the first camera faces downwards."""
 AIM = (0.0, -0.17, 0.2)
 """The point of the room that is in the middle of its image."""
@@ -41,7 +41,7 @@ def still_life(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     objects = [*_furniture(), *_books(rng), *_plant(rng), *_pottery(), *_fruit(), *_toys(moving), *_lamp()]
     distance = VIEW * float(camera.K[0, 0]) / camera.hw[1]
     world = World((0.06, 0.065, 0.07), 0.06)
-    return arranged("still-life", seed, rig, objects, _LIGHTS, world, aim=AIM, distance=distance, pitch=PITCH)
+    return arranged("still-life", seed, rig, objects, _LIGHTS, world, aim=AIM, distance=distance, down=DOWNWARDS)
 
 
 _LIGHTS = (
