@@ -5,7 +5,7 @@ No two clocks agree. Every frame of alpha gets colour from the slow frames neare
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 import torch
 from torch import Tensor
@@ -43,12 +43,11 @@ def record_scene(stage: SystemScene | RenderedScene) -> SystemRecording:
     return SystemRecording(raw, ground_truth)
 
 
-def lights(stage: SystemScene | RenderedScene) -> dict[str, Iterator[Tensor]]:
+def lights(stage: SystemScene | RenderedScene) -> Mapping[str, Iterable[Tensor]]:
     """The linear colours that each camera receives, frame by frame."""
     if isinstance(stage, RenderedScene):
-        return {
-            name: (stage.light(name, i).clamp(0, 1) for i in range(len(stage.frames[name]))) for name in stage.rig.names
-        }
+        counts = {name: len(frames) for name, frames in stage.frames.items()}
+        return {name: [stage.light(name, i).clamp(0, 1) for i in range(count)] for name, count in counts.items()}
     velocity, layer = object_velocity(stage)
 
     def layered(name: str) -> Iterator[Tensor]:
