@@ -26,6 +26,14 @@ def test_focal_lengths_are_used_where_they_help():
     assert line_distances(found.rig, points).abs().median() < 0.5
 
 
+def test_with_an_alpha_only_its_pairs_are_related():
+    images = rectified_images()
+    shifted = {"middle": images["right"][..., :-8, 6:]}
+    found = rig_from_images(images | shifted, alpha="right")
+    assert set(found.rig.links) == {("right", "left"), ("right", "middle")}
+    assert set(rig_from_images(images | shifted).rig.links) >= {("left", "right"), ("left", "middle")}
+
+
 def test_bad_input_is_one_clear_line():
     images = rectified_images()
     with pytest.raises(ValueError, match="two cameras or more"):
