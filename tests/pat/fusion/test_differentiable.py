@@ -7,7 +7,7 @@ import torch
 
 from arraygeom import Rig
 from pat import fuse, load_weights
-from pat.data.sample_array import load_sample
+from tests.pat.layered_array import load_sample
 
 HW = (192, 256)
 TOP, LEFT = 104, 192
