@@ -25,7 +25,8 @@ from pat.sensors import Clip, Noise, Quantise, record
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.patterns import patterns
 from ..synthesis.photos import PhotoBank
-from ..synthesis.rigs import RigBatch, RigDistribution
+from ..synthesis.rig_distribution import RigDistribution
+from ..synthesis.rigs import RigBatch
 
 HW = (400, 640)
 IMAGE_SUFFIXES = ("astronaut.png", "chelsea.png", "coffee.png", "rocket.jpg")

@@ -8,12 +8,13 @@ nothing else.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import torch
 from torch import Tensor, nn
 
-from .guided import BetaEstimate, Encoded, GuidedPAT, GuidedPATConfig, output_of
+from .configs import BandwisePATConfig, GuidedPATConfig
+from .guided import BetaEstimate, Encoded, GuidedPAT, output_of
 from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
@@ -22,18 +23,6 @@ from .spectral_mix import SpectralMix, coarse_mix, semi_global_matching_of_bands
 
 COARSELY = 400_000
 """Pixels of alpha at most on which the bands' combination is found."""
-
-
-@dataclass(frozen=True)
-class BandwisePATConfig(GuidedPATConfig):
-    """GuidedPAT's, for one band, which need not have alpha's luminance."""
-
-    bands: int = 1
-    keep_luminance: bool = False
-
-    def __post_init__(self) -> None:
-        if self.bands != 1 or self.keep_luminance:
-            raise ValueError("BandwisePAT fuses one band at a time: leave bands at 1 and keep_luminance at false")
 
 
 class BandwisePAT(nn.Module):

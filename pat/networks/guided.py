@@ -9,7 +9,7 @@ pixels of high confidence to the others, and adds it to alpha.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -22,6 +22,7 @@ from arraygeom import Local, Pair, Segments, View, lazily
 from ..attention import Attended, attend, attend_with_statistics
 from ..media.colour import luminance
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
+from .configs import GuidedPATConfig
 from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
@@ -46,29 +47,6 @@ CONFIDENCE_OFFSET = 1.0
 Chosen on Middlebury's pairs of the tune half."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
-
-
-@dataclass(frozen=True)
-class GuidedPATConfig:
-    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
-
-    Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
-    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim`
-    (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add colour to alpha, and
-    never luminance.
-    """
-
-    widths: tuple[int, int, int, int] = (16, 32, 40, 48)
-    fine_dim: int = 8
-    window: float = 3.0
-    taps: int = 13
-    judge_dim: int = 16
-    confidence_dim: int = 24
-    propagation_dim: int = 8
-    propagation_steps: tuple[int, ...] = (1, 3, 8)
-    head_dim: int = 32
-    bands: int = 3
-    keep_luminance: bool = True
 
 
 class BetaEstimate(NamedTuple):

@@ -14,19 +14,16 @@ from torch import Tensor, nn
 
 from ..support.schema import from_document
 from ..support.tensor_files import undamaged, write_tensors
-from .bandwise import BandwisePAT, BandwisePATConfig
+from .bandwise import BandwisePAT
+from .configs import CONFIGS
 from .denoiser import DenoiserConfig, LowLightNetwork
-from .guided import GuidedPAT, GuidedPATConfig
-from .paper import PAT, PATConfig
+from .guided import GuidedPAT
+from .paper import PAT
 
 SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
-NETWORKS = {
-    "PAT": (PAT, PATConfig),
-    "GuidedPAT": (GuidedPAT, GuidedPATConfig),
-    "BandwisePAT": (BandwisePAT, BandwisePATConfig),
-}
+NETWORKS = {made.__name__: (made, CONFIGS[made.__name__]) for made in (PAT, GuidedPAT, BandwisePAT)}
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
 LARGEST, MOST_ENTRIES = 1024, 16
