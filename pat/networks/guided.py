@@ -29,6 +29,7 @@ from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import (
     FILLS,
     FINE,
+    HalfSizeMatches,
     Normalisations,
     SemiGlobalMatches,
     along,
@@ -119,7 +120,7 @@ class GuidedPAT(nn.Module):
 
         Betas that each have all bands agree on depth, and share the colour that is diffused.
         """
-        found = prepared(inputs, _normalisations, _matches)
+        found = prepared(inputs, _normalisations, lambda _: brightness, _matches)
         if not can_agree(inputs) or self._in_parts(inputs):
             return found
         return replace(found, matches=self._shared(inputs, found))
@@ -158,7 +159,7 @@ class GuidedPAT(nn.Module):
         bands = sum(beta.image.shape[1] for beta in inputs.betas)
         if parts and bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
-        alpha, state = inputs.alpha, state or self.prepare(inputs)
+        alpha, state = inputs.alpha, state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
         own = self.encoder(alpha)
         estimates = [self.estimate(own, alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
         used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
@@ -326,12 +327,12 @@ def _normalisations(inputs: Inputs) -> Normalisations:
     return Normalisations.of(inputs.alpha, brightness(inputs.betas[0].image))
 
 
-def _matches(inputs: Inputs, normalisations: Normalisations) -> SemiGlobalMatches:
+def _matches(inputs: Inputs, normalisations: Normalisations, half: HalfSizeMatches | None) -> SemiGlobalMatches:
     """The matches of the one beta."""
     (beta,) = inputs.betas
-    blocks = beta.field.of_blocks(FINE)
+    segments, blocks = beta.field.straight, beta.field.of_blocks(FINE)
     return semi_global_matching(
-        inputs.alpha, brightness(beta.image), beta.image, beta.field.straight, blocks, normalisations
+        inputs.alpha, brightness(beta.image), beta.image, segments, blocks, normalisations, half
     )
 
 
