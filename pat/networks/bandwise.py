@@ -93,7 +93,7 @@ def _matches(
 ) -> SemiGlobalMatches:
     """The matches of the one beta, once for all its bands."""
     alpha, (beta,), (mix, normalisations) = inputs.alpha, inputs.betas, combined
-    segments, blocks = beta.field.straight, beta.field.of_blocks(FINE)
+    segments, blocks = beta.field.straight, None if half else beta.field.of_blocks(FINE)
     if beta.image.shape[1] == 1:
         return semi_global_matching(alpha, beta.image, beta.image, segments, blocks, normalisations, half)
     return semi_global_matching_of_bands(alpha, beta.image, segments, blocks, mix, normalisations, half)

@@ -330,7 +330,7 @@ def _normalisations(inputs: Inputs) -> Normalisations:
 def _matches(inputs: Inputs, normalisations: Normalisations, half: HalfSizeMatches | None) -> SemiGlobalMatches:
     """The matches of the one beta."""
     (beta,) = inputs.betas
-    segments, blocks = beta.field.straight, beta.field.of_blocks(FINE)
+    segments, blocks = beta.field.straight, None if half else beta.field.of_blocks(FINE)
     return semi_global_matching(
         inputs.alpha, brightness(beta.image), beta.image, segments, blocks, normalisations, half
     )

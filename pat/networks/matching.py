@@ -51,7 +51,7 @@ def semi_global_matching(
     guide: Float[Tensor, "b 1 hb wb"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    blocks: Segments,
+    blocks: Segments | None,
     normalisations: Normalisations | None = None,
     half: HalfSizeMatches | None = None,
 ) -> SemiGlobalMatches:
@@ -73,12 +73,15 @@ def matched(
     alpha: Float[Tensor, "b 1 h w"],
     guide: Float[Tensor, "b 1 hb wb"],
     segments: Segments,
-    blocks: Segments,
+    blocks: Segments | None,
     normalisations: Normalisations,
     half: HalfSizeMatches | None = None,
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 3 h2 w2"]]:
     """`disparity` and `facts` alone."""
-    rough, facts = half or matched_at_half_size(alpha, guide, blocks, normalisations.half)
+    if half is None:
+        assert blocks is not None, "matching without blocks begins with matches at half the size"
+        half = matched_at_half_size(alpha, guide, blocks, normalisations.half)
+    rough, facts = half
     disparity, unlike = matched_at_full_size(alpha, guide, segments, rough, normalisations.whole)
     return disparity, torch.cat([avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
 

@@ -120,8 +120,8 @@ class Prepared:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
-        return sum(part.nbytes for found in self.matches for part in found)
+        """Memory held, of a large frame: as `stored`."""
+        return sum(part.nbytes for found in self.matches for part in found.stored())
 
     def cut(self, box: Box) -> Prepared:
         """Of a part of alpha."""

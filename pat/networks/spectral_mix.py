@@ -120,7 +120,7 @@ def semi_global_matching_of_bands(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    blocks: Segments,
+    blocks: Segments | None,
     mix: SpectralMix,
     normalisations: Normalisations,
     half: HalfSizeMatches | None = None,

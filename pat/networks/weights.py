@@ -23,7 +23,9 @@ from .paper import PAT
 SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
-NETWORKS = {made.__name__: (made, CONFIGS[made.__name__]) for made in (PAT, GuidedPAT, BandwisePAT)}
+NETWORKS: Mapping[str, tuple[Any, Any]] = {
+    made.__name__: (made, CONFIGS[made.__name__]) for made in (PAT, GuidedPAT, BandwisePAT)
+}
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
 LARGEST, MOST_ENTRIES = 1024, 16

@@ -212,7 +212,9 @@ def run(*words: str, then: str = "") -> subprocess.CompletedProcess:
     return subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True)
 
 
-@pytest.mark.parametrize("words", [(), ("rig",), ("fuse", "--help"), ("train", "--help"), ("--tyro-print-completion", "bash")])
+@pytest.mark.parametrize(
+    "words", [(), ("rig",), ("fuse", "--help"), ("train", "--help"), ("--tyro-print-completion", "bash")]
+)
 def test_help_and_completion_import_no_torch(words):
     code = f"""
 import sys
