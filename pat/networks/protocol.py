@@ -140,6 +140,13 @@ class FusionOutput(NamedTuple):
     confidence: list[Tensor]
     overall: Tensor | None = None
 
+    def cut(self, box: Box) -> FusionOutput:
+        """The part at (top, bottom, left, right); of an image that is not enlarged."""
+        top, bottom, left, right = box
+        part = (..., slice(top, bottom), slice(left, right))
+        lists = ([t[part] for t in tensors] for tensors in self[1:4])
+        return FusionOutput(self.image[part], *lists, self.overall if self.overall is None else self.overall[part])
+
 
 JoinsBands = Literal["no", "neighbours", "all"]
 
