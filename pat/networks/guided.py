@@ -100,7 +100,7 @@ class GuidedPAT(nn.Module):
     halo = 640
     """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
     beta_halo = 96
-    bytes_per_pixel = 320.0
+    bytes_per_pixel = 280.0
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
@@ -205,10 +205,9 @@ class GuidedPAT(nn.Module):
     ) -> BetaEstimate:
         """The estimate of one beta of any bands; `guide` is what of these is compared with alpha."""
         of = guide or brightness
-        other = self.encoder(of(beta.image))
         segments = _in_type(beta.field.straight, self._exact(alpha))
         window = window_around(found.disparity, segments, self.config.window)
-        query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
+        query, key = self._key(own), self._key(self.encoder(of(beta.image)))
         attended = attend_with_statistics(query, key, self._exact(beta.image), window, samples=self.config.taps)
         value = attended.value.to(alpha)
         facts = [of(value) - alpha, attended.peak[:, None].to(alpha), attended.deviation[:, None].to(alpha)]
@@ -227,9 +226,14 @@ class GuidedPAT(nn.Module):
         context = self.judge(stacked(own.quarter, rough))
         return self.confidence(stacked(enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)))
 
+    def _key(self, features: Encoded) -> Tensor:
+        """What queries and keys are at full size."""
+        return self._exact(pixel_shuffle(self.fine_key(features.half), 2))
+
     def _exact(self, x: Tensor) -> Tensor:
-        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
-        return x if self.training else x.double()
+        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there. The
+        channels are beside each other, as attention wants them: else it makes a copy."""
+        return x if self.training else x.to(torch.float64, memory_format=torch.channels_last)
 
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:

@@ -20,8 +20,8 @@ from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatche
 
 LOG = logging.getLogger(__name__)
 
-MATCHING_HALO = 256
-"""The halo of the pieces in which large frames are matched, pixels."""
+MATCHING_HALO = 128
+"""The halo of the pieces in which large frames are matched at full size, pixels."""
 MATCHED_AT_ONCE = 1_600_000
 """Pixels of alpha matched at once. Larger frames are cut the same way whatever memory is allowed, so that results do
 not depend on it."""
