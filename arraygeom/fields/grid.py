@@ -29,8 +29,9 @@ class FieldOnGrid:
     """The search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a block.
 
     Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good matches is
-    taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes) nevertheless, without blocks;
-    its parts are in float64, so that the rounding is the same whatever the parts. Explicit positions stay lazy: `pixels` is None then, and only `at` answers.
+    taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes) nevertheless, without blocks,
+    and cut to float64: the rounding is the same whatever the parts. Explicit positions stay lazy: `pixels`
+    is None then, and only `at` answers.
 
     pixels: (B or 1, H, W), in beta's pixels.
     blocks: (B or 1, H / 2, W / 2), of the centres of blocks of 2 x 2 pixels; None if not asked for.
