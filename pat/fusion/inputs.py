@@ -141,6 +141,9 @@ ROWS = 512
 LOST = 0.3
 """Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
 
+ONE_SIDE = 0.9
+"""Length of the sum of all betas' segments, over the sum of their lengths, from which all count as on one side."""
+
 
 def background_filled(
     depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], inputs: Inputs
@@ -148,14 +151,18 @@ def background_filled(
     """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
 
     What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
-    are above or below alpha. What is unknown stays NaN.
+    are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded in one of them:
+    depth is then as it is.
     """
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
     if not steps:
         return depth
     every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
-    apart = torch.stack([(part.end[every] - part.start[every]).abs().mean((0, 1, 2)) for part in steps]).sum(0)
-    if bool(apart[0] < apart[1]):
+    apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
+    if apart.sum(0).norm() < ONE_SIDE * apart.norm(dim=1).sum():
+        return depth
+    across, down = apart.sum(0).abs().tolist()
+    if across < down:
         return _filled_along_rows(depth.mT, confidence.mT).mT
     return _filled_along_rows(depth, confidence)
 
