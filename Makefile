@@ -20,7 +20,8 @@ help:
 	@echo "make check      format, lint and types"
 	@echo "make format     put the format right, and what lint can repair"
 	@echo "make bench      measure attention and training"
-	@echo "make bench-job  measure pat fuse as a command; QUICK=1: one size, a minute"
+	@echo "make bench-job  measure pat fuse as a command into docs/performance.md, 15 minutes; QUICK=1: one size, a minute;"
+	@echo "                AGAINST=FOLDER: another checkout too"
 	@echo "make fuzz       read 6,000 damaged files, each in a process of its own; the table of docs/fuzzing.md"
 	@echo "make kills      end commands with SIGKILL some 100 times, continue and compare; the table of docs/kills.md"
 	@echo "make transformations  torch's transformations of every operator; the table of docs/transformations.md"
@@ -81,7 +82,8 @@ bench: $(READY)
 	@$(BIN)/python -m tests.benchmarks.bench_training
 
 bench-job: $(READY)
-	@$(BIN)/python -m tests.benchmarks.bench_job $(if $(QUICK),--quick)
+	@$(BIN)/python -m tests.benchmarks.bench_job $(if $(QUICK),--quick) $(if $(AGAINST),--against $(AGAINST))
+	@$(if $(QUICK),,$(BIN)/python -m docs.update_readme --document docs/performance.md --block job=tests/benchmarks/RESULTS_job.md)
 
 fuzz: $(READY)
 	@OMP_NUM_THREADS=1 $(BIN)/python -m tests.fuzz.run --out docs/fuzzing.md

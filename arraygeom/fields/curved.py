@@ -94,16 +94,19 @@ class _Straight(NamedTuple):
 
     @classmethod
     def of(cls, view: View) -> _Straight:
+        """Of a view; one without a lens is its own."""
         if not isinstance(view, LensView) or view.distortion is None:
             return cls(view, view, torch.eye(3, dtype=torch.float64))
         pinhole = pinhole_view(view)
         return cls(view, pinhole, product(pinhole.K, torch.linalg.inv(view.K)))
 
     def undistort(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (*n, 2) of the view in those of the pinhole, and which the lens model covers."""
         straight, valid = self.view.to(x.dtype).undistort(x)
         return map_homogeneous(self.A[:2], straight), valid
 
     def distort(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Pixels (*n, 2) of the pinhole in those of the view, and which the lens model covers."""
         return self.view.to(x.dtype).distort(map_homogeneous(torch.linalg.inv(self.A)[:2], x))
 
 
@@ -137,6 +140,7 @@ class _Curve(NamedTuple):
 
     @classmethod
     def of(cls, pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> _Curve:
+        """The curves of alpha's pixels x (*n, 2) from near to far (metres), as far as beta's image may show them."""
         pose = pair.beta_from_alpha.to(x.dtype)
         alpha, beta = (c.to(x.dtype) for c in pair.cameras)
         rays, seen = alpha.rays(x)

@@ -18,6 +18,8 @@ Box = tuple[int, int, int, int]
 
 BLOCK = 2
 """Side of the blocks of alpha's pixels whose centres `FieldOnGrid.blocks` is of."""
+LARGE = 1 << 22
+"""Pixels of a grid from which its segments are stored as float32."""
 _CHUNK = 1 << 18
 """Pixels evaluated at once."""
 
@@ -27,7 +29,9 @@ class FieldOnGrid:
     """The search segments of every pixel of alpha, in float64: 33 bytes a pixel, and 8 for its share of a block.
 
     Float32 would round positions by up to 3e-5 px, which is enough to change which of two equally good matches is
-    taken: 7e-4 in the fused image. Explicit positions stay lazy: `pixels` is None then, and only `at` answers.
+    taken: 7e-4 in the fused image. Those of a large grid are stored as float32 (17 bytes) nevertheless, without blocks,
+    and cut to float64: the rounding is the same whatever the parts. Explicit positions stay lazy: `pixels`
+    is None then, and only `at` answers.
 
     pixels: (B or 1, H, W), in beta's pixels.
     blocks: (B or 1, H / 2, W / 2), of the centres of blocks of 2 x 2 pixels; None if not asked for.
@@ -48,22 +52,21 @@ class FieldOnGrid:
         """
         at, hw = lazily(field, pair), hw or pair.alpha.hw
         device = pair.cameras[0].K.device if pair.calibrated else None
-        grid = pixel_grid(hw, dtype=torch.float64, device=device)
         # Explicit positions of a whole frame may not fit into memory: one point shows which kind the field gives.
-        kind = at(grid[:1, 0] + 0.25)
+        kind = at(torch.full((1, 2), 0.25, dtype=torch.float64, device=device))
         if isinstance(kind, Positions):
             return cls(at, kind.xy.shape[-2], None)
-        pixels = _on_grid(at, grid)
+        pixels = _on_grid(at, hw, device=device)
         h, w = pair.alpha.hw
         sparse = (..., slice(0, h, 4), slice(0, w, 4))
         longest = torch.where(pixels.valid[sparse], pixels.length[sparse].detach().float(), 0.0).max()
         found = cls(at, int(torch.ceil(longest)) + 1, pixels)
-        return replace(found, blocks=found.of_blocks(BLOCK)) if blocks else found
+        return replace(found, blocks=found.of_blocks(BLOCK)) if blocks and not found.large else found
 
     @classmethod
     def evaluated(cls, at: Callable[[Tensor], Segments], hw: HW, samples: int) -> FieldOnGrid:
         """A straight field, given as a function of alpha's pixels, on a grid of even sides."""
-        found = cls(at, samples, _on_grid(at, pixel_grid(hw, dtype=torch.float64)))
+        found = cls(at, samples, _on_grid(at, hw))
         return replace(found, blocks=found.of_blocks(BLOCK))
 
     def of_blocks(self, side: int) -> Segments:
@@ -76,8 +79,31 @@ class FieldOnGrid:
         if self.pixels is None:
             raise ValueError("this network samples straight segments: choose a straight field, or undistort the images")
         h, w = self.pixels.valid.shape[-2:]
-        grid = pixel_grid((h // side, w // side), dtype=torch.float64, device=self.pixels.start.device)
-        return _on_grid(self.at, (grid + 0.5) * side - 0.5)
+        return _on_grid(self.at, (h // side, w // side), side, self.pixels.start.device)
+
+    def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
+        """A straight field with its segments moved by a step that depends on them and on alpha's pixels (*n, 2)."""
+
+        def moved(found: Segments | Positions, x: Tensor) -> Segments:
+            assert isinstance(found, Segments)
+            return _shifted(found, -step(found, x))
+
+        def grid(stored: Segments, side: int) -> Segments:
+            def at(x: Tensor) -> Segments:
+                top, bottom = (round(float((x[i, 1] + 0.5) / side - 0.5)) for i in (0, -1))
+                rows = (t[:, top : bottom + 1].flatten(1, 2) for t in _parts(stored))
+                return moved(_exact(Segments(*rows)), x)
+
+            h, w = stored.valid.shape[-2:]
+            return _on_grid(at, (h, w), side, stored.start.device)
+
+        blocks = self.blocks and grid(self.blocks, BLOCK)
+        return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
+
+    @property
+    def large(self) -> bool:
+        """Whether segments are stored as float32."""
+        return self.pixels is not None and self.pixels.valid[0].numel() >= LARGE
 
     @property
     def straight(self) -> Segments:
@@ -102,7 +128,8 @@ class FieldOnGrid:
                 return Positions(found.xy - found.xy.new_tensor(shift), found.mask)
             return _shifted(found, shift)
 
-        pixels = self.pixels and _shifted(_window(self.pixels, box), shift)
+        pixels = self.pixels and _window(self.pixels, box)
+        pixels = pixels and _shifted(_exact(pixels) if self.large else pixels, shift)
         blocks = self.blocks and _shifted(_window(self.blocks, tuple(n // BLOCK for n in box)), shift)  # type: ignore[arg-type]
         return FieldOnGrid(at, self.samples, pixels, blocks)
 
@@ -117,31 +144,43 @@ class FieldOnGrid:
         return FieldOnGrid(lambda x: one(self.at(x)), self.samples, pixels, blocks)  # type: ignore[arg-type]
 
 
-def _on_grid(at: Callable[[Tensor], Segments | Positions], x: Tensor) -> Segments:
-    """A straight field at a grid of pixels (h, w, 2) as (B or 1, h, w)."""
-    h, w = x.shape[:2]
+def _on_grid(
+    at: Callable[[Tensor], Segments | Positions], hw: HW, side: int = 1, device: torch.device | None = None
+) -> Segments:
+    """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w)."""
+    h, w = hw
     rows = max(_CHUNK // max(w, 1), 1)
+    columns = torch.arange(w, dtype=torch.float64, device=device)
     whole: list[Tensor] = []
     for top in range(0, h, rows):
-        found = at(x[top : top + rows].reshape(-1, 2))
+        y, x = torch.meshgrid(torch.arange(top, min(top + rows, h)).to(columns), columns, indexing="ij")
+        found = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
         assert isinstance(found, Segments)
-        part = [t.reshape(-1, min(rows, h - top), w, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))]
+        part = [t.reshape(-1, len(y), w, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))]
         if rows >= h:
             return Segments(*part)
         if any(t.requires_grad for t in part):
-            return _on_grid_whole(at, x)
+            return _on_grid_whole(at, hw, side, device)
+        if h * w >= LARGE:
+            part = [*(t.float() for t in part[:2]), part[2]]
         whole = whole or [t.new_empty(t.shape[0], h, w, *t.shape[3:]) for t in part]
         for target, t in zip(whole, part):
             target[:, top : top + rows] = t
     return Segments(*whole)
 
 
-def _on_grid_whole(at: Callable[[Tensor], Segments | Positions], x: Tensor) -> Segments:
+def _on_grid_whole(
+    at: Callable[[Tensor], Segments | Positions], hw: HW, side: int, device: torch.device | None
+) -> Segments:
     """The same at once, which keeps the gradient."""
-    found = at(x.reshape(-1, 2))
+    grid = (pixel_grid(hw, dtype=torch.float64, device=device) + 0.5) * side - 0.5
+    found = at(grid.reshape(-1, 2))
     assert isinstance(found, Segments)
-    h, w = x.shape[:2]
-    return Segments(*(t.reshape(-1, h, w, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))))
+    return Segments(*(t.reshape(-1, *hw, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))))
+
+
+def _exact(found: Segments) -> Segments:
+    return Segments(found.start.double(), found.end.double(), found.valid)
 
 
 def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
@@ -153,8 +192,8 @@ def _window(found: Segments, box: Box) -> Segments:
     return Segments(*(t[:, rows, columns] for t in _parts(found)))
 
 
-def _shifted(found: Segments, shift: tuple[int, int]) -> Segments:
+def _shifted(found: Segments, shift: tuple[int, int] | Tensor) -> Segments:
     if shift == (0, 0):
         return found
-    step = found.start.new_tensor(shift)
+    step = shift if isinstance(shift, Tensor) else found.start.new_tensor(shift)
     return Segments(found.start - step, found.end - step, found.valid)

@@ -55,7 +55,7 @@ from ..sensors import Clip, Noise, Quantise, record
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rendered import RENDER_FILE, Rendered, is_rendered
-from ..synthesis.rigs import RigDistribution
+from ..synthesis.rig_distribution import RigDistribution
 from .baseline import classical
 from .metrics import bootstrap_interval, score
 from .tables import markdown_table, write_csv

@@ -28,7 +28,8 @@ from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, save_frame
-from pat.synthesis.rigs import RigBatch, RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
+from pat.synthesis.rigs import RigBatch
 
 FARTHEST = 50.0
 """Layered scenes of rigs that see to infinity end at this many times the near bound."""

@@ -1,1 +1,1 @@
-"""TODO."""
+"""The fusion of frames, batches and sequences."""

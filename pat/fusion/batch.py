@@ -46,7 +46,7 @@ from ..media.headers import RAW_SUFFIXES
 from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.video import write_video
-from ..networks.weights import Network, find_weights, load_weights
+from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
@@ -102,6 +102,8 @@ class Batch:
     kind: ImageFormat = "png"
     alone: bool = False
     """Of a sequence: fuse each frame by itself, without warping colour; for comparison."""
+    precision: Precision = "float32"
+    """Of the network's convolutions, as of `load_weights`."""
     strict: bool = False
     """A frame of unfit confidence (`LowConfidenceWarning`) fails."""
 
@@ -140,6 +142,8 @@ class Batch:
             "first": {name: str(files[0]) for name, files in self.files.items()},
             "rig": rig_text(self.rig),
         }
+        if self.precision != "float32":
+            facts["precision"] = self.precision
         if self.noise is not None:
             facts |= {"noise": noise_document(self.noise), "keep_alpha": self.keep_alpha}
         if self.luminance != "alpha":
@@ -250,7 +254,7 @@ class Batch:
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
         options = {"max_memory": self.max_memory, "luminance": self.luminance}
         return SequenceFusion(
-            _network(self.weights),
+            _network(self.weights, self.precision),
             developed_rig(self.rig, self.files),
             frames,
             self.alpha,
@@ -291,7 +295,7 @@ class Batch:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
             return fuse(
-                _network(self.weights),
+                _network(self.weights, self.precision),
                 images.developed,
                 images,
                 alpha=self.alpha,
@@ -375,8 +379,8 @@ def _planned(plan: Path, time: int) -> Batch:
 
 
 @lru_cache(maxsize=2)
-def _network(weights: str) -> Network:
-    return load_weights(weights)
+def _network(weights: str, precision: Precision) -> Network:
+    return load_weights(weights, precision=precision)
 
 
 def find_images(text: str | Path, *, name: str = "") -> list[Path]:

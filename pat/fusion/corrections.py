@@ -27,8 +27,7 @@ from arraygeom.sampling import on_image, sample
 from ..networks.bandwise import BandwisePAT
 from ..networks.guided import GuidedPAT, brightness
 from ..networks.protocol import Beta, FusionNetwork, Inputs
-from ..networks.semi_global import Normalisation, blurred
-from ..networks.spectral_mix import reduced
+from ..networks.semi_global import Normalisation, blurred, reduced
 from .inputs import FrameInputs, padded
 from .misalignment import Misalignment, fit_misalignment, normals
 from .response import Given, Response, fit, stated_response

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom import Moved, Pair, Segments, depth_from_track, pixel_grid
-from arraygeom.epipolar import Track
+from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
@@ -87,14 +87,15 @@ def padded(image: Tensor, multiple: int) -> Tensor:
     return pad(image, (0, -w % multiple, 0, -h % multiple), mode="replicate")
 
 
-def _within(where: Float[Tensor, "h w 2"], segments: Segments) -> Float[Tensor, "h w 2"]:
-    """Positions, those beyond an end of their segment moved along it to that end."""
-    h, w = where.shape[:2]
-    start, end = (t[0, :h, :w].to(where) for t in (segments.start, segments.end))
+def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
+    """Positions of some of alpha's pixels, those beyond an end of their segment moved along it to that end."""
+    h, w = which.shape
+    start, end, valid = (t[0, :h, :w][which] for t in (segments.start, segments.end, segments.valid))
+    start, end = start.to(where), end.to(where)
     way = end - start
     length2 = way.square().sum(-1)
     share = ((where - start) * way).sum(-1) / length2.clamp(min=1e-12)
-    beyond = segments.valid[0, :h, :w] & (length2 > 1e-6) & ((share < 0) | (share > 1))
+    beyond = valid & (length2 > 1e-6) & ((share < 0) | (share > 1))
     moved = where + (share.clamp(0, 1) - share)[..., None] * way
     return torch.where(beyond[..., None], moved, where)
 
@@ -120,9 +121,11 @@ def depth_and_confidence(
         found = depth_from_track(track, (where + offset).reshape(-1, 2))
         if beta.field.pixels is not None and pair.depth is not None:
             near, far = (bound.to(found.depth) for bound in pair.depth)
-            bounded = found.valid & (found.depth >= near) & (found.depth <= far)
-            where = torch.where(bounded.reshape(h, w, 1), where, _within(where, beta.field.pixels))
-            found = depth_from_track(track, (where + offset).reshape(-1, 2))
+            beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
+            if bool(beyond.any()):
+                moved = _within(where.reshape(-1, 2)[beyond], beta.field.pixels, beyond.view(h, w))
+                there = depth_from_track(Track(*(v.expand_as(track.a)[beyond] for v in track)), moved + offset)
+                found = Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
         valid = found.valid.reshape(h, w)
         weight = torch.where(valid & (confidence[0, :h, :w] > UNSEEN), confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
@@ -133,6 +136,8 @@ def depth_and_confidence(
     return depth.to(output.image), overall[0, :h, :w]
 
 
+ROWS = 512
+"""Rows whose depth is filled at a time."""
 LOST = 0.3
 """Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
 
@@ -152,20 +157,28 @@ def background_filled(
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
     if not steps:
         return depth
-    apart = torch.stack([(part.end - part.start).mean((0, 1, 2)) for part in steps])
+    every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
+    apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
     if apart.sum(0).norm() < ONE_SIDE * apart.norm(dim=1).sum():
         return depth
     across, down = apart.sum(0).abs().tolist()
-    along_rows = across >= down
+    if across < down:
+        return _filled_along_rows(depth.mT, confidence.mT).mT
+    return _filled_along_rows(depth, confidence)
+
+
+def _filled_along_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Some rows at a time: what is computed on the way is seven times as large."""
+    return torch.cat([_filled_rows(*part) for part in zip(depth.split(ROWS), confidence.split(ROWS))])
+
+
+def _filled_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
     known = (confidence >= LOST) & depth.isfinite()
-    if not along_rows:
-        inverse, known = inverse.mT, known.mT
     before = _nearest_known(inverse, known)
     after = _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1)
     beside = torch.fmin(before, after)
     found = torch.where(known | beside.isnan(), inverse, beside)
-    found = found if along_rows else found.mT
     return torch.where(depth.isfinite() & (found > 0), 1 / found, depth)
 
 

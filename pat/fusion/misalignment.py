@@ -7,7 +7,7 @@ freed of what it is off along its segment.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import cv2
@@ -17,7 +17,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Segments, pixel_grid
+from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 
@@ -83,23 +83,7 @@ class Misalignment:
         """The field with its segments displaced; `hw` is alpha's size without padding."""
         if self == Misalignment() or field.pixels is None:
             return field
-
-        def at(x: Tensor) -> Segments:
-            found = field.at(x)
-            assert isinstance(found, Segments)
-            return self._displaced(found, x, hw)
-
-        def grid(found: Segments, side: int) -> Segments:
-            shape = found.valid.shape[-2:]
-            x = (pixel_grid((shape[0], shape[1]), dtype=torch.float64, device=found.start.device) + 0.5) * side - 0.5
-            return self._displaced(found, x, hw)
-
-        blocks = field.blocks and grid(field.blocks, 2)
-        return replace(field, at=at, pixels=grid(field.pixels, 1), blocks=blocks)
-
-    def _displaced(self, found: Segments, x: Tensor, hw: HW) -> Segments:
-        step = self.at(x, hw)[..., None] * normals(found)
-        return Segments(found.start + step, found.end + step, found.valid)
+        return field.displaced(lambda found, x: self.at(x, hw)[..., None] * normals(found))
 
 
 def normals(segments: Segments) -> Float[Tensor, "*n 2"]:

@@ -6,6 +6,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -182,14 +183,13 @@ def fuse_tile(network: FusionNetwork, frame: FrameInputs, state: State | None, t
 
 
 def _fused(network: FusionNetwork, inputs: Inputs, state: State | None, frame: FrameInputs, tile: Tile) -> Frame:
-    top, bottom, left, right = tile.outer
+    top, bottom, left, right = tile.inner
+    box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
+    output = network(inputs, state).cut(box)
+    part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
-    output = network(inputs, state)
-    depth, confidence = depth_and_confidence(output, inputs, frame.placements, hw, (left, top))
-    rows = slice(tile.inner[0] - top, tile.inner[1] - top)
-    columns = slice(tile.inner[2] - left, tile.inner[3] - left)
-    image = output.image[0, :, : hw[0], : hw[1]]
-    return Frame(image[:, rows, columns], depth[rows, columns], confidence[rows, columns])
+    depth, confidence = depth_and_confidence(output, part, frame.placements, hw, (left, top))
+    return Frame(output.image[0], depth, confidence)
 
 
 def assembled(hw: HW, parts: Iterable[tuple[Tile, Frame]]) -> Frame:

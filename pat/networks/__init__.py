@@ -1,1 +1,1 @@
-"""TODO."""
+"""The networks, their building blocks and their weights."""

@@ -8,32 +8,21 @@ nothing else.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 
 import torch
 from torch import Tensor, nn
 
-from .guided import BetaEstimate, Encoded, GuidedPAT, GuidedPATConfig, output_of
+from .configs import BandwisePATConfig, GuidedPATConfig
+from .guided import BetaEstimate, Encoded, GuidedPAT, output_of
 from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
-from .semi_global import FINE, Normalisations, SemiGlobalMatches
+from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches
 from .spectral_mix import SpectralMix, coarse_mix, semi_global_matching_of_bands
 
 COARSELY = 400_000
 """Pixels of alpha at most on which the bands' combination is found."""
-
-
-@dataclass(frozen=True)
-class BandwisePATConfig(GuidedPATConfig):
-    """GuidedPAT's, for one band, which need not have alpha's luminance."""
-
-    bands: int = 1
-    keep_luminance: bool = False
-
-    def __post_init__(self) -> None:
-        if self.bands != 1 or self.keep_luminance:
-            raise ValueError("BandwisePAT fuses one band at a time: leave bands at 1 and keep_luminance at false")
 
 
 class BandwisePAT(nn.Module):
@@ -55,7 +44,7 @@ class BandwisePAT(nn.Module):
 
     def prepare(self, inputs: Inputs) -> Prepared:
         """For each beta how its bands are combined and normalised, and by that its semi-global matches."""
-        return prepared(inputs, self._combination, _matches)
+        return prepared(inputs, self._combination, lambda combined: combined[0].of, _matches)
 
     def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
         """The combination of the one beta's bands that is most like alpha, and how that is normalised."""
@@ -73,7 +62,7 @@ class BandwisePAT(nn.Module):
 
     def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
-        state = state or self.prepare(inputs)
+        state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
         own = self.single.encoder(inputs.alpha)
         parts = [
             self._of_beta(own, inputs.alpha, beta, found, mix)
@@ -99,10 +88,12 @@ class BandwisePAT(nn.Module):
         return mix.reconciled(torch.cat(bands, 1), alpha), estimate
 
 
-def _matches(inputs: Inputs, combined: tuple[SpectralMix, Normalisations]) -> SemiGlobalMatches:
+def _matches(
+    inputs: Inputs, combined: tuple[SpectralMix, Normalisations], half: HalfSizeMatches | None
+) -> SemiGlobalMatches:
     """The matches of the one beta, once for all its bands."""
     alpha, (beta,), (mix, normalisations) = inputs.alpha, inputs.betas, combined
-    segments, blocks = beta.field.straight, beta.field.of_blocks(FINE)
+    segments, blocks = beta.field.straight, None if half else beta.field.of_blocks(FINE)
     if beta.image.shape[1] == 1:
-        return semi_global_matching(alpha, beta.image, beta.image, segments, blocks, normalisations)
-    return semi_global_matching_of_bands(alpha, beta.image, segments, blocks, mix, normalisations)
+        return semi_global_matching(alpha, beta.image, beta.image, segments, blocks, normalisations, half)
+    return semi_global_matching_of_bands(alpha, beta.image, segments, blocks, mix, normalisations, half)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 
 
 class ResidualBlock(nn.Module):
@@ -61,3 +64,15 @@ def stacked(*parts: Float[Tensor, "b _ h w"]) -> Float[Tensor, "b d h w"]:
 def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:
     """Bilinear, by the pixel-area convention c' = (c + 0.5) factor - 0.5."""
     return nn.functional.interpolate(x, scale_factor=factor, mode="bilinear", align_corners=False)
+
+
+def in_bfloat16(part: nn.Module) -> None:
+    """Let a part compute in bfloat16 where autocast does, with float32 output."""
+    forward = part.forward
+
+    def cast(*images: Tensor) -> Any:
+        with torch.autocast(images[0].device.type, torch.bfloat16):
+            answer = forward(*images)
+        return tree_map(lambda t: t.float(), answer)
+
+    part.forward = cast

@@ -9,7 +9,7 @@ pixels of high confidence to the others, and adds it to alpha.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -22,12 +22,14 @@ from arraygeom import Local, Pair, Segments, View, lazily
 from ..attention import Attended, attend, attend_with_statistics
 from ..media.colour import luminance
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
+from .configs import GuidedPATConfig
 from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import (
     FILLS,
     FINE,
+    HalfSizeMatches,
     Normalisations,
     SemiGlobalMatches,
     along,
@@ -48,29 +50,6 @@ LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
-
-
-@dataclass(frozen=True)
-class GuidedPATConfig:
-    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
-
-    Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
-    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim`
-    (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add colour to alpha, and
-    never luminance.
-    """
-
-    widths: tuple[int, int, int, int] = (16, 32, 40, 48)
-    fine_dim: int = 8
-    window: float = 3.0
-    taps: int = 13
-    judge_dim: int = 16
-    confidence_dim: int = 24
-    propagation_dim: int = 8
-    propagation_steps: tuple[int, ...] = (1, 3, 8)
-    head_dim: int = 32
-    bands: int = 3
-    keep_luminance: bool = True
 
 
 class BetaEstimate(NamedTuple):
@@ -131,7 +110,7 @@ class GuidedPAT(nn.Module):
     halo = 640
     """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
     beta_halo = 96
-    bytes_per_pixel = 320.0
+    bytes_per_pixel = 280.0
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
@@ -151,7 +130,7 @@ class GuidedPAT(nn.Module):
 
         Betas that each have all bands agree on depth, and share the colour that is diffused.
         """
-        found = prepared(inputs, _normalisations, _matches)
+        found = prepared(inputs, _normalisations, lambda _: brightness, _matches)
         if not can_agree(inputs) or self._in_parts(inputs):
             return found
         return replace(found, matches=self._shared(inputs, found))
@@ -190,7 +169,7 @@ class GuidedPAT(nn.Module):
         bands = sum(beta.image.shape[1] for beta in inputs.betas)
         if parts and bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
-        alpha, state = inputs.alpha, state or self.prepare(inputs)
+        alpha, state = inputs.alpha, state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
         own = self.encoder(alpha)
         estimates = [self.estimate(own, alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
         used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
@@ -236,10 +215,9 @@ class GuidedPAT(nn.Module):
     ) -> BetaEstimate:
         """The estimate of one beta of any bands; `guide` is what of these is compared with alpha."""
         of = guide or brightness
-        other = self.encoder(of(beta.image))
         segments = _in_type(beta.field.straight, self._exact(alpha))
         window = window_around(found.disparity, segments, self.config.window)
-        query, key = (self._exact(pixel_shuffle(self.fine_key(f.half), 2)) for f in (own, other))
+        query, key = self._key(own), self._key(self.encoder(of(beta.image)))
         attended = attend_with_statistics(query, key, self._exact(beta.image), window, samples=self.config.taps)
         value = attended.value.to(alpha)
         facts = [of(value) - alpha, attended.peak[:, None].to(alpha), attended.deviation[:, None].to(alpha)]
@@ -260,9 +238,14 @@ class GuidedPAT(nn.Module):
         context = self.judge(stacked(own.quarter, rough))
         return self.confidence(stacked(enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)))
 
+    def _key(self, features: Encoded) -> Tensor:
+        """What queries and keys are at full size."""
+        return self._exact(pixel_shuffle(self.fine_key(features.half), 2))
+
     def _exact(self, x: Tensor) -> Tensor:
-        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there."""
-        return x if self.training else x.double()
+        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there. The
+        channels are beside each other, as attention wants them: else it makes a copy."""
+        return x if self.training else x.to(torch.float64, memory_format=torch.channels_last)
 
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
@@ -361,12 +344,12 @@ def _normalisations(inputs: Inputs) -> Normalisations:
     return Normalisations.of(inputs.alpha, brightness(inputs.betas[0].image))
 
 
-def _matches(inputs: Inputs, normalisations: Normalisations) -> SemiGlobalMatches:
+def _matches(inputs: Inputs, normalisations: Normalisations, half: HalfSizeMatches | None) -> SemiGlobalMatches:
     """The matches of the one beta."""
     (beta,) = inputs.betas
-    blocks = beta.field.of_blocks(FINE)
+    segments, blocks = beta.field.straight, None if half else beta.field.of_blocks(FINE)
     return semi_global_matching(
-        inputs.alpha, brightness(beta.image), beta.image, beta.field.straight, blocks, normalisations
+        inputs.alpha, brightness(beta.image), beta.image, segments, blocks, normalisations, half
     )
 
 

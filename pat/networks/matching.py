@@ -25,6 +25,7 @@ from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
     FINE,
+    HalfSizeMatches,
     Normalisation,
     Normalisations,
     SemiGlobalMatches,
@@ -50,17 +51,19 @@ def semi_global_matching(
     guide: Float[Tensor, "b 1 hb wb"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    blocks: Segments,
+    blocks: Segments | None,
     normalisations: Normalisations | None = None,
+    half: HalfSizeMatches | None = None,
 ) -> SemiGlobalMatches:
     """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
 
     `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
     of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole images if these
-    are parts. On the CPU, with as many threads as torch may use; the same whatever their number.
+    are parts, and `half` what is known of these parts from the whole images. On the CPU, with as many threads as torch
+    may use; the same whatever their number.
     """
     normalisations = normalisations or Normalisations.of(alpha, guide)
-    disparity, facts = matched(alpha, guide, segments, blocks, normalisations)
+    disparity, facts = matched(alpha, guide, segments, blocks, normalisations, half)
     colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
     return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))
 
@@ -70,12 +73,16 @@ def matched(
     alpha: Float[Tensor, "b 1 h w"],
     guide: Float[Tensor, "b 1 hb wb"],
     segments: Segments,
-    blocks: Segments,
+    blocks: Segments | None,
     normalisations: Normalisations,
+    half: HalfSizeMatches | None = None,
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 3 h2 w2"]]:
     """`disparity` and `facts` alone."""
-    half, facts = matched_at_half_size(alpha, guide, blocks, normalisations.half)
-    disparity, unlike = matched_at_full_size(alpha, guide, segments, half, normalisations.whole)
+    if half is None:
+        assert blocks is not None, "matching without blocks begins with matches at half the size"
+        half = matched_at_half_size(alpha, guide, blocks, normalisations.half)
+    rough, facts = half
+    disparity, unlike = matched_at_full_size(alpha, guide, segments, rough, normalisations.whole)
     return disparity, torch.cat([avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
 
 

@@ -7,7 +7,6 @@ configuration is the paper's; variants are configuration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -18,25 +17,8 @@ from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention import Attended, attend_with_statistics
 from .blocks import ResidualASPP, ResidualBlock
+from .configs import PATConfig
 from .protocol import FusionOutput, Inputs, JoinsBands
-
-
-@dataclass(frozen=True)
-class PATConfig:
-    """The paper's network by default.
-
-    `betas` is their number, `in_channels` that of each image (an image with fewer is repeated), `dim` the
-    width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
-    of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is sampled.
-    """
-
-    betas: int = 1
-    in_channels: int = 3
-    out_channels: int = 3
-    dim: int = 64
-    scale: int = 1
-    residual: bool = False
-    interpolation: Literal["nearest", "bilinear"] = "nearest"
 
 
 class PAT(nn.Module):

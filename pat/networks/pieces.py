@@ -16,12 +16,12 @@ from arraygeom.pixels import HW
 
 from ..support.memory import give_back
 from .protocol import Inputs
-from .semi_global import SemiGlobalMatches
+from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches, matched_at_half_size
 
 LOG = logging.getLogger(__name__)
 
-MATCHING_HALO = 256
-"""The halo of the pieces in which large frames are matched, pixels."""
+MATCHING_HALO = 128
+"""The halo of the pieces in which large frames are matched at full size, pixels."""
 MATCHED_AT_ONCE = 1_600_000
 """Pixels of alpha matched at once. Larger frames are cut the same way whatever memory is allowed, so that results do
 not depend on it."""
@@ -32,6 +32,10 @@ class Tile(NamedTuple):
 
     inner: Box
     outer: Box
+
+
+Match = Callable[[Inputs, HalfSizeMatches | None], SemiGlobalMatches]
+"""Matches inputs with one beta, given what is known of them at half the size."""
 
 
 def area(box: Box) -> int:
@@ -79,15 +83,25 @@ def matching_pieces(hw: HW, multiple: int) -> list[Tile]:
     return list(tiles_of(hw, sides_by_work(hw, MATCHING_HALO, multiple, MATCHED_AT_ONCE)[0], MATCHING_HALO))
 
 
-def matched_in_pieces(inputs: Inputs, match: Callable[[Inputs], SemiGlobalMatches]) -> SemiGlobalMatches:
-    """The matches of a whole frame from the inner parts of its pieces; `inputs` have one beta."""
+def matched_in_pieces(inputs: Inputs, brightness: Callable[[Tensor], Tensor], match: Match) -> SemiGlobalMatches:
+    """The matches of a frame with one beta; of a large one, from the inner parts of pieces that begin with matches of
+    the whole frame at half the size. Colours of those are stored as float16.
+
+    `brightness` makes of beta's bands what alpha is compared with.
+    """
     pieces = matching_pieces(inputs.hw, inputs.multiple)
     if len(pieces) == 1:
-        return match(inputs)
+        return match(inputs, None)
+    (beta,) = inputs.betas
+    guide, blocks = brightness(beta.image), beta.field.of_blocks(FINE)
+    half = matched_at_half_size(inputs.alpha, guide, blocks, Normalisations.of(inputs.alpha, guide).half)
+    del guide, blocks
+    give_back()
     found: list[Tensor] = []
     for inner, outer in pieces:
         top, bottom, left, right = inner
-        part = match(inputs.cut(outer)).cut((top - outer[0], bottom - outer[0], left - outer[2], right - outer[2]))
+        part = match(inputs.cut(outer), half.cut(outer))
+        part = part.cut((top - outer[0], bottom - outer[0], left - outer[2], right - outer[2])).stored()
         steps = [(bottom - top) // p.shape[-2] for p in part]
         found = found or [p.new_empty(*p.shape[:-2], *(n // s for n in inputs.hw)) for p, s in zip(part, steps)]
         for target, p, s in zip(found, part, steps):
@@ -106,8 +120,8 @@ class Prepared:
 
     @property
     def nbytes(self) -> int:
-        """Memory held."""
-        return sum(part.nbytes for found in self.matches for part in found)
+        """Memory held, of a large frame: as `stored`."""
+        return sum(part.nbytes for found in self.matches for part in found.stored())
 
     def cut(self, box: Box) -> Prepared:
         """Of a part of alpha."""
@@ -118,13 +132,14 @@ class Prepared:
 def prepared(
     inputs: Inputs,
     common: Callable[[Inputs], Any],
-    match: Callable[[Inputs, Any], SemiGlobalMatches],
+    brightness: Callable[[Any], Callable[[Tensor], Tensor]],
+    match: Callable[[Inputs, Any, HalfSizeMatches | None], SemiGlobalMatches],
 ) -> Prepared:
-    """`common` of each beta, and by that its matches. Each beta for itself."""
+    """`common` of each beta, and by that its matches. Each beta for itself. For the rest see `matched_in_pieces`."""
     betas = [inputs.of_beta(i) for i in range(len(inputs.betas))]
     facts = tuple(common(one) for one in betas)
     found = []
     for i, (one, known) in enumerate(zip(betas, facts), 1):
         LOG.info("matching beta %d of %d", i, len(betas))
-        found.append(matched_in_pieces(one, lambda piece, f=known: match(piece, f)))
+        found.append(matched_in_pieces(one, brightness(known), lambda piece, half, f=known: match(piece, f, half)))
     return Prepared(tuple(found), facts)

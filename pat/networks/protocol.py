@@ -140,6 +140,14 @@ class FusionOutput(NamedTuple):
     confidence: list[Tensor]
     overall: Tensor | None = None
 
+    def cut(self, box: Box) -> FusionOutput:
+        """The part at (top, bottom, left, right); of an image that is not enlarged."""
+        top, bottom, left, right = box
+        part = (..., slice(top, bottom), slice(left, right))
+        position, deviation, confidence = ([t[part] for t in tensors] for tensors in self[1:4])
+        overall = None if self.overall is None else self.overall[part]
+        return FusionOutput(self.image[part], position, deviation, confidence, overall)
+
 
 JoinsBands = Literal["no", "neighbours", "all"]
 

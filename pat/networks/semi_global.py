@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,7 +32,9 @@ FINE = 2
 """Matching is done on images this many times smaller."""
 BLOCK = 320
 """Sides of what is processed at a time, in pixels of the reduced images."""
-MOST_MARGIN = 192
+LONG_BLOCK = 640
+"""The longer side of the blocks of large images, along the segments."""
+LEAST_MARGIN, MOST_MARGIN = 64, 192
 MOST_COSTS = 2**25
 """Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
 CONSISTENT = 0.2
@@ -78,7 +80,24 @@ class SemiGlobalMatches(NamedTuple):
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
+        colours = (part[whole].to(self.disparity) for part in (self.matched, self.colour))
+        return SemiGlobalMatches(self.disparity[whole], self.facts[half], *colours)
+
+    def stored(self) -> SemiGlobalMatches:
+        """The same with colours as float16, which `cut` reads; differences from alpha are rounded by 1e-4 at most."""
+        return self._replace(matched=self.matched.half(), colour=self.colour.half())
+
+
+class HalfSizeMatches(NamedTuple):
+    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `SemiGlobalMatches`."""
+
+    disparity: Tensor
+    facts: Tensor
+
+    def cut(self, box: tuple[int, int, int, int]) -> HalfSizeMatches:
+        """The part at alpha's (top, bottom, left, right), all even."""
+        top, bottom, left, right = (n // FINE for n in box)
+        return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
 
 
 class Normalisation(NamedTuple):
@@ -138,8 +157,8 @@ class _Geometry(NamedTuple):
 
 def matched_at_half_size(
     alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, normalisation: Normalisation
-) -> tuple[Float[Tensor, "b 1 h2 w2"], Float[Tensor, "b 3 h2 w2"]]:
-    """`disparity` and `facts` alone; `normalisation` is that of half the size."""
+) -> HalfSizeMatches:
+    """Matches of images at half the size; `normalisation` is that of half the size."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
     geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
@@ -149,7 +168,7 @@ def matched_at_half_size(
     dense = np.stack([filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
     smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, dense)])
     disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
-    return disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha)
+    return HalfSizeMatches(disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha))
 
 
 def normalised_at_matches(
@@ -213,23 +232,36 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
         margin = min(labels + 32, MOST_MARGIN)
         small = a.shape[0] * (BLOCK + 2 * margin) * labels <= MOST_COSTS
-        boxes = inner_and_outer(a.shape, margin, a.shape[0] if small else BLOCK)
+        boxes = (
+            inner_and_outer(a.shape, margin, a.shape[0]) if small else _large_blocks(a.shape, geometry.along[i], labels)
+        )
         tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in boxes]
     in_parallel(tasks)
     return disparity, facts
 
 
+def _large_blocks(hw: tuple[int, ...], along: NDArray, labels: int) -> Iterator[Any]:
+    """Blocks of an image that is too large to be as high as one, with the margins that matching back asks for: as long
+    as segments are in x and in y."""
+    x, y = (min(int(labels * np.abs(along[..., i]).max()) + LEAST_MARGIN, MOST_MARGIN) for i in range(2))
+    return inner_and_outer(hw, (y, x), *((BLOCK, LONG_BLOCK) if x > y else (LONG_BLOCK, BLOCK)))
+
+
 def inner_and_outer(
-    hw: tuple[int, ...], margin: int, rows: int | None = None
+    hw: tuple[int, ...], margin: int | tuple[int, int], rows: int | None = None, columns: int | None = None
 ) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """Inner and outer blocks of so many rows (by default squares): the result, and what is computed for it."""
-    rows = rows or BLOCK
+    """Inner and outer blocks of so many rows and columns (by default squares): the result, and what is computed for it.
+
+    `margin` is in y and in x.
+    """
+    rows, columns = rows or BLOCK, columns or BLOCK
+    down, across = (margin, margin) if isinstance(margin, int) else margin
     for top in range(0, hw[0], rows):
-        for left in range(0, hw[1], BLOCK):
-            inner = slice(top, min(top + rows, hw[0])), slice(left, min(left + BLOCK, hw[1]))
+        for left in range(0, hw[1], columns):
+            inner = slice(top, min(top + rows, hw[0])), slice(left, min(left + columns, hw[1]))
             outer = (
-                slice(max(top - margin, 0), top + rows + margin),
-                slice(max(left - margin, 0), left + BLOCK + margin),
+                slice(max(top - down, 0), top + rows + down),
+                slice(max(left - across, 0), left + columns + across),
             )
             yield inner, outer
 
@@ -396,6 +428,12 @@ def along(segments: Segments) -> Float[Tensor, "*n 2"]:
     """Unit vectors from end to start; zero where a segment is a point."""
     length = segments.length
     return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+
+
+def reduced(segments: Segments, factor: int) -> Segments:
+    """The same segments in pixels of a beta that is `factor` times smaller."""
+    start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
+    return Segments(start, end, segments.valid)
 
 
 def enlarged(x: Tensor) -> Tensor:

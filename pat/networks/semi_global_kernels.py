@@ -11,6 +11,7 @@ NOWHERE = np.uint8(80)
 UNSEEN = np.uint8(24)
 """Cost of a label beyond beta's edge, where the point may well be: about that of a mismatch."""
 MOST = np.float32(1e9)
+MOST_BITS = MOST.view(np.int32)
 LEVELS = np.float32(30.0)
 """Cost of a difference of 1 in (normalised) brightness, which counts up to `TRUNCATED`."""
 TRUNCATED = np.float32(20.0)
@@ -30,16 +31,18 @@ HALF = np.float32(0.5)
 def census(image, out):
     """One bit for each of the 48 pixels around: whether it is darker (Zabih and Woodfill 1994)."""
     height, width = image.shape
+    # A row around at a time, continued by three pixels to either side: then the loop along it is of vectors.
+    row = np.empty(width + 6, image.dtype)
     for y in range(height):
-        for x in range(width):
-            centre, bits = image[y, x], np.uint64(0)
-            for dy in range(-3, 4):
-                row = min(max(y + dy, 0), height - 1)
-                for dx in range(-3, 4):
-                    if dx != 0 or dy != 0:
-                        column = min(max(x + dx, 0), width - 1)
-                        bits = (bits << np.uint64(1)) | np.uint64(image[row, column] < centre)
-            out[y, x] = bits
+        centre, bits = image[y], out[y]
+        bits[:] = 0
+        for dy in range(-3, 4):
+            above = image[min(max(y + dy, 0), height - 1)]
+            row[:3], row[3:-3], row[-3:] = above[0], above, above[-1]
+            for dx in range(7):
+                if dx != 3 or dy != 0:
+                    for x in range(width):
+                        bits[x] = (bits[x] << np.uint64(1)) | np.uint64(row[x + dx] < centre[x])
 
 
 @compiled(inline="always")
@@ -89,17 +92,25 @@ def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
 
 
 @compiled(inline="always")
-def _advance(before, least, cost, total, now, jump):
-    """One step of a path: its costs `now` (from index 1; a wall at both ends), added to `total`; the least."""
-    for i in range(len(cost)):
-        step = min(before[i], before[i + 2]) + SMALL
-        stay = min(before[i + 1], least + jump)
-        now[i + 1] = np.float32(cost[i]) + min(step, stay) - least
-    fewest = MOST
-    for i in range(len(cost)):
+def _least(bits, first, last):
+    """The least of costs from `first` to before `last`, none of which is negative: by their bits, as loops over floats
+    that keep a minimum do not become vector instructions."""
+    least = MOST_BITS
+    for i in range(first, last):
+        least = min(least, bits[i])
+    return least
+
+
+@compiled(inline="always")
+def _advance(before, least, cost, total, now, bits, jump):
+    """One step of a path: its costs `now` (from index 1; a wall at both ends; `bits` are the same), added to `total`;
+    the least. A loop for each array that is written: else they do not become vector instructions."""
+    labels, leap = len(cost), least + jump
+    for i in range(labels):
+        now[i + 1] = np.float32(cost[i]) + min(min(before[i], before[i + 2]) + SMALL, min(before[i + 1], leap)) - least
+    for i in range(labels):
         total[i] += now[i + 1]
-        fewest = min(fewest, now[i + 1])
-    return fewest
+    return np.int32(_least(bits, 1, labels + 1)).view(np.float32)
 
 
 @compiled(inline="always")
@@ -122,6 +133,7 @@ def _sweep_rows(cost, guide, total, way):
     """Paths along rows."""
     height, width, labels = cost.shape
     before, now = np.full((2, labels + 2), MOST, np.float32)
+    before_bits, bits = before.view(np.int32), now.view(np.int32)
     first, step = (0, 1) if way == 0 else (width - 1, -1)
     for y in range(height):
         before[1:-1] = 0
@@ -129,8 +141,8 @@ def _sweep_rows(cost, guide, total, way):
         for i in range(width):
             x = first + i * step
             jump = _jump(guide[y, x], guide[y, x - step]) if i > 0 else LARGE
-            least = _advance(before, least, cost[y, x], total[y, x], now, jump)
-            before, now = now, before
+            least = _advance(before, least, cost[y, x], total[y, x], now, bits, jump)
+            before, before_bits, now, bits = now, bits, before, before_bits
 
 
 @compiled(inline="always")
@@ -138,6 +150,7 @@ def _sweep(cost, guide, total, dx, way):
     """Paths from row to row, that move by `dx` columns on the way."""
     height, width, labels = cost.shape
     before, now = np.full((2, width, labels + 2), MOST, np.float32)
+    before_bits, bits = before.view(np.int32), now.view(np.int32)
     fewest, fewer = np.zeros((2, width), np.float32)
     first, step = (0, 1) if way == 0 else (height - 1, -1)
     for i in range(height):
@@ -150,8 +163,9 @@ def _sweep(cost, guide, total, dx, way):
                 fewer[x] = cost[y, x].min()
             else:
                 jump = _jump(guide[y, x], guide[y - step, origin])
-                fewer[x] = _advance(before[origin], fewest[origin], cost[y, x], total[y, x], now[x], jump)
-        before, now = now, before
+                there, fell = before[origin], fewest[origin]
+                fewer[x] = _advance(there, fell, cost[y, x], total[y, x], now[x], bits[x], jump)
+        before, before_bits, now, bits = now, bits, before, before_bits
         fewest, fewer = fewer, fewest
 
 
@@ -209,15 +223,12 @@ def _claims(total, end, along, length, rows, columns):
 @compiled(inline="always")
 def _two_best(total, last):
     """The best of the labels to `last`, and what the best does that is not beside it."""
-    best = 0
-    for label in range(1, last + 1):
-        if total[label] < total[best]:
-            best = label
-    second = MOST
-    for label in range(last + 1):
-        if abs(label - best) > 1:
-            second = min(second, total[label])
-    return best, second
+    bits, best = total.view(np.int32), 0
+    least = _least(bits, 0, last + 1)
+    while bits[best] > least:
+        best += 1
+    second = min(_least(bits, 0, best - 1), _least(bits, best + 2, last + 1))
+    return best, np.int32(second).view(np.float32)
 
 
 @compiled(inline="always")

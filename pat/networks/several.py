@@ -42,7 +42,7 @@ class MatchedBeta(NamedTuple):
     def of(cls, beta: Beta, found: SemiGlobalMatches) -> MatchedBeta:
         """Of a beta with a track, and its own matches."""
         pixels, disparity = beta.field.straight, found.disparity[0, 0]
-        segments = Segments(pixels.start[0], pixels.end[0], pixels.valid[0])
+        segments = Segments(pixels.start[0].double(), pixels.end[0].double(), pixels.valid[0])
         assert beta.track is not None
         track = beta.track(pixel_grid((disparity.shape[0], disparity.shape[1]), dtype=torch.float64))
         size = (beta.image.shape[-2], beta.image.shape[-1])

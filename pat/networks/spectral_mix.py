@@ -20,6 +20,7 @@ from arraygeom import Segments
 from .matching import matched
 from .semi_global import (
     MOST_DETAIL,
+    HalfSizeMatches,
     Normalisation,
     Normalisations,
     SemiGlobalMatches,
@@ -30,6 +31,7 @@ from .semi_global import (
     local_slope,
     match_weight,
     matched_at_half_size,
+    reduced,
 )
 
 OUTLIER = 0.06
@@ -118,12 +120,13 @@ def semi_global_matching_of_bands(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    blocks: Segments,
+    blocks: Segments | None,
     mix: SpectralMix,
     normalisations: Normalisations,
+    half: HalfSizeMatches | None = None,
 ) -> SemiGlobalMatches:
     """`semi_global_matching` of alpha and the mix of the bands; all are warped to alpha's view."""
-    disparity, facts = matched(alpha, mix.of(beta), segments, blocks, normalisations)
+    disparity, facts = matched(alpha, mix.of(beta), segments, blocks, normalisations, half)
     values, valid = at_matches(beta, segments, disparity)
     colours, unlike = _matched(values, alpha, mix, normalisations.whole)
     weight = match_weight(unlike, is_consistent(facts), valid)
@@ -138,12 +141,6 @@ def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Nor
     rises = mix.rises(values)
     slope = rises + local_slope(values - rises * brightness, brightness)
     return values + slope * beyond.clamp(-MOST_DETAIL, MOST_DETAIL) - alpha, brightness - soft
-
-
-def reduced(segments: Segments, factor: int) -> Segments:
-    """The same segments in pixels of a beta that is `factor` times smaller."""
-    start, end = ((x + 0.5) / factor - 0.5 for x in (segments.start, segments.end))
-    return Segments(start, end, segments.valid)
 
 
 def _fit(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

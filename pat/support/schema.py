@@ -11,10 +11,6 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-import yaml
-
-from arraygeom.safe_yaml import load_yaml, yaml_problem
-
 T = TypeVar("T")
 
 
@@ -43,6 +39,10 @@ def from_document(kind: type[T], document: Any, entry: str = "") -> T:
 
 def read_yaml(path: str | Path) -> Any:
     """The content of a YAML file. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    import yaml
+
+    from arraygeom.safe_yaml import load_yaml, yaml_problem
+
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")

@@ -24,7 +24,8 @@ from arraygeom.sampling import sample
 from .layers import Layers, draw_layers
 from .outlines import outlines
 from .photos import PhotoBank
-from .rigs import RigBatch, RigDistribution
+from .rig_distribution import RigDistribution
+from .rigs import RigBatch
 
 _FAINT = 1 / 256
 _MAX_OVERSAMPLING = 4

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -14,7 +13,7 @@ from arraygeom.camera import Camera
 from arraygeom.pixels import HW
 from arraygeom.pose import Pose, rotation_from_vector
 
-Range = tuple[float, float]
+from .rig_distribution import Range, RigDistribution
 
 
 @dataclass(frozen=True)
@@ -26,89 +25,62 @@ class RigBatch:
     far: Float[Tensor, " b"]
 
 
-@dataclass(frozen=True)
-class RigDistribution:
-    """A distribution of random rigs. Pairs are ranges; lengths are drawn evenly in their logarithm.
+def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator) -> RigBatch:
+    """What `RigDistribution.sample` draws."""
+    near = log_uniform(rigs.near, (batch,), generator)
+    far = near * log_uniform(rigs.depth_ratio, (batch,), generator)
+    alpha = _alpha(rigs, batch, hw, generator)
+    beta = _rectified_beta if rigs.mode == "rectified" else _general_beta
+    return RigBatch([alpha] + [beta(rigs, alpha, near, far, generator) for _ in range(rigs.betas)], near, far)
 
-    - `mode`: "rectified" (betas displaced along x alone, their images resized copies of alpha's geometry, so
-      that x_beta = s (x_alpha - disparity) up to the half pixel) or "general".
-    - `parallax`: displacement of the nearest depth against infinity, in alpha's pixels; sets the baseline.
-    - `near` in metres and `depth_ratio` = far / near.
-    - `frame`: width of the whole image as a multiple of alpha's, which is a patch of it; `focal`: focal length
-      as a multiple of that width.
-    - `resolutions`: beta's pixels a radian over alpha's and its size over alpha's; one is drawn for each camera
-      of a batch.
-    - `alpha`, rectified only: whether alpha is the left camera, the right, or either (one draw a rig).
-    - general only: `focal_ratio` (on top of the resolution), `rotation` in degrees about a random axis,
-      `toe_in` (how far betas rotate towards a point of the scene: 0 parallel, 1 wholly), `decentring` (how far
-      beta's patch misses alpha's, as a fraction of its size).
-    """
 
-    mode: Literal["rectified", "general"] = "rectified"
-    betas: int = 1
-    parallax: Range = (12.0, 120.0)
-    near: Range = (0.5, 8.0)
-    depth_ratio: Range = (1.5, 40.0)
-    frame: Range = (1.0, 4.0)
-    focal: Range = (0.7, 1.5)
-    resolutions: tuple[float, ...] = (1.0, 0.5, 0.25)
-    alpha: Literal["left", "right", "either"] = "either"
-    focal_ratio: Range = (0.5, 2.0)
-    rotation: float = 4.0
-    toe_in: Range = (0.0, 1.0)
-    decentring: float = 0.1
+def _alpha(rigs: RigDistribution, batch: int, hw: HW, g: Generator) -> Camera:
+    h, w = hw
+    width = w * log_uniform(rigs.frame, (batch,), g)
+    height = torch.clamp(0.7 * width, min=h)
+    corner = uniform((0, 1), (batch, 2), g) * (torch.stack([width, height], -1) - torch.tensor([w, h]))
+    K = torch.eye(3, dtype=torch.float64).repeat(batch, 1, 1)
+    K[:, 0, 0] = K[:, 1, 1] = width * log_uniform(rigs.focal, (batch,), g)
+    K[:, :2, 2] = torch.stack([width, height], -1) / 2 - corner - 0.5
+    world = Pose(torch.eye(3).double().expand(batch, 3, 3), torch.zeros(batch, 3).double())
+    return Camera(K=K, cam_from_world=world, hw=hw)
 
-    def sample(self, batch: int, hw: HW, generator: Generator) -> RigBatch:
-        """`batch` rigs, alpha's images being of height and width `hw`, alpha's frame being the world."""
-        near = log_uniform(self.near, (batch,), generator)
-        far = near * log_uniform(self.depth_ratio, (batch,), generator)
-        alpha = self._alpha(batch, hw, generator)
-        beta = self._rectified_beta if self.mode == "rectified" else self._general_beta
-        return RigBatch([alpha] + [beta(alpha, near, far, generator) for _ in range(self.betas)], near, far)
 
-    def _alpha(self, batch: int, hw: HW, g: Generator) -> Camera:
-        h, w = hw
-        width = w * log_uniform(self.frame, (batch,), g)
-        height = torch.clamp(0.7 * width, min=h)
-        corner = uniform((0, 1), (batch, 2), g) * (torch.stack([width, height], -1) - torch.tensor([w, h]))
-        K = torch.eye(3, dtype=torch.float64).repeat(batch, 1, 1)
-        K[:, 0, 0] = K[:, 1, 1] = width * log_uniform(self.focal, (batch,), g)
-        K[:, :2, 2] = torch.stack([width, height], -1) / 2 - corner - 0.5
-        world = Pose(torch.eye(3).double().expand(batch, 3, 3), torch.zeros(batch, 3).double())
-        return Camera(K=K, cam_from_world=world, hw=hw)
+def _baseline(rigs: RigDistribution, alpha: Camera, near: Tensor, g: Generator) -> Tensor:
+    return log_uniform(rigs.parallax, near.shape, g) * near / alpha.K[:, 0, 0]
 
-    def _baseline(self, alpha: Camera, near: Tensor, g: Generator) -> Tensor:
-        return log_uniform(self.parallax, near.shape, g) * near / alpha.K[:, 0, 0]
 
-    def _resolution(self, g: Generator) -> float:
-        return self.resolutions[int(torch.randint(len(self.resolutions), (), generator=g))]
+def _resolution(rigs: RigDistribution, g: Generator) -> float:
+    return rigs.resolutions[int(torch.randint(len(rigs.resolutions), (), generator=g))]
 
-    def _rectified_beta(self, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
-        drawn = torch.randint(2, near.shape, generator=g) * 2 - 1
-        side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[self.alpha]
-        t = torch.zeros_like(alpha.t)
-        t[:, 0] = -side * self._baseline(alpha, near, g)
-        return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, self._resolution(g)))
 
-    def _general_beta(self, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
-        """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the image."""
-        batch, resolution = len(near), self._resolution(g)
-        hw = scaled(alpha.hw, resolution)
-        centre = self._baseline(alpha, near, g)[:, None] * _direction(batch, g)
-        depth = 1 / torch.lerp(1 / far, 1 / near, uniform((0, 1), (batch,), g))
-        target = _middle_ray(alpha) * depth[:, None]
-        rotation = uniform(self.toe_in, (batch, 1), g) * _rotation_towards(target - centre, target)
-        wobble = math.radians(self.rotation) * torch.randn(batch, 3, generator=g, dtype=torch.float64) / 2
-        R = rotation_from_vector(wobble) @ rotation_from_vector(rotation)
-        t = -(R @ centre[..., None])[..., 0]
-        K = alpha.K.clone()
-        K[:, 0, 0] *= resolution * log_uniform(self.focal_ratio, (batch,), g)
-        K[:, 1, 1] = K[:, 0, 0]
-        seen = (R @ target[..., None])[..., 0] + t
-        size = torch.tensor([hw[1], hw[0]], dtype=torch.float64)
-        middle = (size - 1) / 2 + uniform((-self.decentring, self.decentring), (batch, 2), g) * size
-        K[:, :2, 2] = middle - K[:, :1, 0] * seen[:, :2] / seen[:, 2:]
-        return Camera(K=K, cam_from_world=Pose(R, t), hw=hw)
+def _rectified_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
+    drawn = torch.randint(2, near.shape, generator=g) * 2 - 1
+    side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[rigs.alpha]
+    t = torch.zeros_like(alpha.t)
+    t[:, 0] = -side * _baseline(rigs, alpha, near, g)
+    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, _resolution(rigs, g)))
+
+
+def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
+    """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the image."""
+    batch, resolution = len(near), _resolution(rigs, g)
+    hw = scaled(alpha.hw, resolution)
+    centre = _baseline(rigs, alpha, near, g)[:, None] * _direction(batch, g)
+    depth = 1 / torch.lerp(1 / far, 1 / near, uniform((0, 1), (batch,), g))
+    target = _middle_ray(alpha) * depth[:, None]
+    rotation = uniform(rigs.toe_in, (batch, 1), g) * _rotation_towards(target - centre, target)
+    wobble = math.radians(rigs.rotation) * torch.randn(batch, 3, generator=g, dtype=torch.float64) / 2
+    R = rotation_from_vector(wobble) @ rotation_from_vector(rotation)
+    t = -(R @ centre[..., None])[..., 0]
+    K = alpha.K.clone()
+    K[:, 0, 0] *= resolution * log_uniform(rigs.focal_ratio, (batch,), g)
+    K[:, 1, 1] = K[:, 0, 0]
+    seen = (R @ target[..., None])[..., 0] + t
+    size = torch.tensor([hw[1], hw[0]], dtype=torch.float64)
+    middle = (size - 1) / 2 + uniform((-rigs.decentring, rigs.decentring), (batch, 2), g) * size
+    K[:, :2, 2] = middle - K[:, :1, 0] * seen[:, :2] / seen[:, 2:]
+    return Camera(K=K, cam_from_world=Pose(R, t), hw=hw)
 
 
 def scaled(hw: HW, s: float) -> HW:

@@ -16,7 +16,8 @@ from pat.evaluation.ablation import sample_photographs
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.layers import Layers, draw_layers
 from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rigs import RigBatch, RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
+from pat.synthesis.rigs import RigBatch
 
 RenderedView = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
 

@@ -11,14 +11,9 @@ from typing import Any, Literal
 import tyro
 import yaml
 
-from arraygeom.atomic import write_text
-from arraygeom.safe_yaml import load_yaml
-from pat.networks.bandwise import BandwisePATConfig
-from pat.networks.guided import GuidedPATConfig
-from pat.networks.paper import PATConfig
-from pat.networks.weights import NETWORKS
+from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.support.schema import from_document, near, to_document
-from pat.synthesis.rigs import RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
@@ -168,6 +163,8 @@ def load_config(name: str | Path) -> TrainConfig:
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
+    from arraygeom.safe_yaml import load_yaml
+
     try:
         values = load_yaml(text) or {}
     except yaml.YAMLError as error:
@@ -189,13 +186,15 @@ def _config(values: Any) -> TrainConfig:
 def config_text(config: TrainConfig) -> str:
     """The recipe as YAML, every value written out; `parse_config` reads it back."""
     plain = to_document(config, defaults=True)
-    kind = next(name for name, (_, made_of) in NETWORKS.items() if type(config.network) is made_of)
+    kind = next(name for name, made_of in CONFIGS.items() if type(config.network) is made_of)
     values = plain | {"network": {"kind": kind} | plain["network"]}
     return yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=118)
 
 
 def save_config(config: TrainConfig, path: Path) -> None:
     """Write `config_text` atomically."""
+    from arraygeom.atomic import write_text
+
     write_text(path, config_text(config))
 
 
@@ -232,6 +231,6 @@ def _network_config(values: Any) -> NetworkConfig:
     if not isinstance(values, Mapping):
         raise ValueError(f"network: wanted entries such as kind: GuidedPAT, got {values!r}")
     kind = values.get("kind", "GuidedPAT")
-    if kind not in NETWORKS:
-        raise ValueError(f"network.kind: no network '{kind}'{near(kind, NETWORKS)}")
-    return from_document(NETWORKS[kind][1], {k: v for k, v in values.items() if k != "kind"}, "network")
+    if kind not in CONFIGS:
+        raise ValueError(f"network.kind: no network '{kind}'{near(kind, CONFIGS)}")
+    return from_document(CONFIGS[kind], {k: v for k, v in values.items() if k != "kind"}, "network")

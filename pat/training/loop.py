@@ -8,18 +8,17 @@ import time
 from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.parallel import DistributedDataParallel
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
-from torch.utils._pytree import tree_map
 
 from arraygeom import ReceptiveField
 from arraygeom.atomic import sweep
-from pat.networks.paper import AttentionEngine
-from pat.networks.weights import NETWORKS, Network, load_weights, save_weights
+from pat.networks.blocks import in_bfloat16
+from pat.networks.weights import NETWORKS, Network, convolutions, load_weights, save_weights
 from pat.support.locks import folder_lock
 from pat.support.tensor_files import write_tensors
 
@@ -219,23 +218,6 @@ def new_network(config: TrainConfig) -> Network:
             )
         network.load_state_dict(weights.state_dict())
     return network
-
-
-def convolutions(network: nn.Module) -> list[nn.Module]:
-    """The parts without attention, whose search segments are functions that torch.compile would break at."""
-    return [part for part in network.children() if not isinstance(part, (AttentionEngine, nn.ModuleList))]
-
-
-def in_bfloat16(part: nn.Module) -> None:
-    """Let a part compute in bfloat16 where autocast does, with float32 output."""
-    forward = part.forward
-
-    def cast(*images: Tensor) -> Any:
-        with torch.autocast(images[0].device.type, torch.bfloat16):
-            answer = forward(*images)
-        return tree_map(lambda t: t.float(), answer)
-
-    part.forward = cast
 
 
 def finite(objective: Objective, given: Sample) -> bool:

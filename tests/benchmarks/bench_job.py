@@ -1,10 +1,12 @@
-"""The main job as a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 5]`.
+"""The main job as a command: `python -m tests.benchmarks.bench_job [--quick] [--runs 5] [--against CHECKOUT]`.
 
 `pat fuse` as a process, from nothing to written files: the sample, 1280x800 with one and three betas, 4024x3036 under
 caps of memory; with kernels compiled before (warm), and with an empty cache (cold). Beside it, in turn in the same run,
-processes that read the same files and write an image by the classical baseline, and by OpenCV's SGBM, WLS and warp.
-The images are the sample array's, enlarged. Prints figures, and puts them into tests/benchmarks/RESULTS_job.md.
-`--quick`: 1280x800 with one beta only, cold once and warm once, nothing written.
+processes that read the same files and write an image by the classical baseline, and by OpenCV's SGBM, WLS and warp;
+and `pat fuse` of another checkout, such as that of an older commit. Then the first second (`pat --help`, `pat warm-up`
+with an empty cache, `pat demo` after it), and forty frames from folders. The images are the sample array's, enlarged.
+Prints figures, and puts them into tests/benchmarks/RESULTS_job.md; some 15 minutes on two cores, twice that with
+another checkout. `--quick`: 1280x800 with one beta only, cold once and warm once, nothing written.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).with_name("RESULTS_job.md")
 PARTS = (sys.executable, "-m", "tests.benchmarks.job_parts")
+PAT = (sys.executable, "-m", "pat")
+FRAMES = 40
 
 
 @dataclass(frozen=True)
@@ -58,12 +62,12 @@ CASES = (
 QUICK = CASES[1:2]
 
 
-def run(command: Sequence[str], cache: Path) -> Run:
-    """Run a command in the repository's root, numba's cache in a folder. Raises RuntimeError if it fails."""
+def run(command: Sequence[str], cache: Path, root: Path = ROOT) -> Run:
+    """Run a command in a checkout, numba's cache in a folder. Raises RuntimeError if it fails."""
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     begin = time.perf_counter()
     with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(command, cwd=ROOT, env=environment, stdout=out, stderr=errors, text=True)
+        process = subprocess.Popen(command, cwd=root, env=environment, stdout=out, stderr=errors, text=True)
         _, status, used = os.wait4(process.pid, 0)
         wall = time.perf_counter() - begin
         process.returncode = os.waitstatus_to_exitcode(status)
@@ -93,21 +97,73 @@ def scenes(cases: Sequence[Case], work: Path) -> Iterator[tuple[Case, Path]]:
         yield case, folder
 
 
-def measured(case: Case, folder: Path, work: Path, runs: int, *, others: bool) -> dict[str, list[Run]]:
-    """Runs by the way to fuse; the first of each is not counted, and fills the cache."""
+def measured(
+    case: Case, folder: Path, work: Path, runs: int, *, others: bool, old: Path | None
+) -> dict[str, list[Run]]:
+    """Runs by the way to fuse. The first of each fills the cache and is not counted, but of large frames, whose
+    kernels are there by then."""
     fuse = fuse_arguments(case, folder, work / "out")
-    ways = {"pat fuse": [sys.executable, "-m", "pat", "fuse", *fuse]}
+    ways = {"pat fuse": [*PAT, "fuse", *fuse]}
+    if old:
+        ways["old"] = ways["pat fuse"]
     if others:
         ways |= {way: [*PARTS, way, str(folder), str(work / way)] for way in ("classical", "opencv")}
     found: dict[str, list[Run]] = {way: [] for way in ways}
-    for i in range(runs + 1):
+    for i in range(runs + others):
         for way, command in ways.items():
-            one = run(command, work / "warm")
-            found[way] += [one] if i else []
+            try:
+                one = run(command, work / ("old" if way == "old" else "warm"), old if old and way == "old" else ROOT)
+            except RuntimeError as error:
+                if way != "old":
+                    raise
+                print(f"old: {str(error).splitlines()[-1]}", flush=True)
+                continue
+            found[way] += [one] if i >= others else []
     if others:
         found["cold"] = [run(ways["pat fuse"], Path(tempfile.mkdtemp(dir=work)))]
         found["stages"] = [run([*PARTS, "stages", *fuse], work / "warm") for _ in range(min(runs, 3))]
     return found
+
+
+def first_second(work: Path, runs: int, root: Path) -> list[list[str]]:
+    """Lines of the table of what is awaited before anything is fused, of a checkout."""
+    cache, demo = Path(tempfile.mkdtemp(dir=work)), [*PAT, "demo", "--out", str(work / "demo")]
+    parts = {
+        "pat --help": [run([*PAT, "--help"], cache, root) for _ in range(runs)],
+        "pat train --help": [run([*PAT, "train", "--help"], cache, root) for _ in range(runs)],
+        "pat demo, nothing compiled": [run(demo, Path(tempfile.mkdtemp(dir=work)), root)],
+        "pat warm-up, nothing compiled": [run([*PAT, "warm-up"], cache, root)],
+        "pat demo after pat warm-up": [run(demo, cache, root)],
+        "pat demo again": [run(demo, cache, root) for _ in range(runs)],
+    }
+    return [
+        [name, *(f"{median(getattr(r, kind) for r in found):.2f}" for kind in ("wall", "cores"))]
+        for name, found in parts.items()
+    ]
+
+
+def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) -> list[str]:
+    """A line of the table of `FRAMES` frames from folders by as many workers as there are cores; `one` is the seconds
+    of a process that fuses one of them."""
+    names = ["mono", *(f"colour{i + 1}" for i in range(case.betas))]
+    for name in names:
+        frames = work / f"frames{case.wh[0]}" / name
+        if not frames.exists():
+            frames.mkdir(parents=True)
+            for i in range(FRAMES):
+                (frames / f"{i:03d}.png").symlink_to(folder / f"{name}.png")
+    images = [word for name in names for word in ("--image", f"{name}={work / f'frames{case.wh[0]}' / name}")]
+    workers = len(os.sched_getaffinity(0))
+    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--workers", str(workers)]
+    found = run([*command, "--out", tempfile.mkdtemp(dir=work)], work / ("warm" if root == ROOT else "old"), root)
+    busy = found.cores / found.wall / workers
+    return [
+        case.name,
+        f"{60 * FRAMES / found.wall:.1f}",
+        f"{60 / one:.1f}",
+        f"{found.cores / FRAMES:.2f}",
+        f"{busy:.0%}",
+    ]
 
 
 def row(case: Case, found: dict[str, list[Run]]) -> list[str]:
@@ -117,6 +173,8 @@ def row(case: Case, found: dict[str, list[Run]]) -> list[str]:
     cells = [case.name, f"{median(walls):.1f} ({min(walls):.1f} to {max(walls):.1f})", f"{cores:.1f}"]
     cells += [f"{max(r.peak for r in ours) / 2**30:.2f} GiB"]
     cells += [f"{found['cold'][0].wall:.1f}" if "cold" in found else ""]
+    old = found.get("old")
+    cells += [f"{median(r.wall for r in old):.1f} ({median(r.cores for r in old):.1f})" if old else ""]
     for way in ("classical", "opencv"):
         other = found.get(way)
         if other is None:
@@ -142,7 +200,7 @@ STAGE_NAMES = (
     "rest",
 )
 COLUMNS = (
-    *("", "seconds", "core seconds", "peak memory", "cold, seconds"),
+    *("", "seconds", "core seconds", "peak memory", "cold, seconds", "other checkout, seconds (of a core)"),
     *("classical baseline, seconds (of a core): ratio", "OpenCV, seconds (of a core): ratio"),
 )
 
@@ -153,36 +211,58 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(cells)} |" for cells in (columns, rule, *rows)) + "\n"
 
 
+FIRST_COLUMNS = ("", "seconds", "core seconds")
+MANY_COLUMNS = ("", "frames a minute", "as processes of one frame", "core seconds a frame", "cores busy")
+
+
 def main() -> None:
     """Print the figures."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--against", type=Path, help="another checkout, measured in turn")
     given = parser.parse_args()
     cases, runs = (QUICK, 1) if given.quick else (CASES, given.runs)
+    old = given.against and given.against.resolve()
     load = os.getloadavg()[0]
-    rows, stages = [], []
-    with tempfile.TemporaryDirectory() as folder:
-        for case, images in scenes(cases, Path(folder)):
+    rows, stages, first, many = [], [], [], []
+    with tempfile.TemporaryDirectory() as name:
+        work = Path(name)
+        for case, images in scenes(cases, work):
             large = case.wh[0] > 2000
-            found = measured(case, images, Path(folder), 1 if large else runs, others=not large)
-            rows.append(row(case, found))
-            print(table(COLUMNS, rows[-1:]).splitlines()[-1], flush=True)
+            found = measured(case, images, work, 1 if large else runs, others=not large, old=old)
+            rows.append(shown(COLUMNS, row(case, found)))
             if "stages" in found:
-                stages.append(stages_row(case, found))
-                print(table(STAGE_NAMES, stages[-1:]).splitlines()[-1], flush=True)
+                stages.append(shown(("", *STAGE_NAMES), stages_row(case, found)))
+            if not large and not given.quick and case.betas == 1:
+                one = median(r.wall for r in found["pat fuse"])
+                many += [shown(MANY_COLUMNS, many_frames(case, images, work, one, ROOT))]
+        for root in () if given.quick else (ROOT, old) if old else (ROOT,):
+            note = "" if root == ROOT else ", other checkout"
+            lines = first_second(work, min(runs, 3), root)
+            first += [shown(FIRST_COLUMNS, [f"`{cells[0]}`{note}", *cells[1:]]) for cells in lines]
     threads = os.environ.get("OMP_NUM_THREADS", "all")
     text = (
-        f"# The main job, measured\n\n`pat fuse` as a process, imports and written files included. "
+        f"`pat fuse` as a process, imports and written files included. "
         f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, {threads} threads; "
         f"load {load:.1f} before, {os.getloadavg()[0]:.1f} after; "
-        f" medians of {runs} runs (4024x3036: one), in turn with the others. Written by `make bench-job`.\n\n"
+        f"medians of {runs} runs (4024x3036: one), in turn with the others. Written by `make bench-job`.\n\n"
         f"{table(COLUMNS, rows)}\nWhere the time goes: share of the seconds, and seconds of a core. Each part without "
         f"those within it.\n\n{table(('', *STAGE_NAMES), stages)}"
     )
+    if first:
+        text += f"\nThe first second:\n\n{table(FIRST_COLUMNS, first)}"
+    if many:
+        text += f"\n{FRAMES} frames from folders, a worker a core:\n\n{table(MANY_COLUMNS, many)}"
     print(text)
     if not given.quick:
         RESULTS.write_text(text, encoding="utf-8")
+
+
+def shown(columns: Sequence[str], cells: list[str]) -> list[str]:
+    """A line of a table, once it has been printed."""
+    print(table(columns, [cells]).splitlines()[-1], flush=True)
+    return cells
 
 
 if __name__ == "__main__":

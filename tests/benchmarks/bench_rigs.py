@@ -24,7 +24,7 @@ from pat.evaluation.tables import markdown_header, markdown_row
 from pat.fusion.fuse import fuse
 from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
-from pat.synthesis.rigs import RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import load_config
 
 SINGLE = load_config("mono-colour-single-rig").rectified_rigs

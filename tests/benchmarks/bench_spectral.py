@@ -27,7 +27,7 @@ from pat.networks.protocol import FusionNetwork
 from pat.networks.weights import load_weights
 from pat.sensors import Clip, Noise, Quantise, record
 from pat.synthesis.layered import LayeredScenes
-from pat.synthesis.rigs import RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import TrainConfig
 from pat.training.samples import photographs
 from pat.training.spectra import Spectra

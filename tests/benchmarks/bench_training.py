@@ -29,9 +29,10 @@ from arraygeom.fields import FIELDS
 from pat.attention import attend
 from pat.attention.reference import Attended
 from pat.evaluation.ablation import sample_photographs
-from pat.networks.weights import Network
+from pat.networks.blocks import in_bfloat16
+from pat.networks.weights import Network, convolutions
 from pat.training.config import TrainConfig, load_config
-from pat.training.loop import convolutions, in_bfloat16, new_network
+from pat.training.loop import new_network
 from pat.training.losses import Objective
 from pat.training.samples import Sample, SampleSource
 

@@ -19,7 +19,8 @@ from arraygeom.io import read_rig, write_rig
 from calib.boards.covariance import RigCovariance
 from pat.cli.main import main
 from pat.media.images import read_image, write_image
-from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.configs import GuidedPATConfig
+from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
 from pat.synthesis.photos import read_photographs
 from pat.training.checkpoints import collect, newest_checkpoint, restore, write_checkpoint

@@ -23,7 +23,8 @@ from pat.evaluation.baseline import classical
 from pat.evaluation.metrics import score
 from pat.media.colour import linear_from_srgb
 from pat.media.images import read_image
-from pat.networks.paper import PAT, PATConfig
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
 from pat.networks.weights import load_weights
 from pat.synthesis.rendered import RenderedFrame, save_frame
 

@@ -20,7 +20,8 @@ from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.fusion.checks import LowConfidenceWarning
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
-from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.configs import GuidedPATConfig
+from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
 from pat.sensors import NoiseLevel
 from pat.support.jobs import JobError

@@ -15,8 +15,9 @@ from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
 from pat.media.images import write_image
-from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
-from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.bandwise import BandwisePAT
+from pat.networks.configs import BandwisePATConfig, GuidedPATConfig
+from pat.networks.guided import GuidedPAT
 from pat.networks.pieces import tiles_of
 
 HW = (64, 96)

@@ -34,9 +34,10 @@ from pat.fusion.views import Views
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT
-from pat.networks.bandwise import BandwisePAT, BandwisePATConfig
-from pat.networks.guided import GuidedPAT, GuidedPATConfig
-from pat.networks.paper import PAT, PATConfig
+from pat.networks.bandwise import BandwisePAT
+from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
+from pat.networks.guided import GuidedPAT
+from pat.networks.paper import PAT
 from pat.networks.pieces import Tile, matching_pieces, tiles_of
 from pat.networks.protocol import Inputs
 from pat.networks.weights import load_weights

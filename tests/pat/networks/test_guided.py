@@ -6,7 +6,8 @@ import torch
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
 from pat.media.colour import luminance
-from pat.networks.guided import GuidedPAT, GuidedPATConfig, window_around
+from pat.networks.configs import GuidedPATConfig
+from pat.networks.guided import GuidedPAT, window_around
 from pat.networks.protocol import Inputs
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8))

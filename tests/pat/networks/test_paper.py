@@ -6,7 +6,8 @@ import torch
 from arraygeom import Pair, Rectified, Rig, View, sampling_locations
 from arraygeom.fields.grid import FieldOnGrid
 from pat.attention import attend
-from pat.networks.paper import PAT, PATConfig
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
 from pat.networks.protocol import Inputs
 
 

@@ -8,8 +8,9 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from pat.networks.guided import GuidedPAT, GuidedPATConfig
-from pat.networks.paper import PAT, PATConfig
+from pat.networks.configs import GuidedPATConfig, PATConfig
+from pat.networks.guided import GuidedPAT
+from pat.networks.paper import PAT
 from pat.networks.weights import FORMAT, load_weights, save_weights, shipped
 
 NETWORKS = [PAT(PATConfig(betas=2, dim=8)), GuidedPAT(GuidedPATConfig(widths=(8, 8, 8, 8)))]

@@ -14,7 +14,8 @@ from arraygeom.sampling import sample
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
-from pat.synthesis.rigs import RigBatch, RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
+from pat.synthesis.rigs import RigBatch
 
 HW = (48, 128)
 

@@ -12,7 +12,8 @@ from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_distance, in
 from arraygeom import rotation_from_vector as rotation
 from pat.cli.main import main
 from pat.media.images import read_image, write_image
-from pat.networks.guided import GuidedPAT, GuidedPATConfig
+from pat.networks.configs import GuidedPATConfig
+from pat.networks.guided import GuidedPAT
 from pat.networks.weights import save_weights
 from pat.systems.showcase import SLOW, SYNTIM, published_matrices, showcase
 

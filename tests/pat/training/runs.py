@@ -7,7 +7,7 @@ import torch
 from torch import Generator
 
 from pat.media.images import write_image
-from pat.networks.guided import GuidedPATConfig
+from pat.networks.configs import GuidedPATConfig
 from pat.training.train import TrainConfig
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8), taps=5)

@@ -6,8 +6,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from pat.networks.guided import GuidedPATConfig
-from pat.networks.paper import PATConfig
+from pat.networks.configs import GuidedPATConfig, PATConfig
 from pat.training.config import (
     TrainConfig,
     command_line,

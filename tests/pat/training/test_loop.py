@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors import safe_open
 
-from pat.networks.paper import PATConfig
+from pat.networks.configs import PATConfig
 from pat.networks.weights import load_weights, save_weights
 from pat.support.locks import folder_lock
 from pat.training import loop

@@ -21,13 +21,13 @@ from pat.data.windows import RenderedView, read_view, undistorted, window
 from pat.farm.backends import LayeredSettings
 from pat.media.colour import luminance
 from pat.media.images import write_image
-from pat.networks.paper import PATConfig
+from pat.networks.configs import PATConfig
 from pat.synthesis.check import CheckLimits
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
-from pat.synthesis.rigs import RigDistribution
+from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import RecordingConfig, TrainConfig, parse_config
 from pat.training.lenses import lens_over, one_camera, through_lenses
 from pat.training.loop import new_network

@@ -7,7 +7,7 @@ from torch import Generator
 
 from arraygeom import sample
 from pat.media.colour import luminance
-from pat.networks.bandwise import BandwisePATConfig
+from pat.networks.configs import BandwisePATConfig
 from pat.training.loop import new_network
 from pat.training.losses import Objective
 from pat.training.samples import scenes

@@ -9,7 +9,7 @@ from torch import Generator
 from arraygeom import Epipolar, Segments, sample
 from pat.media.colour import luminance
 from pat.media.images import write_image
-from pat.networks.guided import GuidedPATConfig
+from pat.networks.configs import GuidedPATConfig
 from pat.networks.weights import load_weights
 from pat.training.train import TrainConfig, degraded, image_loss, scenes, train
 
@@ -89,7 +89,7 @@ def test_a_short_run_learns_and_leaves_weights(config):
 
 def test_degradation_keeps_the_ground_truth_in_colour(config):
     from pat.synthesis.layered import LayeredScenes
-    from pat.synthesis.rigs import RigDistribution
+    from pat.synthesis.rig_distribution import RigDistribution
     from pat.training.train import photographs
 
     scene = LayeredScenes(photographs(config)[0], RigDistribution(), hw=(32, 48)).sample(2, Generator().manual_seed(1))

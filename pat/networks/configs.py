@@ -1,0 +1,63 @@
+"""The networks' configurations. Torch is not imported: the command line reads them for its options."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class PATConfig:
+    """The paper's network by default.
+
+    `betas` is their number, `in_channels` that of each image (an image with fewer is repeated), `dim` the
+    width D, `scale` the enlargement s by pixel shuffle. `residual` adds the network's answer to alpha instead
+    of replacing it, so that alpha's own detail cannot be lost. `interpolation` is how beta is sampled.
+    """
+
+    betas: int = 1
+    in_channels: int = 3
+    out_channels: int = 3
+    dim: int = 64
+    scale: int = 1
+    residual: bool = False
+    interpolation: Literal["nearest", "bilinear"] = "nearest"
+
+
+@dataclass(frozen=True)
+class GuidedPATConfig:
+    """Widths of the features at 1/2, 1/4, 1/8 and 1/16 of the size, of the keys, and of the judgement.
+
+    Attention reaches `window` pixels to either side of the match, with `taps` samples. Colour is propagated
+    within alpha in one round for each of `propagation_steps`, the spacing of 7 x 7 pixels at 1/4. Without `head_dim`
+    (0) nothing is added to what was matched and propagated. `keep_luminance` lets the network add colour to alpha, and
+    never luminance.
+    """
+
+    widths: tuple[int, int, int, int] = (16, 32, 40, 48)
+    fine_dim: int = 8
+    window: float = 3.0
+    taps: int = 13
+    judge_dim: int = 16
+    confidence_dim: int = 24
+    propagation_dim: int = 8
+    propagation_steps: tuple[int, ...] = (1, 3, 8)
+    head_dim: int = 32
+    bands: int = 3
+    keep_luminance: bool = True
+
+
+@dataclass(frozen=True)
+class BandwisePATConfig(GuidedPATConfig):
+    """GuidedPAT's, for one band, which need not have alpha's luminance."""
+
+    bands: int = 1
+    keep_luminance: bool = False
+
+    def __post_init__(self) -> None:
+        if self.bands != 1 or self.keep_luminance:
+            raise ValueError("BandwisePAT fuses one band at a time: leave bands at 1 and keep_luminance at false")
+
+
+CONFIGS = {"PAT": PATConfig, "GuidedPAT": GuidedPATConfig, "BandwisePAT": BandwisePATConfig}
+"""By the name of the network."""
