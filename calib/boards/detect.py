@@ -63,15 +63,18 @@ def explain(images: Iterable[Grey], board: Board) -> str:
     return reasons.most_common(1)[0][0] if reasons else "there are no images"
 
 
-def other_size(images: Iterable[Grey], board: Board) -> str | None:
-    """The size of the chessboard in the images, as "9x6", if most show one of another size than `board`."""
+def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) -> str | None:
+    """The size of the chessboard in the images, as "9x6", if most show one of another size than `board`.
+
+    Only a larger one counts if `board` was found in them: patches of it pass for smaller ones.
+    """
     if not isinstance(board, Chessboard):
         return None
     sizes = Counter(size for grey in images if (size := _grid_size(grey)) is not None)
     if not sizes:
         return None
     size, votes = sizes.most_common(1)[0]
-    same = set(size) == {board.columns, board.rows}
+    same = set(size) == {board.columns, board.rows} or (larger and size[0] * size[1] <= len(board.points))
     return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
 
 

@@ -159,7 +159,7 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
             (
                 f"{name} {camera.hw[1]}x{camera.hw[0]}",
                 f"{len(views.seen)}, {len(r)}",
-                f"{rms:.3f} ({calibration.single[name]:.3f})",
+                f"{rms:.3f}" + (f" ({calibration.single[name]:.3f})" if name in calibration.single else ""),
                 f"{calibration.fit.sigma[name]:.3f}",
                 _with_deviations(calibration, name, camera, "focal"),
                 _with_deviations(calibration, name, camera, "centre"),
@@ -175,11 +175,10 @@ def pair_table(calibration: Calibration) -> str:
     """One row per pair: baseline, relative rotation and epipolar errors."""
     covariance = rig_covariance(calibration)
     cameras = calibration.fit.problem.cameras
-    first = next(iter(cameras))
     rows = []
     for (a, b), errors in calibration.epipolar.items():
         baseline = float((cameras[a].centre - cameras[b].centre).norm())
-        deviation = baseline_deviation(cameras, b, covariance) if covariance and a == first else None
+        deviation = baseline_deviation(cameras, a, b, covariance) if covariance else None
         held = calibration.held_out.get((a, b))
         rows.append(
             (

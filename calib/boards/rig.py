@@ -13,25 +13,15 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Pose, Rig
 
-from .bundle import (
-    BoardPoses,
-    BundleProblem,
-    BundleResult,
-    Free,
-    IntrinsicsPrior,
-    Observations,
-    adjust,
-    intrinsic_values,
-    jackknife,
-    loss,
-    noise,
-    parameter_names,
-)
+from .bundle import BoardPoses, BundleProblem, BundleResult, Free, Observations, adjust, loss, noise
+from .camera_parameters import CameraPrior, intrinsic_values, parameter_names
 from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts, without_outliers
+from .jackknife import jackknife
 from .observability import gate, typical_prior
 from .photos import FrameKey
 from .poses import CalibratedViews, initial_rig
 from .shape import LEAST_GAIN, BoardShape, described, is_significant
+from .start import StartDeviations, rig_near_start, start_cameras, start_notes, start_prior
 from .target import Board
 from .validation import epipolar_errors, held_out_errors, misfit_notes
 
@@ -82,14 +72,22 @@ class Calibration:
 
 
 def calibrate(
-    views: Mapping[str, BoardViews], board: Board, *, lens: Lens | Mapping[str, Lens] = "brown-conrady"
+    views: Mapping[str, BoardViews],
+    board: Board,
+    *,
+    lens: Lens | Mapping[str, Lens] = "brown-conrady",
+    start: Rig | None = None,
+    deviations: StartDeviations | None = None,
 ) -> Calibration:
     """Calibrate a rig from detected board points. Its world is the first camera.
 
     `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, if a camera has too few
     images or only parallel boards, if cameras are not connected, or if their frames contradict each other.
+    With `start`, a rig known to within `deviations`, one image of each camera is enough, and the world is the start's.
     """
     models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
+    if start is not None:
+        return _from_start(start_cameras(start, views, models), views, board, deviations or StartDeviations())
     single = {
         name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()
     }
@@ -114,6 +112,37 @@ def calibrate(
             *together.notes,
             *together.shape_notes(board),
             *misfit_notes(together.fit, tuple(initial.world_from_board)),
+            *_noted(factor),
+        ),
+        raised=factor,
+    )
+
+
+def _from_start(
+    cameras: Mapping[str, Camera], views: Mapping[str, BoardViews], board: Board, deviations: StartDeviations
+) -> Calibration:
+    """Calibrate cameras with their start as a prior, all at once."""
+    initial = rig_near_start(cameras, views, board)
+    priors = {name: start_prior(camera, deviations) for name, camera in cameras.items()}
+    placed = {name: c.replace(cam_from_world=initial.cam_from_world[name]) for name, c in cameras.items()}
+    problem = replace(_problem(placed, initial.world_from_board, initial.views, board), priors=priors)
+    fit, free, notes = _fitted(problem, _flat(board, initial.world_from_board, initial.views))
+    together, factor = _scaled_covariance(_JointFit(fit, free, notes))
+    rig, frames = Rig(fit.problem.cameras), tuple(initial.world_from_board)
+    return Calibration(
+        rig=rig,
+        board=board,
+        fit=together.fit,
+        frames=frames,
+        views=initial.views,
+        single={},
+        epipolar=epipolar_errors(rig, initial.views),
+        notes=(
+            *start_notes(together.fit, deviations),
+            *(f"{name}: left out {key}: its board contradicts the start" for name, key in initial.left_out),
+            *notes,
+            *together.shape_notes(board),
+            *misfit_notes(together.fit, frames),
             *_noted(factor),
         ),
         raised=factor,
@@ -238,14 +267,14 @@ def _joint_fit(problem: BundleProblem, flat: BoardShape, single: Mapping[str, Si
     return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"])
 
 
-def _as_prior(name: str, single: SingleCalibration) -> IntrinsicsPrior:
+def _as_prior(name: str, single: SingleCalibration) -> CameraPrior:
     """The single calibration of a camera as a prior of its intrinsics; none for parameters that were fixed."""
     fit, entries = single.fit, parameter_names(single.camera)
     free = [entries.index(entry.removeprefix(f"{name}.")) for entry in fit.names]
     information = np.zeros((len(entries), len(entries)))
     if fit.covariance is not None:
         information[np.ix_(free, free)] = np.linalg.inv(fit.covariance)
-    return IntrinsicsPrior(intrinsic_values(single.camera), information)
+    return CameraPrior(intrinsic_values(single.camera), information)
 
 
 def _count_points(views: BoardViews) -> int:
@@ -288,7 +317,10 @@ def _fitted(
     Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that are clearly
     neither `flat` nor printed true get a shape.
     """
-    full = {name: _free(camera, index > 0) for index, (name, camera) in enumerate(problem.cameras.items())}
+    full = {
+        name: _free(camera, index > 0 or problem.priors[name].pose is not None)
+        for index, (name, camera) in enumerate(problem.cameras.items())
+    }
     problem, free, notes = gate(problem, full, noise(problem, 0), final=False)
     fit = _with_shape(adjust(problem, free), free, flat)
     for _ in range(ROUNDS):

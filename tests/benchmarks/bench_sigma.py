@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from arraygeom.atomic import write_text
-from calib.boards.bundle import BundleProblem, BundleResult, intrinsic_values, readjusted
+from calib.boards.bundle import BundleProblem, BundleResult, readjusted
+from calib.boards.camera_parameters import intrinsic_values
 from calib.boards.collect import collect_folder
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board

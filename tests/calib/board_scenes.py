@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards.bundle import BoardPoses, BundleProblem, Observations, parameter_names
+from calib.boards.bundle import BoardPoses, BundleProblem, Observations
+from calib.boards.camera_parameters import parameter_names
 from calib.boards.detect import Detection
 from calib.boards.intrinsics import BoardViews
 from calib.boards.target import Board, parse_board

@@ -12,7 +12,7 @@ from calib.boards.adequacy import (
     proposed_views,
     uncertainty,
 )
-from calib.boards.bundle import camera_jacobian, parameter_names
+from calib.boards.camera_parameters import camera_jacobian, parameter_names
 from calib.boards.lens_comparison import LensComparison, compare_lenses
 from calib.boards.rig import calibrate
 from calib.boards.simulation import simulate_photos

@@ -9,18 +9,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import (
-    BoardPoses,
-    BundleProblem,
-    IntrinsicsPrior,
-    Observations,
-    _changed,
-    adjust,
-    camera_jacobian,
-    intrinsic_values,
-    normal_equations,
-    parameter_names,
-)
+from calib.boards.bundle import BoardPoses, BundleProblem, Observations, _changed, adjust, normal_equations
+from calib.boards.camera_parameters import CameraPrior, camera_jacobian, intrinsic_values, parameter_names
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
@@ -138,7 +128,7 @@ def test_a_prior_has_its_stated_weight(small):
     mean[6] += 2 * deviation
     information = np.zeros((len(mean), len(mean)))
     information[6, 6] = deviation**-2
-    held = adjust(replace(alone.problem, priors={"mono": IntrinsicsPrior(mean, information)}), free)
+    held = adjust(replace(alone.problem, priors={"mono": CameraPrior(mean, information)}), free)
     moved = float(held.problem.cameras["mono"].K[0, 0] - alone.problem.cameras["mono"].K[0, 0])
     assert moved == pytest.approx(deviation, rel=0.05)
     assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import jackknife
 from calib.boards.detect import Detection, detect
 from calib.boards.intrinsics import BoardViews
+from calib.boards.jackknife import jackknife
 from calib.boards.rig import calibrate
 from calib.boards.shape import BoardShape
 from calib.boards.simulation import photograph
