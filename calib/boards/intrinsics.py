@@ -90,15 +90,23 @@ def without_outliers(
     """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
 
     `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
-    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points left, keep all of theirs.
+    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or a single row left, keep all of theirs.
     """
     off = {key: _distances(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
     sigma = sigma or max(MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), 0.02)
     kept = {key: _only(views.seen[key], r < OUTLIER * sigma) for key, r in off.items()}
     return BoardViews(
         views.hw,
-        {key: kept[key] if key in kept and len(kept[key].ids) >= FEWEST_POINTS else d for key, d in views.seen.items()},
+        {key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d for key, d in views.seen.items()},
     )
+
+
+def _spans(points: Points) -> bool:
+    """Whether there are enough points, and not all on a line."""
+    if len(points) < FEWEST_POINTS:
+        return False
+    _, second, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(second > 1e-6)
 
 
 def _only(found: Detection, mask: np.ndarray) -> Detection:

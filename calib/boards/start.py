@@ -77,11 +77,11 @@ def start_cameras(start: Rig, views: Mapping[str, BoardViews], lens: Mapping[str
 def rig_near_start(cameras: Mapping[str, Camera], views: Mapping[str, BoardViews], board: Board) -> InitialRig:
     """Cameras at the start's positions, rotated so that they agree on the boards, and the boards in the start's world.
 
-    The camera with most images keeps its orientation. Raises ValueError if a camera has no image.
+    The camera with most images keeps its orientation. Raises ValueError if a camera shares no moment with another.
     """
     for name, v in views.items():
-        if not v.seen:
-            raise ValueError(f"{name}: the board is found in none of its images")
+        if len(views) > 1 and not any(v.seen.keys() & other.seen.keys() for n, other in views.items() if n != name):
+            raise ValueError(f"{name}: never sees the board in the same frame as another camera: check the numbers")
     seen = [
         CalibratedViews(name, c, views[name], {key: board_pose(c, d, board) for key, d in views[name].seen.items()})
         for name, c in cameras.items()
