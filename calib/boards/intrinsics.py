@@ -90,7 +90,7 @@ def without_outliers(
     """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
 
     `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
-    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or a single row left, keep all of theirs.
+    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left, keep all.
     """
     off = {key: _distances(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
     sigma = sigma or max(MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), 0.02)

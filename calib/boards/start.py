@@ -39,6 +39,13 @@ class StartDeviations:
             if not 0 < value < float("inf"):
                 raise ValueError(f"the start's deviation {name}={value:g} is not a positive number")
 
+    @classmethod
+    def of(cls, given: Mapping[str, float]) -> StartDeviations:
+        """By name. Raises ValueError for another name."""
+        if unknown := given.keys() - vars(cls()).keys():
+            raise ValueError(f"a start has no deviation '{min(unknown)}': it has {', '.join(vars(cls()))}")
+        return cls(**given)
+
 
 def start_prior(camera: Camera, deviations: StartDeviations) -> CameraPrior:
     """The prior of a camera by its start, and of what that does not state by ordinary cameras."""
