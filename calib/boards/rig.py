@@ -17,6 +17,7 @@ from .bundle import BoardPoses, BundleProblem, BundleResult, Free, Observations,
 from .camera_parameters import CameraPrior, intrinsic_values, parameter_names
 from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts, without_outliers
 from .jackknife import jackknife
+from .known_points import KnownPoints
 from .observability import gate, typical_prior
 from .photos import FrameKey
 from .poses import CalibratedViews, initial_rig
@@ -192,7 +193,7 @@ def calibrate_single(
         if _count_points(used) == _count_points(before):
             break
     found = SingleCalibration(fit, before, tuple(poses), tuple(notes))
-    check_tilts(name, found.cam_from_board)
+    check_tilts(name, found.cam_from_board, board)
     return found
 
 
@@ -245,7 +246,7 @@ class _JointFit(NamedTuple):
         return described(problem.shape, deviations, board.extents)
 
 
-def _joint_fit(problem: BundleProblem, flat: BoardShape, single: Mapping[str, SingleCalibration]) -> _JointFit:
+def _joint_fit(problem: BundleProblem, flat: BoardShape | None, single: Mapping[str, SingleCalibration]) -> _JointFit:
     """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
 
     Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
@@ -298,8 +299,10 @@ def _problem(
     )
 
 
-def _flat(board: Board, boards: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardShape:
-    """Flat boards, in the order of the blocks."""
+def _flat(board: Board, boards: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardShape | None:
+    """Flat boards, in the order of the blocks; None for points whose positions are known."""
+    if isinstance(board, KnownPoints):
+        return None
     first = {key: d.ids[0] for v in views.values() for key, d in v.seen.items()}
     return BoardShape.flat(board.points, board.part, board.part[[first[key] for key in boards]])
 
@@ -310,7 +313,7 @@ def _observations(views: BoardViews, index: Mapping[FrameKey, int], board: Board
 
 
 def _fitted(
-    problem: BundleProblem, flat: BoardShape, *, final: bool = True
+    problem: BundleProblem, flat: BoardShape | None, *, final: bool = True
 ) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
     """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
@@ -336,9 +339,9 @@ def _fitted(
         notes, fit = notes + dropped, adjust(problem, free)
 
 
-def _with_shape(fit: BundleResult, free: Free, flat: BoardShape) -> BundleResult:
+def _with_shape(fit: BundleResult, free: Free, flat: BoardShape | None) -> BundleResult:
     """The fit with the boards' shapes as unknowns if they matter, by the points and by how frames agree on them."""
-    if fit.problem.shape is not None:
+    if flat is None or fit.problem.shape is not None:
         return fit
     trial = replace(fit.problem, shape=flat)
     try:
