@@ -148,7 +148,7 @@ def _far(fit: BundleResult) -> list[str]:
     notes = []
     for name, camera in fit.problem.cameras.items():
         prior = fit.problem.priors[name]
-        ratio = prior.offset(camera) * np.sqrt(prior.information.diagonal())
+        ratio = prior.offset(camera) / np.sqrt(np.linalg.inv(prior.information).diagonal())
         kinds = {
             "orientation": ratio[:3],
             "position": ratio[3:6],
