@@ -24,18 +24,9 @@ from arraygeom import Link, Rig, View
 from arraygeom.atomic import write_text
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
+from calib.images.held_out import line_distances, line_statistics, split
 from calib.images.matches import Matches, fit_fundamental, line_distance, match_cameras
-from calib.images.refinement import (
-    FREE,
-    LineStatistics,
-    RefinementProblem,
-    line_distances,
-    line_statistics,
-    polish,
-    refine,
-    refine_matches,
-    split,
-)
+from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
 from pat.evaluation.ablation import AblationCase, rendered_cases

@@ -28,8 +28,8 @@ from calib.boards.report import rig_covariance
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.start import StartDeviations
 from calib.boards.target import parse_board
+from calib.images.held_out import line_distances
 from calib.images.matches import Matches, match_cameras
-from calib.images.refinement import line_distances
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image
 
