@@ -20,11 +20,11 @@ import torch
 from tqdm import tqdm
 
 from arraygeom import Rig
-from arraygeom.atomic import write_text
 from calib.boards.detect import Detection
 from calib.boards.intrinsics import BoardViews
 from calib.boards.rig import Calibration, calibrate
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.printed import print_tables
 from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
 
 NOISE = 0.1
@@ -95,12 +95,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
-    lines = []
-    for row in rows(options.draws, options.shares):
-        print(row, flush=True)
-        lines.append(row)
-    if options.out:
-        write_text(options.out, "# Board calibration with wrong corners\n\n" + "\n".join(lines).rstrip() + "\n")
+    print_tables("Board calibration with wrong corners", [rows(options.draws, options.shares)], options.out)
 
 
 if __name__ == "__main__":

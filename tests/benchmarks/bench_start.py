@@ -21,7 +21,6 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Pose, Rig, intrinsics
-from arraygeom.atomic import write_text
 from calib.boards.collect import collect_folder
 from calib.boards.covariance import baseline_deviation
 from calib.boards.report import rig_covariance
@@ -32,6 +31,7 @@ from calib.images.held_out import line_distances
 from calib.images.matches import Matches, match_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image
+from tests.benchmarks.printed import print_tables
 
 BOARD = "chessboard:11x8:30mm"
 ROWS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
@@ -102,12 +102,9 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
-    lines = []
-    for row in rows(options.data / "nine_band_array"):
-        print(row, flush=True)
-        lines.append(row)
-    if options.out:
-        write_text(options.out, "# An array from one image of a board by each camera\n\n" + "\n".join(lines) + "\n")
+    print_tables(
+        "An array from one image of a board by each camera", [rows(options.data / "nine_band_array")], options.out
+    )
 
 
 if __name__ == "__main__":

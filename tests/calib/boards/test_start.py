@@ -14,7 +14,11 @@ from calib.boards.rig import calibrate
 from calib.boards.simulation import photograph
 from calib.boards.start import StartDeviations, start_prior
 from calib.boards.target import parse_board
+from calib.images.held_out import line_distances
+from calib.images.matches import match_cameras
 from pat.cli.main import main
+from pat.media.images import read_image
+from tests.benchmarks.bench_start import GRID, calibrated, neighbours
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see
 
 STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
@@ -159,3 +163,16 @@ def test_mistakes_with_a_start(options, message, photos, capsys):
         )
     assert message in capsys.readouterr().err
     assert not (photos / "rig.yaml").exists()
+
+
+@pytest.mark.slow
+def test_the_nine_band_array(shared_data):
+    """Baselines of 40 mm, and a scene whose points lie near their lines though no image of it was used."""
+    found = calibrated(shared_data / "nine_band_array", StartDeviations())
+    off = [float((found.rig[b].centre - found.rig[a].centre).norm()) - GRID for a, b in neighbours()]
+    assert np.abs(off).max() < 5e-4
+    assert found.rms < 0.11
+    images = {
+        name: read_image(shared_data / "nine_band_array" / "scene" / f"{name}.png") for name in ("Cam-3", "Cam-6")
+    }
+    assert float(line_distances(found.rig, match_cameras(images)).abs().median()) < 0.25
