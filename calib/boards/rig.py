@@ -20,7 +20,7 @@ from .jackknife import jackknife
 from .known_points import KnownPoints
 from .observability import gate, typical_prior
 from .photos import FrameKey
-from .poses import CalibratedViews, initial_rig
+from .poses import CalibratedViews, InitialRig, initial_rig
 from .shape import LEAST_GAIN, BoardShape, described, is_significant
 from .start import StartDeviations, rig_near_start, start_cameras, start_notes, start_prior
 from .target import Board
@@ -41,7 +41,7 @@ class Calibration:
     """A rig with its accuracy.
 
     fit: result of the bundle adjustment; its blocks are `frames` in order.
-    single: each camera's reprojection error (RMS, px) when it is calibrated by itself.
+    single: each camera's reprojection error (RMS, px) when it is calibrated by itself; none with a start.
     views: the detections used, numbered consistently in all cameras.
     raised: the factor by which the covariance's standard deviations were raised to those of a jackknife over frames.
     """
@@ -98,24 +98,8 @@ def calibrate(
     cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
     flat = _flat(board, initial.world_from_board, initial.views)
     together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), flat, single)
-    together, factor = _scaled_covariance(together)
-    rig = Rig(together.fit.problem.cameras)
-    return Calibration(
-        rig=rig,
-        board=board,
-        fit=together.fit,
-        frames=tuple(initial.world_from_board),
-        views=initial.views,
-        single={name: a.fit.problem.rms() for name, a in single.items()},
-        epipolar=epipolar_errors(rig, initial.views),
-        notes=(
-            *_images_left_out(views, single, initial.left_out),
-            *together.notes,
-            *together.shape_notes(board),
-            *misfit_notes(together.fit, tuple(initial.world_from_board)),
-            *_noted(factor),
-        ),
-        raised=factor,
+    return _finished(
+        *_scaled_covariance(together), initial, board, single, _images_left_out(views, single, initial.left_out)
     )
 
 
@@ -128,20 +112,32 @@ def _from_start(
     placed = {name: c.replace(cam_from_world=initial.cam_from_world[name]) for name, c in cameras.items()}
     problem = replace(_problem(placed, initial.world_from_board, initial.views, board), priors=priors)
     fit, free, notes = _fitted(problem, _flat(board, initial.world_from_board, initial.views))
+    far = (f"{name}: left out {key}: its board contradicts the start" for name, key in initial.left_out)
     together, factor = _scaled_covariance(_JointFit(fit, free, notes))
-    rig, frames = Rig(fit.problem.cameras), tuple(initial.world_from_board)
+    return _finished(together, factor, initial, board, {}, [*start_notes(together.fit, deviations), *far])
+
+
+def _finished(
+    together: _JointFit,
+    factor: float,
+    initial: InitialRig,
+    board: Board,
+    single: Mapping[str, SingleCalibration],
+    notes: Iterable[str],
+) -> Calibration:
+    """The calibration by a fit of all cameras, with its errors, and notes after those given."""
+    rig, frames = Rig(together.fit.problem.cameras), tuple(initial.world_from_board)
     return Calibration(
         rig=rig,
         board=board,
         fit=together.fit,
         frames=frames,
         views=initial.views,
-        single={},
+        single={name: a.fit.problem.rms() for name, a in single.items()},
         epipolar=epipolar_errors(rig, initial.views),
         notes=(
-            *start_notes(together.fit, deviations),
-            *(f"{name}: left out {key}: its board contradicts the start" for name, key in initial.left_out),
             *notes,
+            *together.notes,
             *together.shape_notes(board),
             *misfit_notes(together.fit, frames),
             *_noted(factor),

@@ -119,14 +119,13 @@ def _gains(fit: BundleResult, deviations: StartDeviations) -> str:
     focal = np.mean([float(c.K[0, 0]) for c in fit.problem.cameras.values()])
     width = np.mean([c.hw[1] for c in fit.problem.cameras.values()])
     kinds = {
-        "focal": ("focal lengths", deviations.focal * focal, 1.0, "px"),
-        "centre": ("principal points", deviations.centre * width, 1.0, "px"),
+        "focal": ("focal lengths", deviations.focal * focal),
+        "centre": ("principal points", deviations.centre * width),
     }
     texts = []
-    for kind, (label, before, factor, unit) in kinds.items():
+    for kind, (label, before) in kinds.items():
         found = [d for name, d in after.items() if f".{kind}." in name]
-        if found:
-            texts.append(f"{label} ±{factor * before:.3g} > ±{factor * np.median(found):.3g} {unit}")
+        texts += [f"{label} ±{before:.3g} > ±{np.median(found):.3g} px"] if found else []
     positions = np.median(_position_deviations(fit))
     texts.append(f"positions ±{1e3 * deviations.position:.3g} > ±{1e3 * positions:.3g} mm")
     return f"held to the start; standard deviations stated > with the images: {', '.join(texts)}"
@@ -148,19 +147,10 @@ def _far(fit: BundleResult) -> list[str]:
     notes = []
     for name, camera in fit.problem.cameras.items():
         prior = fit.problem.priors[name]
-        ratio = prior.offset(camera) / np.sqrt(np.linalg.inv(prior.information).diagonal())
-        kinds = {
-            "orientation": ratio[:3],
-            "position": ratio[3:6],
-            "focal length": ratio[6:8],
-            "principal point": ratio[8:10],
-        }
-        if far := [
-            f"{kind} ({np.abs(r).max():.0f} deviations)"
-            for kind, r in kinds.items()
-            if np.abs(r).max() > FAR_FROM_START
-        ]:
-            notes.append(
-                f"{name}: far from the start: {', '.join(far)}: is the start right, or its deviations too small?"
-            )
+        ratio = np.abs(prior.offset(camera)) / np.sqrt(np.linalg.inv(prior.information).diagonal())
+        parts = np.split(ratio[:10], [3, 6, 8])
+        kinds = zip(("orientation", "position", "focal length", "principal point"), (part.max() for part in parts))
+        if far := [f"{kind} ({worst:.0f} deviations)" for kind, worst in kinds if worst > FAR_FROM_START]:
+            listed = ", ".join(far)
+            notes.append(f"{name}: far from the start: {listed}: is the start right, or its deviations too small?")
     return notes
