@@ -69,7 +69,7 @@ def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
     keys = {key for moments in photos.values() for key in moments}
     if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
         return photos
-    return {name: dict(zip([0], moments.values())) for name, moments in photos.items()}
+    return {name: dict(zip(["image 1"], moments.values())) for name, moments in photos.items()}
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:

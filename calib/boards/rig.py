@@ -110,11 +110,25 @@ def _from_start(
     initial = rig_near_start(cameras, views, board)
     priors = {name: start_prior(camera, deviations) for name, camera in cameras.items()}
     placed = {name: c.replace(cam_from_world=initial.cam_from_world[name]) for name, c in cameras.items()}
-    problem = replace(_problem(placed, initial.world_from_board, initial.views, board), priors=priors)
-    fit, free, notes = _fitted(problem, _flat(board, initial.world_from_board, initial.views))
+    detected, flat = initial.views, _flat(board, initial.world_from_board, initial.views)
+    problem = replace(_problem(placed, initial.world_from_board, detected, board), priors=priors)
+    fit, free, notes = _fitted(problem, flat)
+    used = {name: _near_fit(fit, name, v, initial, board) for name, v in detected.items()}
+    if left_out := [note for name, v in detected.items() for note in _points_left_out(name, v, used[name])]:
+        initial = initial._replace(views=used)
+        boards = fit.problem.board_poses(initial.world_from_board)
+        fit, free, notes = _fitted(replace(_problem(fit.problem.cameras, boards, used, board), priors=priors), flat)
     far = (f"{name}: left out {key}: its board contradicts the start" for name, key in initial.left_out)
     together, factor = _scaled_covariance(_JointFit(fit, free, notes))
-    return _finished(together, factor, initial, board, {}, [*start_notes(together.fit, deviations), *far])
+    return _finished(together, factor, initial, board, {}, [*start_notes(together.fit, deviations), *far, *left_out])
+
+
+def _near_fit(fit: BundleResult, name: str, views: BoardViews, initial: InitialRig, board: Board) -> BoardViews:
+    """A camera's views without the points that a fit of all cameras shows to be outliers."""
+    camera, boards = fit.problem.cameras[name], fit.problem.board_poses(initial.world_from_board)
+    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
+    points = board.points if fit.problem.shape is None else fit.problem.shape.deformed(board.points, board.part)
+    return without_outliers(views, camera, poses, points, sigma=fit.sigma[name])
 
 
 def _finished(

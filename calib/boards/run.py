@@ -17,7 +17,7 @@ from .collect import Progress, collect_folder
 from .intrinsics import Lens
 from .lens_comparison import compare_lenses
 from .printing import draw_board
-from .report import coverage_advice, coverages, report_html, rig_covariance, summary
+from .report import by_cameras, coverage_advice, coverages, report_html, rig_covariance, summary
 from .rig import calibrate
 from .start import StartDeviations
 from .target import parse_board, parse_boards
@@ -81,7 +81,7 @@ def calibrate_photos(
             covariance.save(folder / written[1].name)
         rig.save(folder / out.name)
     advice = coverage_advice(calibration, coverages(calibration))
-    messages = [summary(calibration), *lenses, *found.notes, *calibration.notes, *advice]
+    messages = [summary(calibration), *by_cameras([*lenses, *found.notes, *calibration.notes, *advice])]
     return CalibrationOutput(messages, [path for path in written if path.exists()])
 
 

@@ -62,7 +62,7 @@ def test_one_image_of_each_camera_is_one_moment(tmp_path):
     for name in ("cam-0", "cam-1"):
         write(tmp_path / f"{name}.png")
     found = find_photos(tmp_path, patterns={"cam-0": "cam-0.png", "cam-1": "cam-1.png"})
-    assert [list(moments) for moments in found.values()] == [[0], [0]]
+    assert [list(moments) for moments in found.values()] == [["image 1"], ["image 1"]]
     write(tmp_path / "cam-1b.png")
     found = find_photos(tmp_path, patterns={"cam-0": "cam-0.png", "cam-1": "cam-1*.png"})
     assert found["cam-0"].keys() == {0} != found["cam-1"].keys()
