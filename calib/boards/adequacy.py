@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Pose, rotation_from_vector
 
-from .bundle import BundleResult, camera_jacobian, parameter_names, readjusted
+from .bundle import BundleResult, readjusted
+from .camera_parameters import camera_jacobian, parameter_names
 from .target import Board
 from .validation import without_blocks
 

@@ -16,8 +16,9 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Camera, Pose
 
+from .camera_parameters import CameraPrior, camera_jacobian, changed, parameter_names
 from .shape import BoardShape
 
 ROBUST = 3.0
@@ -97,27 +98,9 @@ Free = Mapping[str, Bool[np.ndarray, "_"]]
 """By camera, a mask of the parameters that may change, in the order of `parameter_names`."""
 
 
-class IntrinsicsPrior(NamedTuple):
-    """A normal prior of a camera's intrinsics: mean and inverse covariance, in the order of `parameter_names`.
-
-    Entries of the pose are zero.
-    """
-
-    mean: Float[np.ndarray, " p"]
-    information: Float[np.ndarray, "p p"]
-
-    def slope(self, camera: Camera) -> Float[np.ndarray, " p"]:
-        """The negative gradient of `loss` with respect to each parameter."""
-        return self.information @ (self.mean - intrinsic_values(camera))
-
-    def loss(self, camera: Camera) -> float:
-        """Half the squared Mahalanobis distance from the mean."""
-        return float(self.slope(camera) @ (self.mean - intrinsic_values(camera))) / 2
-
-
 @dataclass(frozen=True)
 class BundleProblem:
-    """Cameras, structure and observations; optionally a prior of each camera's intrinsics.
+    """Cameras, structure and observations; optionally a prior of each camera.
 
     shape: the shape of the boards, adjusted with the cameras; None for flat ones, and where there are no boards.
     """
@@ -125,7 +108,7 @@ class BundleProblem:
     cameras: Mapping[str, Camera]
     structure: Structure
     seen: Mapping[str, Observations]
-    priors: Mapping[str, IntrinsicsPrior] = field(default_factory=dict)
+    priors: Mapping[str, CameraPrior] = field(default_factory=dict)
     shape: BoardShape | None = None
 
     def observed(self, name: str) -> Observations:
@@ -175,24 +158,6 @@ class BundleResult(NamedTuple):
             name: np.array([f"{name}.{entry}" in named for entry in parameter_names(camera)])
             for name, camera in self.problem.cameras.items()
         }
-
-
-def parameter_names(camera: Camera) -> list[str]:
-    """The parameters of a camera as `Rig.parameters` orders them: "rotation.0", ..., "distortion.4"."""
-    return [f"{key.removeprefix('.')}.{i}" for key, size in parameter_sizes(camera).items() for i in range(size)]
-
-
-def intrinsic_values(camera: Camera) -> Float[np.ndarray, " p"]:
-    """The parameters' values, in the order of `parameter_names`; 0 for those of the pose."""
-    lens = () if camera.distortion is None else camera.distortion.coefficients.tolist()
-    K = camera.K.detach().numpy()
-    return np.array([*(0.0,) * 6, K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens])
-
-
-def parameter_sizes(camera: Camera) -> dict[str, int]:
-    """The length of each of a camera's parameter vectors, by its name in a rig with one camera called ""."""
-    lens = {} if camera.distortion is None else {".distortion": camera.distortion.coefficients.shape[-1]}
-    return {".rotation": 3, ".translation": 3, ".focal": 2, ".centre": 2} | lens
 
 
 def adjust(
@@ -300,35 +265,10 @@ def _stepped(problem: BundleProblem, free: Free, change: Array, blocks: Array) -
         full = np.zeros(len(free[name]))
         count = int(free[name].sum())
         full[free[name]] = change[at : at + count]
-        cameras[name] = _changed(camera, torch.from_numpy(full))
+        cameras[name] = changed(camera, torch.from_numpy(full))
         at += count
     shape = problem.shape and problem.shape.stepped(change[at:])
     return replace(problem, cameras=cameras, structure=problem.structure.stepped(blocks), shape=shape)
-
-
-def _changed(camera: Camera, change: torch.Tensor) -> Camera:
-    """The camera after a change of all its parameters, in the order of `parameter_names`."""
-    sizes = parameter_sizes(camera)
-    changed = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values())))))[""]
-    assert isinstance(changed, Camera)
-    return changed
-
-
-def camera_jacobian(camera: Camera, X: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2 p"]:
-    """Derivatives of the pixels of world points with respect to the camera, in the order of `parameter_names`.
-
-    Two reverse passes with a copy of the intrinsics per point; those of the pose follow by the chain rule.
-    """
-    local = camera.cam_from_world.apply(torch.from_numpy(X)).detach().requires_grad_()
-    sizes = {key: size for key, size in parameter_sizes(camera).items() if key not in (".rotation", ".translation")}
-    change = torch.zeros(len(X), sum(sizes.values()), dtype=local.dtype, requires_grad=True)
-    copies = Rig({"": camera}).perturbed(dict(zip(sizes, change.split(list(sizes.values()), -1))))[""]
-    assert isinstance(copies, Camera)
-    x = copies.project_local(local[:, None]).x[:, 0]
-    by_point, by_change = zip(*(torch.autograd.grad(v.sum(), (local, change), retain_graph=True) for v in x.unbind(-1)))
-    along = torch.stack(by_point, 1)
-    rotational = torch.linalg.cross((local.detach() - camera.t)[:, None].expand_as(along), along)
-    return torch.cat([rotational, along, torch.stack(by_change, 1)], -1).numpy()
 
 
 @dataclass(frozen=True)
@@ -381,14 +321,15 @@ def normal_equations(problem: BundleProblem, free: Free, sigma: Mapping[str, flo
     at = 0
     for name in problem.cameras:
         mine = np.array([*range(at, at := at + int(free[name].sum())), *range(c - shapes, c)], dtype=int)
-        part = _linearised(problem, name, sigma[name], free[name])
+        part = linearised(problem, name, sigma[name], free[name])
         rows = part.by_shared.reshape(2 * len(part.r), len(mine))
         H[np.ix_(mine, mine)] += rows.T @ rows
         g[mine] += np.einsum("nip,ni->p", part.by_shared, part.r)
         if (prior := problem.priors.get(name)) is not None:
             own = mine[: len(mine) - shapes]
-            H[np.ix_(own, own)] += prior.information[np.ix_(free[name], free[name])]
-            g[own] += prior.slope(problem.cameras[name])[free[name]]
+            information, slope = prior.equations(problem.cameras[name])
+            H[np.ix_(own, own)] += information[np.ix_(free[name], free[name])]
+            g[own] += slope[free[name]]
         np.add.at(B, part.block, np.einsum("nid,nie->nde", part.by_block, part.by_block))
         np.add.at(h, part.block, np.einsum("nid,ni->nd", part.by_block, part.r))
         coupled = np.zeros((b, len(mine), d))
@@ -400,62 +341,7 @@ def normal_equations(problem: BundleProblem, free: Free, sigma: Mapping[str, flo
     return NormalEquations(H, W, B, g, h, shapes)
 
 
-class Jackknife(NamedTuple):
-    """By how the blocks disagree: covariances of the cameras' parameters and of the shapes.
-
-    left_out: of the cameras' parameters by leaving out each block in turn. step: the shapes after a Gauss-Newton step.
-    """
-
-    covariance: Float[np.ndarray, "c c"]
-    left_out: Float[np.ndarray, "c c"]
-    shapes: Float[np.ndarray, "s s"]
-    step: Float[np.ndarray, " s"]
-
-
-def jackknife(problem: BundleProblem, free: Free, sigma: Mapping[str, float]) -> Jackknife:
-    """The covariance of the free parameters by how the blocks (frames) disagree, to first order.
-
-    It contains what blocks have in common beyond their points' noise: a bent board, blur, wrong exposure times. A plain
-    jackknife's deviations are too large by 15 to 40 % with a dozen boards that determine all parameters between them;
-    Bell and McCaffrey's (2002) correction removes that.
-    """
-    equations = normal_equations(problem, free, sigma)
-    (b, c), shapes = equations.W.shape[:2], equations.shapes
-    H, g, at = np.zeros((b, c, c)), np.zeros((b, c)), 0
-    for name in problem.cameras:
-        mine = np.array([*range(at, at := at + int(free[name].sum())), *range(c - shapes, c)], dtype=int)
-        part = _linearised(problem, name, sigma[name], free[name])
-        own, slope = np.zeros((b, len(mine), len(mine))), np.zeros((b, len(mine)))
-        np.add.at(own, part.block, np.einsum("nip,niq->npq", part.by_shared, part.by_shared))
-        np.add.at(slope, part.block, np.einsum("nip,ni->np", part.by_shared, part.r))
-        H[:, mine[:, None], mine] += own
-        g[:, mine] += slope
-    Y = equations.W @ np.linalg.inv(equations.B + 1e-12 * np.eye(equations.B.shape[-1]))
-    H -= Y @ equations.W.swapaxes(-1, -2)
-    g -= np.einsum("bcd,bd->bc", Y, equations.h)
-    total = equations.information_with_shapes()
-    whole = equations.g - np.einsum("bcd,bd->c", Y, equations.h)
-    step = np.linalg.lstsq(total, whole, rcond=1e-14)[0]
-    covariance = _clustered(total, H, g - H @ step)
-    each = np.stack([np.linalg.lstsq(total - P, whole - slope, rcond=1e-14)[0] for P, slope in zip(H, g)])
-    each -= each.mean(0)
-    after = np.zeros(0) if problem.shape is None else problem.shape.values.ravel() + step[c - shapes :]
-    cameras, boards = slice(c - shapes), slice(c - shapes, c)
-    left_out = (b - 1) / b * (each.T @ each)[cameras, cameras]
-    return Jackknife(covariance[cameras, cameras], left_out, covariance[boards, boards], after)
-
-
-def _clustered(total: Array, H: Array, g: Array) -> Array:
-    """The covariance by the slopes g (b, c) of blocks, each scaled by (1 - its share H of the information)^(-1/2)."""
-    scale = 1 / np.sqrt(total.diagonal())
-    whiten = np.linalg.inv(np.linalg.cholesky(total * scale * scale[:, None])) * scale
-    share, axes = np.linalg.eigh(whiten @ H @ whiten.T)
-    slopes = np.einsum("bji,bj->bi", axes, g @ whiten.T) / np.sqrt(np.maximum(1 - share, 1e-6))
-    changes = np.einsum("bij,bj->bi", axes, slopes) @ whiten
-    return np.asarray(changes.T @ changes)
-
-
-class _Linearised(NamedTuple):
+class Linearised(NamedTuple):
     """One camera's residuals (n, 2), and its pixels' derivatives by parameters and shapes, and by blocks, weighted."""
 
     r: Array
@@ -464,7 +350,8 @@ class _Linearised(NamedTuple):
     block: Array
 
 
-def _linearised(problem: BundleProblem, name: str, sigma: float, free: np.ndarray) -> _Linearised:
+def linearised(problem: BundleProblem, name: str, sigma: float, free: np.ndarray) -> Linearised:
+    """A camera's residuals and derivatives for its noise (pixels) and the mask of its free parameters."""
     camera, seen = problem.cameras[name], problem.observed(name)
     X = problem.structure.world(seen)
     r = seen.x - camera.project(torch.from_numpy(X)).x.numpy()
@@ -474,7 +361,7 @@ def _linearised(problem: BundleProblem, name: str, sigma: float, free: np.ndarra
     by_shared = np.concatenate([by_camera[..., free], by_point @ _by_shape(problem, name)], -1)
     weight = np.sqrt(_weights(np.linalg.norm(r, axis=-1) / sigma)) / sigma
     wide = weight[:, None, None]
-    return _Linearised(weight[:, None] * r, wide * by_shared, wide * by_block, seen.block)
+    return Linearised(weight[:, None] * r, wide * by_shared, wide * by_block, seen.block)
 
 
 def _by_shape(problem: BundleProblem, name: str) -> Array:

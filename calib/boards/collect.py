@@ -91,7 +91,7 @@ def _check_board(name: str, moments: Mapping[FrameKey, Photo], seen: Collection[
         why = explain(_greys(list(moments.values())), board.members[0])
         labels = _named([p.label for p in moments.values()], NAMED)
         raise ValueError(f"{name}: the board {board} is found in none of {len(moments)} images ({labels}): {why}")
-    if other := other_size(_greys([moments[key] for key in seen]), board):
+    if other := other_size(_greys([moments[key] for key in seen]), board, larger=True):
         raise ValueError(
             f"{name}: the images show a chessboard with {other} inner corners and the board given is {board}: "
             "count the corners between squares, not the squares"

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
 
-from .bundle import camera_jacobian, parameter_names
+from .camera_parameters import camera_jacobian, centre_derivatives, parameter_names
 
 FORMAT = "arraygeom-covariance 1"
 
@@ -89,12 +89,9 @@ def beta_covariance(
     return found
 
 
-def baseline_deviation(rig: Mapping[str, Camera], name: str, covariance: RigCovariance) -> float:
-    """The standard deviation of the distance between a camera and the world's origin, metres."""
-    camera = rig[name]
-    centre, (x, y, z) = camera.centre.numpy(), camera.t.numpy()
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    centre_by_pose = -camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1)
-    direction = centre / max(float(np.linalg.norm(centre)), 1e-12)
-    change = direction @ centre_by_pose @ covariance.of(name, camera)[:6]
-    return float(np.sqrt(change @ covariance.matrix @ change))
+def baseline_deviation(rig: Mapping[str, Camera], a: str, b: str, covariance: RigCovariance) -> float:
+    """The standard deviation of the distance between two cameras, metres."""
+    baseline = (rig[b].centre - rig[a].centre).numpy()
+    direction = baseline / max(float(np.linalg.norm(baseline)), 1e-12)
+    of_a, of_b = (direction @ centre_derivatives(rig[n]) @ covariance.of(n, rig[n])[:6] for n in (a, b))
+    return float(np.sqrt((of_b - of_a) @ covariance.matrix @ (of_b - of_a)))

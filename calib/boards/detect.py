@@ -15,12 +15,15 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 
 from .corners import monomials, refine_corners
+from .known_points import KnownPoints
 from .target import AprilGrid, Board, Charuco, Chessboard, Circles, MarkedBoard, marker_dictionary
 
 Grey = UInt8[np.ndarray, "h w"]
 
 FEWEST = 8
 """Points that a detection must have: a pose needs 4, a check of it more."""
+FEWEST_KNOWN = 6
+"""Likewise of points of known position."""
 ENOUGH = 0.6
 """Share of a board's corners that must fit the corner model, else all are refined by gradients."""
 LARGEST_MISFIT = 0.35
@@ -63,15 +66,18 @@ def explain(images: Iterable[Grey], board: Board) -> str:
     return reasons.most_common(1)[0][0] if reasons else "there are no images"
 
 
-def other_size(images: Iterable[Grey], board: Board) -> str | None:
-    """The size of the chessboard in the images, as "9x6", if most show one of another size than `board`."""
+def other_size(images: Iterable[Grey], board: Board, *, larger: bool = False) -> str | None:
+    """The size of the chessboard in the images, as "9x6", if most show one of another size than `board`.
+
+    Only a larger one counts if `board` was found in them: patches of it pass for smaller ones.
+    """
     if not isinstance(board, Chessboard):
         return None
     sizes = Counter(size for grey in images if (size := _grid_size(grey)) is not None)
     if not sizes:
         return None
     size, votes = sizes.most_common(1)[0]
-    same = set(size) == {board.columns, board.rows}
+    same = set(size) == {board.columns, board.rows} or (larger and size[0] * size[1] <= len(board.points))
     return None if same or (votes < 2 and sizes.total() > 1) else f"{max(size)}x{min(size)}"
 
 
@@ -120,8 +126,25 @@ def _april_grid(grey: Grey, board: AprilGrid) -> Detection | None:
     tags -= board.first
     points = board.corners[tags].reshape(-1)
     # tags stand on their heads in Kalibr's files, and otherwise in others'
-    turned = [np.roll(x, k, 1).reshape(-1, 2).astype(np.float64) for k in range(4)]
-    return Detection(points, min(turned, key=lambda x: _distance_from_plane(board.points[points, :2], x)))
+    rotated = [np.roll(x, k, 1).reshape(-1, 2).astype(np.float64) for k in range(4)]
+    return Detection(points, min(rotated, key=lambda x: _distance_from_plane(board.points[points, :2], x)))
+
+
+def _known_points(grey: Grey, board: KnownPoints) -> Detection | None:
+    """Corners, and centres by the diagonals, which lenses hardly move."""
+    seen = _tags(grey, board.dictionary, 1)
+    ids = [i for i, (marker, _) in enumerate(board.ids) if marker in seen]
+    if len(ids) < FEWEST_KNOWN:
+        return None
+    x = [_crossing(seen[m]) if corner < 0 else seen[m][corner] for m, corner in (board.ids[i] for i in ids)]
+    return Detection(np.array(ids), np.array(x, dtype=np.float64))
+
+
+def _crossing(corners: np.ndarray) -> np.ndarray:
+    """Where the diagonals of a quadrilateral cross: the projection of a square's centre."""
+    a, b, c, d = corners.astype(np.float64)
+    along = np.linalg.solve(np.stack([c - a, b - d], -1), b - a)
+    return np.asarray(a + along[0] * (c - a))
 
 
 def _tags(grey: Grey, dictionary: str, border: int) -> dict[int, np.ndarray]:
@@ -163,6 +186,7 @@ _FINDERS: dict[type[Board], Callable[[Grey, Any], Detection | None]] = {
     Charuco: _charuco,
     AprilGrid: _april_grid,
     Circles: _circles,
+    KnownPoints: _known_points,
 }
 
 
@@ -171,7 +195,7 @@ def _refined(grey: Grey, found: Detection, board: Board) -> Detection:
 
     Where few fit the corner model, as in images that are too small for it, all are refined by gradients.
     """
-    if isinstance(board, Circles):
+    if isinstance(board, Circles | KnownPoints):
         return found
     clear = _clear(board)
     x, good = refine_corners(grey, found.x, board.points[found.ids, :2] / board.spacing, clear=clear)
@@ -203,6 +227,8 @@ def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
 
 def _plausible(found: Detection, board: Board) -> bool:
     """Whether there are enough points, not collinear, and on a smoothly distorted grid."""
+    if isinstance(board, KnownPoints):
+        return True
     p = board.points[found.ids, :2]
     if len(p) < FEWEST or np.linalg.svd(p - p.mean(0), compute_uv=False)[1] <= 0.5 * board.spacing:
         return False
@@ -245,6 +271,8 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
     if isinstance(board, AprilGrid) and len(_markers(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
         other = f"border{3 - border}"
         return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
+    if isinstance(board, KnownPoints):
+        return f"{len(ids)} of its markers are visible, too few, or not of {board.dictionary}: name their dictionary"
     if len(ids) >= 4 and max(ids) > last:
         return (
             f"markers up to number {max(ids)} are visible and the board has {board.first} to {last}: is its size right?"

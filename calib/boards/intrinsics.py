@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from arraygeom import Camera, Distortion, Pose
+from arraygeom import Camera, Distortion, Pose, intrinsics
 from arraygeom.pixels import HW
 
 from .detect import Detection
@@ -55,11 +55,13 @@ class InitialCamera(NamedTuple):
 def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens = "brown-conrady") -> InitialCamera:
     """A camera's intrinsics, lens and board poses from its own images.
 
-    Raises ValueError if there are fewer than three images with a board, or if the board was never tilted.
+    Raises ValueError if there are fewer than three images with a board (one, with points that are not in a plane), or
+    if the board was never tilted.
     """
-    if len(views.seen) < FEWEST_IMAGES:
+    fewest = FEWEST_IMAGES if board.flat else 1
+    if len(views.seen) < fewest:
         raise ValueError(
-            f"{name}: the board is found in {len(views.seen)} of its images and {FEWEST_IMAGES} is the least: "
+            f"{name}: the board is found in {len(views.seen)} of its images and {fewest} is the least: "
             "take ten or more, at several distances and tilts"
         )
     plausible = BoardViews(views.hw, {key: near_homography(d, board) for key, d in views.seen.items()})
@@ -67,14 +69,14 @@ def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens =
     for _ in range(2):
         plausible = without_outliers(views, camera, poses, board.points)
         camera, poses = _solved(name, plausible, board, lens)
-    check_tilts(name, poses)
+    check_tilts(name, poses, board)
     rms = {key: _rms(camera, pose, plausible.seen[key], board.points) for key, pose in poses.items()}
     return InitialCamera(camera, poses, rms)
 
 
 def near_homography(found: Detection, board: Board) -> Detection:
     """The points that a homography of the board fits (least median of squares), apart from the lens's distortion."""
-    if len(found.ids) < FEWEST_POINTS:
+    if len(found.ids) < FEWEST_POINTS or not board.flat:
         return found
     plane = board.points[found.ids, :2]
     H, _ = cv2.findHomography(plane, found.x, cv2.LMEDS)
@@ -90,15 +92,23 @@ def without_outliers(
     """The views without points farther from a camera's projections than `OUTLIER` standard deviations.
 
     `points` are the board's, metres. `sigma` is along x or y, pixels; by default estimated from the median of all
-    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points left, keep all of theirs.
+    distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left, keep all.
     """
     off = {key: _distances(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
     sigma = sigma or max(MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), 0.02)
     kept = {key: _only(views.seen[key], r < OUTLIER * sigma) for key, r in off.items()}
     return BoardViews(
         views.hw,
-        {key: kept[key] if key in kept and len(kept[key].ids) >= FEWEST_POINTS else d for key, d in views.seen.items()},
+        {key: kept[key] if key in kept and _spans(points[kept[key].ids]) else d for key, d in views.seen.items()},
     )
+
+
+def _spans(points: Points) -> bool:
+    """Whether there are enough points, and not all on a line."""
+    if len(points) < FEWEST_POINTS:
+        return False
+    _, second, _ = np.linalg.svd(points - points.mean(0), compute_uv=False)
+    return bool(second > 1e-6)
 
 
 def _only(found: Detection, mask: np.ndarray) -> Detection:
@@ -119,8 +129,10 @@ def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Cam
     return camera, {key: _pose(r, t) for key, r, t in zip(views.seen, rotations, translations)}
 
 
-def check_tilts(name: str, poses: Mapping[FrameKey, Pose]) -> None:
-    """Raises ValueError if all boards are parallel: focal length and distance are ambiguous then."""
+def check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None:
+    """Raises ValueError if all (flat) boards are parallel: focal length and distance are ambiguous then."""
+    if not board.flat:
+        return
     normals = np.stack([pose.R[:, 2].numpy() for pose in poses.values()])
     widest = float(np.degrees(np.arccos(np.clip(normals @ normals.T, -1, 1)).max()))
     if widest < FEWEST_TILT:
@@ -136,28 +148,52 @@ def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
     rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
     flat = rays[usable, :2] / rays[usable, 2:]
-    correspondences = board.points[found.ids[usable]], flat, np.eye(3), np.zeros(4)
-    _, r, t = cv2.solvePnP(*correspondences, flags=cv2.SOLVEPNP_IPPE)
-    _, r, t = cv2.solvePnP(*correspondences, r, t, True, cv2.SOLVEPNP_ITERATIVE)
+    points = board.points[found.ids[usable]]
+    method = cv2.SOLVEPNP_IPPE if board.flat else cv2.SOLVEPNP_SQPNP
+    first = points * (1, 1, 0) if board.flat else points
+    _, r, t = cv2.solvePnP(first, flat, np.eye(3), np.zeros(4), flags=method)
+    _, r, t = cv2.solvePnP(points, flat, np.eye(3), np.zeros(4), r, t, True, cv2.SOLVEPNP_ITERATIVE)
     return _pose(r, t)
 
 
 def _pinhole(views: BoardViews, board: Board, lens: Lens) -> Solved:
     """Two radial terms suffice initially: (K, coefficients, rotations, translations)."""
-    points = [board.points[d.ids].astype(np.float32) for d in views.seen.values()]
+    initial = board.points * (1, 1, 0) if board.flat else board.points
+    points = [initial[d.ids].astype(np.float32) for d in views.seen.values()]
     pixels = [d.x.astype(np.float32)[:, None] for d in views.seen.values()]
     h, w = views.hw
     flags = cv2.CALIB_FIX_K3 | cv2.CALIB_ZERO_TANGENT_DIST
     if lens == "none":
         flags |= cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2
-    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), np.eye(3), np.zeros(5), flags=flags)
+    K: np.ndarray = np.eye(3)
+    if not board.flat:
+        flags |= cv2.CALIB_USE_INTRINSIC_GUESS
+        K = _linear_intrinsics(max(zip(points, pixels), key=lambda view: len(view[0])), views.hw)
+    _, K, c, rotations, translations = cv2.calibrateCamera(points, pixels, (w, h), K, np.zeros(5), flags=flags)
     coefficients = np.zeros(COEFFICIENTS.get(lens, 5))
     coefficients[:2] = c.reshape(-1)[:2]
     return K, coefficients, list(rotations), list(translations)
 
 
+def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarray:
+    """K with square pixels and a central principal point by a linear camera of one view (Hartley & Zisserman 7.1)."""
+    X, x = view[0].astype(np.float64), view[1][:, 0].astype(np.float64)
+    if len(X) < FEWEST_POINTS:
+        return np.array(intrinsics(float(max(hw)), hw))
+    scale, middle = hw[1] / 2, np.array([(hw[1] - 1) / 2, (hw[0] - 1) / 2])
+    u, v = ((x - middle) / scale).T
+    Xh, zero = np.column_stack([X / np.abs(X).max(), np.ones(len(X))]), np.zeros((len(X), 4))
+    A = np.concatenate([np.hstack([Xh, zero, -u[:, None] * Xh]), np.hstack([zero, Xh, -v[:, None] * Xh])])
+    P = np.linalg.svd(A)[2][-1].reshape(3, 4)
+    K = cv2.decomposeProjectionMatrix(P)[0]
+    focal = scale * float(np.sqrt(abs(K[0, 0] * K[1, 1]))) / abs(K[2, 2])
+    return np.array(intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw))
+
+
 def _fisheye(views: BoardViews, board: Board, lens: Lens) -> Solved:
     del lens
+    if not board.flat:
+        raise ValueError("fisheyes need a flat board to start from: points of known position give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]
     pixels = [d.x[:, None] for d in views.seen.values()]
     h, w = views.hw

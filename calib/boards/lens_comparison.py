@@ -10,7 +10,8 @@ from jaxtyping import Float
 
 from arraygeom import Pose
 
-from .bundle import BoardPoses, BundleProblem, Observations, parameter_names, readjusted
+from .bundle import BoardPoses, BundleProblem, Observations, readjusted
+from .camera_parameters import parameter_names
 from .intrinsics import BoardViews, Lens, board_pose
 from .photos import FrameKey
 from .rig import SingleCalibration, calibrate_single

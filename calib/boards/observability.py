@@ -9,7 +9,8 @@ from jaxtyping import Float
 
 from arraygeom import Camera
 
-from .bundle import BundleProblem, Free, IntrinsicsPrior, intrinsic_values, normal_equations, parameter_names
+from .bundle import BundleProblem, Free, normal_equations
+from .camera_parameters import CameraPrior, intrinsic_values, parameter_names
 
 TYPICAL_COEFFICIENTS = {
     "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
@@ -49,7 +50,7 @@ def typical_sizes(camera: Camera) -> Float[np.ndarray, " p"]:
     return np.array([3.0] * 3 + [100.0] * 3 + [focal] * 2 + [TYPICAL_CENTRE_ERROR * camera.hw[1]] * 2 + [*coefficients])
 
 
-def typical_prior(camera: Camera) -> IntrinsicsPrior:
+def typical_prior(camera: Camera) -> CameraPrior:
     """Prior of ordinary cameras: square pixels, a principal point near the centre, moderate distortion.
 
     Negligible where boards were observed at many positions and tilts; elsewhere it keeps a camera plausible.
@@ -63,7 +64,7 @@ def typical_prior(camera: Camera) -> IntrinsicsPrior:
     information[:8, :8] = 0.0
     focal = camera.K[:2, :2].det().abs().sqrt().item()
     information[6:8, 6:8] = np.array([[1, -1], [-1, 1]]) / (ASPECT_DEVIATION * focal) ** 2
-    return IntrinsicsPrior(mean, information)
+    return CameraPrior(mean, information)
 
 
 def gate(
@@ -97,9 +98,10 @@ def gate(
 
 
 def _relative_information(problem: BundleProblem, free: Free, sigma: dict[str, float]) -> np.ndarray:
-    """The inverse covariance of the free parameters in units of their typical sizes."""
+    """The inverse covariance of the free parameters in units of their typical sizes, by pixels and stated priors."""
     sizes = np.concatenate([typical_sizes(camera)[free[name]] for name, camera in problem.cameras.items()])
-    information = normal_equations(replace(problem, priors={}), free, sigma).information()
+    stated = {name: prior for name, prior in problem.priors.items() if prior.pose is not None}
+    information = normal_equations(replace(problem, priors=stated), free, sigma).information()
     return information * sizes[:, None] * sizes
 
 

@@ -53,14 +53,23 @@ def find_photos(folder: Path, *, patterns: Mapping[str, str] | None = None) -> P
 
     `patterns` maps camera names to patterns of file names, relative to the folder. Without it every subfolder with
     images or a video is a camera; where there is none, every prefix of file names before a final number
-    (left01.jpg, right01.jpg), or every video. Raises FileNotFoundError and ValueError.
+    (left01.jpg, right01.jpg), or every video. If each camera has one image, they are of one moment. Raises
+    FileNotFoundError and ValueError.
     """
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder}: no such folder of images: give one with a subfolder for each camera")
     cameras = _by_pattern(folder, patterns) if patterns else _by_folder(folder) or _by_name(folder)
     if not cameras:
         raise ValueError(f"{folder}: no images or videos here: give a folder with a subfolder for each camera")
-    return {name: _moments(name, files) for name, files in cameras.items()}
+    return _of_one_moment({name: _moments(name, files) for name, files in cameras.items()})
+
+
+def _of_one_moment(photos: dict[str, dict[FrameKey, Photo]]) -> Photos:
+    """Cameras with one image each took it at the same moment: numbers in the files' names are those of cameras."""
+    keys = {key for moments in photos.values() for key in moments}
+    if len(keys) == 1 or any(len(moments) > 1 for moments in photos.values()):
+        return photos
+    return {name: dict(zip(["image 1"], moments.values())) for name, moments in photos.items()}
 
 
 def frame_keys(stems: list[str]) -> list[FrameKey]:

@@ -74,7 +74,7 @@ def initial_rig(cameras: Sequence[CalibratedViews], board: Board) -> InitialRig:
     """
     pairs = {(a.name, b.name): found for a, b in combinations(cameras, 2) if (found := pair_pose(a, b, board))}
     poses = _along_tree(cameras, pairs, board)
-    return _boards(cameras, poses, board)
+    return consistent_boards(cameras, poses, board)
 
 
 def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativePose | None:
@@ -82,13 +82,13 @@ def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativeP
     shared = tuple(key for key in a.views.seen if key in b.views.seen)
     if not shared:
         return None
-    turns = symmetry_poses(board)
+    symmetries = symmetry_poses(board)
     tried = shared[:: max(1, len(shared) // MOST_CANDIDATES)]
-    candidates = [a.poses[key] @ turn @ b.poses[key].inverse() for key in tried for turn in turns]
+    candidates = [a.poses[key] @ symmetry @ b.poses[key].inverse() for key in tried for symmetry in symmetries]
     voted = max((_vote(a, b, pose, shared, board) for pose in candidates), key=lambda v: v.score)
     for _ in range(2):
-        averaged = _average(
-            [_nearest(voted.pose, a.poses[k], b.poses[k], turns) for k in voted.agreeing] or [voted.pose]
+        averaged = average_pose(
+            [nearest_pose(voted.pose, a.poses[k], b.poses[k], symmetries) for k in voted.agreeing] or [voted.pose]
         )
         voted = max(voted, _vote(a, b, averaged, shared, board), key=lambda v: v.score)
     corners = sum(len(a.views.seen[k].ids) + len(b.views.seen[k].ids) for k in voted.agreeing)
@@ -109,13 +109,13 @@ def _vote(a: CalibratedViews, b: CalibratedViews, a_from_b: Pose, keys: Sequence
     return _Candidate(a_from_b, frames, (len(frames), -float(errors[agree].sum())))
 
 
-def _nearest(a_from_b: Pose, a_from_board: Pose, b_from_board: Pose, turns: Sequence[Pose]) -> Pose:
+def nearest_pose(a_from_b: Pose, a_from_board: Pose, b_from_board: Pose, symmetries: Sequence[Pose]) -> Pose:
     """One frame's relative pose, for the numbering that brings it closest to a given one."""
-    poses = [a_from_board @ turn @ b_from_board.inverse() for turn in turns]
+    poses = [a_from_board @ symmetry @ b_from_board.inverse() for symmetry in symmetries]
     return max(poses, key=lambda pose: float((pose.R * a_from_b.R).sum()))
 
 
-def _average(poses: Sequence[Pose]) -> Pose:
+def average_pose(poses: Sequence[Pose]) -> Pose:
     """The rotation nearest to the mean of all, and the median translation."""
     U, _, Vh = torch.linalg.svd(torch.stack([pose.R for pose in poses]).mean(0))
     flip = torch.diag(torch.tensor([1.0, 1.0, float(torch.linalg.det(U @ Vh).sign())], dtype=U.dtype))
@@ -142,8 +142,8 @@ def _prediction_errors(
     counts = [len(d.ids) for d in detections]
     points = torch.from_numpy(board.points)
     errors = []
-    for turn in symmetry_poses(board):
-        X = torch.cat([(a_from_b @ pose @ turn).apply(points[d.ids]) for d, pose in zip(detections, poses)])
+    for symmetry in symmetry_poses(board):
+        X = torch.cat([(a_from_b @ pose @ symmetry).apply(points[d.ids]) for d, pose in zip(detections, poses)])
         x, _, valid = a.camera.project_local(X)
         distance = np.linalg.norm(x.numpy() - np.concatenate([d.x for d in detections]), axis=-1)
         distance = np.where(valid.numpy(), distance, np.inf)
@@ -169,7 +169,7 @@ def _along_tree(
     return poses
 
 
-def _boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
+def consistent_boards(cameras: Sequence[CalibratedViews], poses: dict[str, Pose], board: Board) -> InitialRig:
     """Board poses from the camera most others agree with, and the other cameras' numbering made consistent."""
     boards: dict[FrameKey, Pose] = {}
     seen: dict[str, dict[FrameKey, Detection]] = {c.name: {} for c in cameras}

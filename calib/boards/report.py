@@ -49,7 +49,7 @@ def report_html(
     With the points `detected` in `photos`, the images that fit worst are drawn.
     """
     covers = coverages(calibration)
-    advice = [*notes, *calibration.notes, *coverage_advice(calibration, covers)]
+    advice = by_cameras([*notes, *calibration.notes, *coverage_advice(calibration, covers)])
     parts = [
         f"<h1>{escape(title)}</h1>",
         f"<p>{escape(summary(calibration))}</p>",
@@ -95,6 +95,16 @@ def report_html(
     body = "\n".join(parts)
     head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{STYLE}</style>'
     return f'<!DOCTYPE html>\n<html lang="en">{head}\n{body}\n</html>\n'
+
+
+def by_cameras(notes: Iterable[str]) -> list[str]:
+    """Notes such as "left: no points at the top", with the same text as one: "left, right: no points at the top"."""
+    names: dict[str, list[str]] = {}
+    for note in notes:
+        name, between, text = note.partition(": ")
+        name, text = (name, text) if between else ("", note)
+        names.setdefault(text, []).append(name)
+    return [": ".join(filter(None, [", ".join(dict.fromkeys(listed)), text])) for text, listed in names.items()]
 
 
 def summary(calibration: Calibration) -> str:
@@ -159,7 +169,7 @@ def camera_table(calibration: Calibration, covers: Mapping[str, Coverage]) -> st
             (
                 f"{name} {camera.hw[1]}x{camera.hw[0]}",
                 f"{len(views.seen)}, {len(r)}",
-                f"{rms:.3f} ({calibration.single[name]:.3f})",
+                f"{rms:.3f}" + (f" ({calibration.single[name]:.3f})" if name in calibration.single else ""),
                 f"{calibration.fit.sigma[name]:.3f}",
                 _with_deviations(calibration, name, camera, "focal"),
                 _with_deviations(calibration, name, camera, "centre"),
@@ -175,11 +185,10 @@ def pair_table(calibration: Calibration) -> str:
     """One row per pair: baseline, relative rotation and epipolar errors."""
     covariance = rig_covariance(calibration)
     cameras = calibration.fit.problem.cameras
-    first = next(iter(cameras))
     rows = []
     for (a, b), errors in calibration.epipolar.items():
         baseline = float((cameras[a].centre - cameras[b].centre).norm())
-        deviation = baseline_deviation(cameras, b, covariance) if covariance and a == first else None
+        deviation = baseline_deviation(cameras, a, b, covariance) if covariance else None
         held = calibration.held_out.get((a, b))
         rows.append(
             (

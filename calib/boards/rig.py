@@ -13,25 +13,16 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Pose, Rig
 
-from .bundle import (
-    BoardPoses,
-    BundleProblem,
-    BundleResult,
-    Free,
-    IntrinsicsPrior,
-    Observations,
-    adjust,
-    intrinsic_values,
-    jackknife,
-    loss,
-    noise,
-    parameter_names,
-)
+from .bundle import BoardPoses, BundleProblem, BundleResult, Free, Observations, adjust, loss, noise
+from .camera_parameters import CameraPrior, intrinsic_values, parameter_names
 from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts, without_outliers
+from .jackknife import jackknife
+from .known_points import KnownPoints
 from .observability import gate, typical_prior
 from .photos import FrameKey
-from .poses import CalibratedViews, initial_rig
+from .poses import CalibratedViews, InitialRig, initial_rig
 from .shape import LEAST_GAIN, BoardShape, described, is_significant
+from .start import StartDeviations, rig_near_start, start_cameras, start_notes, start_prior
 from .target import Board
 from .validation import epipolar_errors, held_out_errors, misfit_notes
 
@@ -50,7 +41,7 @@ class Calibration:
     """A rig with its accuracy.
 
     fit: result of the bundle adjustment; its blocks are `frames` in order.
-    single: each camera's reprojection error (RMS, px) when it is calibrated by itself.
+    single: each camera's reprojection error (RMS, px) when it is calibrated by itself; none with a start.
     views: the detections used, numbered consistently in all cameras.
     raised: the factor by which the covariance's standard deviations were raised to those of a jackknife over frames.
     """
@@ -82,14 +73,22 @@ class Calibration:
 
 
 def calibrate(
-    views: Mapping[str, BoardViews], board: Board, *, lens: Lens | Mapping[str, Lens] = "brown-conrady"
+    views: Mapping[str, BoardViews],
+    board: Board,
+    *,
+    lens: Lens | Mapping[str, Lens] = "brown-conrady",
+    start: Rig | None = None,
+    deviations: StartDeviations | None = None,
 ) -> Calibration:
     """Calibrate a rig from detected board points. Its world is the first camera.
 
     `lens` is the model of all cameras, or of each by name. Raises ValueError, with advice, if a camera has too few
     images or only parallel boards, if cameras are not connected, or if their frames contradict each other.
+    With `start`, a rig known to within `deviations`, one image of each camera is enough, and the world is the start's.
     """
     models = {name: lens if isinstance(lens, str) else lens[name] for name in views}
+    if start is not None:
+        return _from_start(start_cameras(start, views, models), views, board, deviations or StartDeviations())
     single = {
         name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()
     }
@@ -99,21 +98,62 @@ def calibrate(
     cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
     flat = _flat(board, initial.world_from_board, initial.views)
     together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), flat, single)
-    together, factor = _scaled_covariance(together)
-    rig = Rig(together.fit.problem.cameras)
+    return _finished(
+        *_scaled_covariance(together), initial, board, single, _images_left_out(views, single, initial.left_out)
+    )
+
+
+def _from_start(
+    cameras: Mapping[str, Camera], views: Mapping[str, BoardViews], board: Board, deviations: StartDeviations
+) -> Calibration:
+    """Calibrate cameras with their start as a prior, all at once."""
+    initial = rig_near_start(cameras, views, board)
+    priors = {name: start_prior(camera, deviations) for name, camera in cameras.items()}
+    placed = {name: c.replace(cam_from_world=initial.cam_from_world[name]) for name, c in cameras.items()}
+    detected, flat = initial.views, _flat(board, initial.world_from_board, initial.views)
+    problem = replace(_problem(placed, initial.world_from_board, detected, board), priors=priors)
+    fit, free, notes = _fitted(problem, flat)
+    used = {name: _near_fit(fit, name, v, initial, board) for name, v in detected.items()}
+    if left_out := [note for name, v in detected.items() for note in _points_left_out(name, v, used[name])]:
+        initial = initial._replace(views=used)
+        boards = fit.problem.board_poses(initial.world_from_board)
+        fit, free, notes = _fitted(replace(_problem(fit.problem.cameras, boards, used, board), priors=priors), flat)
+    far = (f"{name}: left out {key}: its board contradicts the start" for name, key in initial.left_out)
+    together, factor = _scaled_covariance(_JointFit(fit, free, notes))
+    return _finished(together, factor, initial, board, {}, [*start_notes(together.fit, deviations), *far, *left_out])
+
+
+def _near_fit(fit: BundleResult, name: str, views: BoardViews, initial: InitialRig, board: Board) -> BoardViews:
+    """A camera's views without the points that a fit of all cameras shows to be outliers."""
+    camera, boards = fit.problem.cameras[name], fit.problem.board_poses(initial.world_from_board)
+    poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
+    points = board.points if fit.problem.shape is None else fit.problem.shape.deformed(board.points, board.part)
+    return without_outliers(views, camera, poses, points, sigma=fit.sigma[name])
+
+
+def _finished(
+    together: _JointFit,
+    factor: float,
+    initial: InitialRig,
+    board: Board,
+    single: Mapping[str, SingleCalibration],
+    notes: Iterable[str],
+) -> Calibration:
+    """The calibration by a fit of all cameras, with its errors, and notes after those given."""
+    rig, frames = Rig(together.fit.problem.cameras), tuple(initial.world_from_board)
     return Calibration(
         rig=rig,
         board=board,
         fit=together.fit,
-        frames=tuple(initial.world_from_board),
+        frames=frames,
         views=initial.views,
         single={name: a.fit.problem.rms() for name, a in single.items()},
         epipolar=epipolar_errors(rig, initial.views),
         notes=(
-            *_images_left_out(views, single, initial.left_out),
+            *notes,
             *together.notes,
             *together.shape_notes(board),
-            *misfit_notes(together.fit, tuple(initial.world_from_board)),
+            *misfit_notes(together.fit, frames),
             *_noted(factor),
         ),
         raised=factor,
@@ -163,7 +203,7 @@ def calibrate_single(
         if _count_points(used) == _count_points(before):
             break
     found = SingleCalibration(fit, before, tuple(poses), tuple(notes))
-    check_tilts(name, found.cam_from_board)
+    check_tilts(name, found.cam_from_board, board)
     return found
 
 
@@ -216,7 +256,7 @@ class _JointFit(NamedTuple):
         return described(problem.shape, deviations, board.extents)
 
 
-def _joint_fit(problem: BundleProblem, flat: BoardShape, single: Mapping[str, SingleCalibration]) -> _JointFit:
+def _joint_fit(problem: BundleProblem, flat: BoardShape | None, single: Mapping[str, SingleCalibration]) -> _JointFit:
     """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
 
     Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
@@ -238,14 +278,14 @@ def _joint_fit(problem: BundleProblem, flat: BoardShape, single: Mapping[str, Si
     return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"])
 
 
-def _as_prior(name: str, single: SingleCalibration) -> IntrinsicsPrior:
+def _as_prior(name: str, single: SingleCalibration) -> CameraPrior:
     """The single calibration of a camera as a prior of its intrinsics; none for parameters that were fixed."""
     fit, entries = single.fit, parameter_names(single.camera)
     free = [entries.index(entry.removeprefix(f"{name}.")) for entry in fit.names]
     information = np.zeros((len(entries), len(entries)))
     if fit.covariance is not None:
         information[np.ix_(free, free)] = np.linalg.inv(fit.covariance)
-    return IntrinsicsPrior(intrinsic_values(single.camera), information)
+    return CameraPrior(intrinsic_values(single.camera), information)
 
 
 def _count_points(views: BoardViews) -> int:
@@ -269,8 +309,10 @@ def _problem(
     )
 
 
-def _flat(board: Board, boards: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardShape:
-    """Flat boards, in the order of the blocks."""
+def _flat(board: Board, boards: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardShape | None:
+    """Flat boards, in the order of the blocks; None for points whose positions are known."""
+    if isinstance(board, KnownPoints):
+        return None
     first = {key: d.ids[0] for v in views.values() for key, d in v.seen.items()}
     return BoardShape.flat(board.points, board.part, board.part[[first[key] for key in boards]])
 
@@ -281,14 +323,17 @@ def _observations(views: BoardViews, index: Mapping[FrameKey, int], board: Board
 
 
 def _fitted(
-    problem: BundleProblem, flat: BoardShape, *, final: bool = True
+    problem: BundleProblem, flat: BoardShape | None, *, final: bool = True
 ) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
     """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that are clearly
     neither `flat` nor printed true get a shape.
     """
-    full = {name: _free(camera, index > 0) for index, (name, camera) in enumerate(problem.cameras.items())}
+    full = {
+        name: _free(camera, index > 0 or problem.priors[name].pose is not None)
+        for index, (name, camera) in enumerate(problem.cameras.items())
+    }
     problem, free, notes = gate(problem, full, noise(problem, 0), final=False)
     fit = _with_shape(adjust(problem, free), free, flat)
     for _ in range(ROUNDS):
@@ -304,9 +349,9 @@ def _fitted(
         notes, fit = notes + dropped, adjust(problem, free)
 
 
-def _with_shape(fit: BundleResult, free: Free, flat: BoardShape) -> BundleResult:
+def _with_shape(fit: BundleResult, free: Free, flat: BoardShape | None) -> BundleResult:
     """The fit with the boards' shapes as unknowns if they matter, by the points and by how frames agree on them."""
-    if fit.problem.shape is not None:
+    if flat is None or fit.problem.shape is not None:
         return fit
     trial = replace(fit.problem, shape=flat)
     try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from glob import escape
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 from matplotlib import rc_context
 
+from arraygeom import Rig
 from arraygeom.atomic import sweep, write_atomically, write_text, write_together
 from arraygeom.rig import depth_range
 
@@ -15,8 +17,9 @@ from .collect import Progress, collect_folder
 from .intrinsics import Lens
 from .lens_comparison import compare_lenses
 from .printing import draw_board
-from .report import coverage_advice, coverages, report_html, rig_covariance, summary
+from .report import by_cameras, coverage_advice, coverages, report_html, rig_covariance, summary
 from .rig import calibrate
+from .start import StartDeviations
 from .target import parse_board, parse_boards
 
 
@@ -35,11 +38,15 @@ def calibrate_photos(
     patterns: Mapping[str, str] | None = None,
     lens: Lens | Literal["auto"] = "brown-conrady",
     depth: tuple[float, float] | None = None,
+    start: Path | None = None,
+    deviations: StartDeviations | None = None,
     progress: Progress | None = None,
 ) -> CalibrationOutput:
     """Calibrate from a folder of images; write the rig file, its report and its covariance, the rig last.
 
     Several boards may be in the images at once. The lens "auto" is, for each camera, the model that its images support.
+    `start` is the file of a rig known to within `deviations`: one image of each camera is enough then, such as one
+    called like the camera.
     Raises ValueError and OSError for unusable images, and then writes nothing.
     """
     if out.suffix.lower() not in (".yaml", ".yml"):
@@ -47,10 +54,15 @@ def calibrate_photos(
     if depth is not None:
         depth_range(*depth)
     target = parse_boards([board] if isinstance(board, str) else board)
+    nominal = None if start is None else Rig.load(start)
+    if nominal is not None:
+        if lens == "auto":
+            raise ValueError("--lens auto compares lenses on held-out frames: with --start name one")
+        patterns = patterns or _named_like(photos, nominal)
     found = collect_folder(photos, target, patterns=patterns, progress=progress)
     comparisons = compare_lenses(found.views, target) if lens == "auto" else {}
     chosen = {name: comparisons[name].advised if lens == "auto" else lens for name in found.views}
-    calibration = calibrate(found.views, target, lens=chosen)
+    calibration = calibrate(found.views, target, lens=chosen, start=nominal, deviations=deviations)
     lenses = [f"{name}: {c.advice}" for name, c in comparisons.items()]
     rig = calibration.rig.replace(depth=depth, name=out.stem)
     written = [out.with_suffix(".html"), out.with_suffix(".covariance.json"), out]
@@ -69,8 +81,14 @@ def calibrate_photos(
             covariance.save(folder / written[1].name)
         rig.save(folder / out.name)
     advice = coverage_advice(calibration, coverages(calibration))
-    messages = [summary(calibration), *lenses, *found.notes, *calibration.notes, *advice]
+    messages = [summary(calibration), *by_cameras([*lenses, *found.notes, *calibration.notes, *advice])]
     return CalibrationOutput(messages, [path for path in written if path.exists()])
+
+
+def _named_like(folder: Path, rig: Rig) -> dict[str, str] | None:
+    """A pattern for each camera if the folder holds a file called like each."""
+    patterns = {name: f"{escape(name)}.*" for name in rig.names}
+    return patterns if all(any(folder.glob(pattern)) for pattern in patterns.values()) else None
 
 
 def write_board(board: str, out: Path, *, paper: str | None = None) -> Path:

@@ -10,6 +10,8 @@ A board is specified by a short text:
 - ``aprilgrid:6x6:88mm:0.3``: tags across x down, side of a tag, space between tags as a share of it (Kalibr's layout,
   tag family 36h11; ``border1`` for tags with one black bit around them instead of two); or Kalibr's own target file.
 
+- ``targets.csv:4x4``: markers at known positions (see `known_points`).
+
 ``from24`` at the end of a board with markers: its first marker has this number, so that several boards differ.
 
 Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the board, the first point at the origin.
@@ -51,6 +53,11 @@ class Board(ABC):
     spacing: float
     identified: ClassVar[bool] = False
     """Whether points are identified one by one, by markers."""
+
+    @property
+    def flat(self) -> bool:
+        """Whether the points lie in a plane."""
+        return True
 
     @property
     def members(self) -> tuple[Board, ...]:
@@ -136,7 +143,7 @@ class MarkedBoard(Board):
 
     @property
     @abstractmethod
-    def markers(self) -> range:
+    def markers(self) -> Sequence[int]:
         """The numbers of its markers."""
 
 
@@ -233,7 +240,7 @@ class AprilGrid(MarkedBoard):
         tag, gap = 1e3 * self.tag, 1e3 * self.gap
         for number, corners in zip(self.markers, self.corners):
             left, top = 1e3 * self.points[corners[0], :2] + gap
-            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, turns=2)
+            _draw_marker(axes, self.dictionary, number, left, top, tag, border=self.border, quarter_turns=2)
         for column, row in np.ndindex(self.columns // 2 + 1, self.rows // 2 + 1):
             axes.add_patch(_black(column * (tag + gap), row * (tag + gap), gap, gap))
 
@@ -318,9 +325,16 @@ class Circles(Board):
 
 
 def parse_board(text: str) -> Board:
-    """The board that a text specifies, such as ``charuco:8x6:30mm``; see the module. Raises ValueError."""
+    """The board that a text specifies, such as ``charuco:8x6:30mm``; see the module.
+
+    Raises ValueError, or FileNotFoundError for a file that is not there.
+    """
     if text.lower().endswith((".yaml", ".yml")):
         text = _kalibr_target(Path(text))
+    if ".csv" in text:
+        from .known_points import known_points
+
+        return known_points(text)
     kind, _, rest = text.strip().lower().partition(":")
     parts = rest.split(":")
     if kind not in ("chessboard", "charuco", "circles", "acircles", "aprilgrid") or len(parts) < 2:
@@ -364,12 +378,20 @@ def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
 
 
 def _draw_marker(
-    axes: Any, dictionary: str, number: int, left: float, top: float, side: float, *, border: int = 1, turns: int = 0
+    axes: Any,
+    dictionary: str,
+    number: int,
+    left: float,
+    top: float,
+    side: float,
+    *,
+    border: int = 1,
+    quarter_turns: int = 0,
 ) -> None:
-    """Runs of black bits as one rectangle each: no hairlines between bits. `turns` are quarters."""
+    """Runs of black bits as one rectangle each: no hairlines between bits."""
     known = marker_dictionary(dictionary)
     bits = known.markerSize + 2 * border
-    black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, turns)
+    black = np.rot90(cv2.aruco.generateImageMarker(known, number, bits, borderBits=border) == 0, quarter_turns)
     step = side / bits
     for row, line in enumerate(black):
         edges: np.ndarray = np.flatnonzero(np.diff(np.concatenate([[0], line.astype(int), [0]])))
@@ -399,7 +421,7 @@ def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[s
         raise ValueError(
             f"board '{text}': markers of {_millimetres(marker)} do not fit into squares that are no larger"
         )
-    name = _dictionary_name(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
+    name = smallest_dictionary(text, names[0] if names else "4x4", first + (columns * rows + 1) // 2)
     return Charuco(columns - 1, rows - 1, spacing, name, first, marker=marker, legacy="legacy" in options)
 
 
@@ -440,8 +462,11 @@ def _kalibr_target(path: Path) -> str:
     raise ValueError(f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares")
 
 
-def _dictionary_name(text: str, name: str, markers: int) -> str:
-    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers."""
+def smallest_dictionary(text: str, name: str, markers: int) -> str:
+    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers.
+
+    `text` names the target in the ValueError where there is none.
+    """
     names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
     for full in names:
         if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:

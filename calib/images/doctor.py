@@ -19,6 +19,7 @@ from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 
+from .held_out import image_parts
 from .matches import Matches, match_cameras
 from .plausibility import least_surprise
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
@@ -202,13 +203,22 @@ def _clearly_better(
     inliers: Tensor,
     noise: float,
 ) -> bool:
-    """Whether a mistake explains the points clearly better than a drift of the given rig does."""
-    given, repaired = (
-        least_surprise(r, pairs, inliers, noise, mirrored=f.handed < 0.5)
-        for r, f in zip((rig, remedy.repair(rig)), figures)
-    )
+    """Whether a mistake explains the points clearly better than a drift of the rig does, whatever part is left out.
+
+    Points of one object, or wrong ones in one place, do not decide: the mistake is better without each part in turn.
+    """
     before, after = (f.penalised_misfit for f in figures)
-    return after <= max(EXPLAINED[0], EXPLAINED[1] * before) and repaired + MARGIN < given
+    if after > max(EXPLAINED[0], EXPLAINED[1] * before):
+        return False
+    rigs, parts = (rig, remedy.repair(rig)), image_parts(rig, pairs)
+    for left_out in (None, *parts.unique().tolist()):
+        used = inliers if left_out is None else inliers & (parts != left_out)
+        given, repaired = (
+            least_surprise(r, pairs, used, noise, mirrored=f.handed < 0.5) for r, f in zip(rigs, figures)
+        )
+        if repaired + MARGIN >= given:
+            return False
+    return True
 
 
 def _thinned(matches: Matches) -> Matches:

@@ -15,9 +15,10 @@ from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
 
+from .held_out import line_distances, split
 from .lenses import describe_lenses
 from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, with_map
-from .refinement import line_distances, refine_matches, split
+from .refinement import refine_matches
 
 LOG = logging.getLogger(__name__)
 

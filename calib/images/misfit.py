@@ -13,8 +13,8 @@ from torch import Tensor
 from arraygeom import Rig
 
 from .doctor import diagnose_matches
+from .held_out import line_distances
 from .matches import Matches, match_cameras
-from .refinement import line_distances
 from .residuals import match_depths, own_distance, related
 
 LARGEST_SIDE = 1000

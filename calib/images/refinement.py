@@ -20,19 +20,20 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, Rig
 
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
+from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, nearer, split
 from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
 from .matches import ENOUGH, Matches, match_cameras, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
-from .residuals import epipolar_residuals, own_distance, related, sampson_of_pairs, systematic_modes
+from .residuals import own_distance, related, sampson_of_pairs, systematic_modes
 
 LOG = logging.getLogger(__name__)
 
@@ -51,14 +52,6 @@ LARGEST_DISTANCE, OF_OWN = 1.0, 3.0
 this many times their distance from the lines of an F fitted to them."""
 AT_BEST = 1.1
 """No more is freed where held-out points are within this factor of their distance from such lines."""
-HELD_OUT = 4
-"""One in this many points or frames is held out."""
-CELL = 24
-"""Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
-SIGNIFICANT = 2.0
-"""Standard errors by which the distances of held-out points must decrease."""
-PARTS = 3
-"""The jackknife leaves out one of so many by so many parts of the image."""
 UNCHANGED = 1e-3
 """Relative deviation of depth within which a pattern of depth stays."""
 CORRELATED_PIXELS = 10.0
@@ -226,7 +219,7 @@ class RefinementProblem:
         """
         if not bool(solution.active.any()):
             return solution
-        changes = left_out(residuals, solution, _parts(self.rig, self.used), PARTS**2)
+        changes = left_out(residuals, solution, image_parts(self.rig, self.used), PARTS**2)
         found = solution._replace(z=torch.zeros_like(solution.z))
         for _ in range(2):
             values = log_depths(self.after, [self.rig, self.after(found.z)], self.used)
@@ -337,16 +330,6 @@ def _uncertain_depth(depth: DepthChange | None) -> list[str]:
     return found
 
 
-def _parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
-    """Which of `PARTS` x `PARTS` parts of alpha's image each point is in."""
-    found = []
-    for names, matches in pairs.items():
-        h, w = rig[names[0]].hw
-        cell = (matches.alpha * PARTS / matches.alpha.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
-        found.append(cell[:, 0] + PARTS * cell[:, 1])
-    return torch.cat(found)
-
-
 def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
     """Derivatives of all distances by what the calibrated cameras' lens models leave, in prior deviations."""
     names = [name for name in rig.names if isinstance(rig[name], Camera) and any(name in pair for pair in pairs)]
@@ -376,7 +359,7 @@ def polish(
 
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
         parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
-        return torch.cat([error[valid & (_held_out_pixels(error) == held_out)] for error, valid in parts])
+        return torch.cat([error[valid & (held_out_pixels(error) == held_out)] for error, valid in parts])
 
     LOG.info("minimising the photometric error, %d frames", len(frames))
     noise = noise_scale(errors(solution.z, held_out=False).detach())
@@ -395,54 +378,6 @@ def polish(
     before, after = (float(errors(v, held_out=True).detach().abs().mean()) for v in (solution.z, z))
     off = [line_distances(fit.after(v), fit.held_out) for v in (z, solution.z)]
     return solution._replace(z=z), PhotometricResult(before, after, after < before and not nearer(*off))
-
-
-def _held_out_pixels(error: Tensor) -> Tensor:
-    """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
-    rows, columns = (torch.arange(n) // 4 for n in error.shape)
-    return (columns + 2 * rows[:, None]) % HELD_OUT == 0
-
-
-def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:
-    """Statistics of the distances of points from their lines."""
-    nearest = distance.abs().sort().values[: max(1, int(0.85 * len(distance)))]
-    return LineStatistics(len(distance), float(distance.abs().median()), float(nearest.square().mean().sqrt()))
-
-
-def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
-    """Whether distances from the lines decreased significantly: a paired test, distances clipped at 5 px."""
-    gain = before.abs().clamp(max=5) - after.abs().clamp(max=5)
-    return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
-
-
-def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
-    """Signed distances in pixels of all points from their lines, in beta."""
-    return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
-
-
-def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:
-    """Points to use and points to hold out: whole frames if there are several, else squares of alpha's image."""
-    if len(frames) > 1:
-        held_out = max(1, len(frames) // HELD_OUT)
-        return _joined(frames[:-held_out]), _joined(frames[-held_out:])
-    (pairs,) = frames
-    marks = {names: _held_out_points(matches) for names, matches in pairs.items()}
-    return (
-        {names: matches.only(~marks[names]) for names, matches in pairs.items()},
-        {names: matches.only(marks[names]) for names, matches in pairs.items() if bool(marks[names].any())},
-    )
-
-
-def _held_out_points(matches: Matches) -> Tensor:
-    """Points in one square out of `HELD_OUT`."""
-    column, row = (matches.alpha / CELL).floor().long().unbind(-1)
-    return (column + 2 * row) % HELD_OUT == 0
-
-
-def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], Matches]:
-    names = dict.fromkeys(name for frame in frames for name in frame)
-    parts = {name: [frame[name] for frame in frames if name in frame] for name in names}
-    return {name: Matches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
 
 
 def _with_maps(rig: Rig, pairs: Pairs) -> Rig:

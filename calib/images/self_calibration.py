@@ -20,9 +20,10 @@ from torch import Tensor
 from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
 from arraygeom.pixels import map_homogeneous
 
+from .held_out import line_distances
 from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
-from .refinement import line_distances, refine_matches
+from .refinement import refine_matches
 
 LOG = logging.getLogger(__name__)
 

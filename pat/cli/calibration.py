@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
 from .options import Depth, Out, say
+
+if TYPE_CHECKING:
+    from calib.boards.start import StartDeviations
 
 BOARDS = (
     "charuco:8x6:30mm (squares), chessboard:9x6:25mm (inner corners), circles:7x5:20mm, acircles:4x11:20mm, "
@@ -41,6 +44,11 @@ class Calibrate:
     """Lens model; kannala-brandt for fisheyes. auto compares them on held-out frames and takes what they support."""
     depth: Depth = None
     """Near and far bounds in metres of the scenes to come, written into the rig."""
+    start: Annotated[Path | None, options.optional("RIG")] = None
+    """A rig known roughly, such as measured positions and nominal focal lengths: one image a camera is enough then."""
+    deviation: UseAppendAction[Annotated[tuple[str, ...], arg(metavar="NAME=VALUE")]] = ()
+    """How well the start is known: position=0.0005 (m), rotation=3 (degrees), focal=0.02 (share of the focal length),
+    centre=0.01 (share of the width); these are the defaults."""
     watch: bool = False
     """While images are taken: a page (.watch.html) with what was detected and which view would help most."""
 
@@ -60,10 +68,19 @@ class Calibrate:
             patterns={name: str(pattern) for name, pattern in patterns.items()},
             lens=self.lens,
             depth=self.depth,
+            start=self.start,
+            deviations=self._deviations(),
             progress=options.progress("detecting the board"),
         )
         print("\n".join(found.messages))
         say(f"written: {', '.join(map(str, found.written))}")
+
+    def _deviations(self) -> StartDeviations:
+        from calib.boards.start import StartDeviations
+
+        if self.deviation and self.start is None:
+            raise ValueError("--deviation is of a --start: give the rig too")
+        return StartDeviations.of(options.numbers_by_name(self.deviation, "--deviation"))
 
     def _watch(self, patterns: dict[str, str]) -> None:
         from calib.boards.target import parse_boards

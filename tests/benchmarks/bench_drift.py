@@ -21,12 +21,12 @@ import numpy as np
 import torch
 
 from arraygeom import Rig
-from arraygeom.atomic import write_text
 from calib.images.depth_change import observed_depths
 from calib.images.matches import match_cameras
 from calib.images.refinement import refine_matches
 from calib.images.remedies import swap
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.printed import print_tables
 from tests.calib.real import RealPair, bumblebee, syntim
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -115,13 +115,7 @@ def main() -> None:
     cv2.setRNGSeed(0)
     torch.set_num_threads(1)
     tables = {"simulated": lambda: simulated(options.draws), "real": lambda: real(options.data, options.draws)}
-    lines = []
-    for table in [tables[name]() for name in options.only]:
-        for line in chain(table, [""]):
-            print(line, flush=True)
-            lines.append(line)
-    if options.out:
-        write_text(options.out, "# Depth of drifted rigs after refinement\n\n" + "\n".join(lines))
+    print_tables("Depth of drifted rigs after refinement", (tables[name]() for name in options.only), options.out)
 
 
 if __name__ == "__main__":

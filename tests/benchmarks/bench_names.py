@@ -20,12 +20,12 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig
-from arraygeom.atomic import write_text
 from calib.images.doctor import Diagnosis, diagnose_matches
 from calib.images.matches import match_cameras, seen_depths
 from calib.images.remedies import TRANSPOSE, on_cameras, on_pixels, rotated_view, swap
 from pat.evaluation.tables import markdown_header, markdown_row
 from tests.benchmarks.bench_drift import drifted, error
+from tests.benchmarks.printed import print_tables
 from tests.calib.real import bumblebee, syntim
 from tests.calib.simulated import simulated_matches, simulated_rig
 
@@ -155,7 +155,7 @@ def table(cases: dict[str, Callable[[Random, bool], Case]], draws: int) -> Itera
                 outcomes[outcome] += 1
                 names[found.named.kind] += 1
                 if outcome in ("worse", "wrong", "false alarm"):
-                    notes.append(f"{label}, {what}, draw {draw}: {outcome}: {found.as_text()}")
+                    notes.append(f"{label}, {what}, draw {draw}: {outcome}: {found.verdict}")
             totals += outcomes
             if outcomes:
                 spoken = ", ".join(f"{name} {count}" for name, count in names.most_common())
@@ -177,12 +177,7 @@ def main() -> None:
         cases = {name: lambda g, lens, case=case: case for name, case in real_cases(options.data)}
     else:
         cases = {f: lambda g, lens, f=f: simulated_case(f, g, lens=lens) for f in ("wide", "narrow")}
-    lines = []
-    for line in table(cases, options.draws):
-        print(line, flush=True)
-        lines.append(line)
-    if options.out:
-        write_text(options.out, "# What the doctor names\n\n" + "\n".join(lines) + "\n")
+    print_tables("What the doctor names", [table(cases, options.draws)], options.out)
 
 
 if __name__ == "__main__":

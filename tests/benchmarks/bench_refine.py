@@ -21,21 +21,11 @@ import torch
 from torch import Tensor
 
 from arraygeom import Link, Rig, View
-from arraygeom.atomic import write_text
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
+from calib.images.held_out import line_distances, line_statistics, split
 from calib.images.matches import Matches, fit_fundamental, line_distance, match_cameras
-from calib.images.refinement import (
-    FREE,
-    LineStatistics,
-    RefinementProblem,
-    line_distances,
-    line_statistics,
-    polish,
-    refine,
-    refine_matches,
-    split,
-)
+from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
 from pat.evaluation.ablation import AblationCase, rendered_cases
@@ -45,6 +35,7 @@ from pat.fusion.fuse import fuse
 from pat.media.images import read_image
 from pat.networks.weights import load_weights
 from pat.systems.showcase import FAST, FAST_FRAME, SCENE, SLOW, SLOW_FRAME, published_matrices
+from tests.benchmarks.printed import print_tables
 from tests.calib.real import bumblebee, syntim
 from tests.calib.scenes import uninformed
 
@@ -180,13 +171,7 @@ def main() -> None:
         "photometry": lambda: by_photometry(options.draws, g),
         "real": lambda: real_pairs(options.data, options.draws, g),
     }
-    lines = []
-    for table in [tables[name]() for name in options.only or tables]:
-        for line in chain(table, [""]):
-            print(line, flush=True)
-            lines.append(line)
-    if options.out:
-        write_text(options.out, "# Refinement of rigs\n\n" + "\n".join(lines))
+    print_tables("Refinement of rigs", (tables[name]() for name in options.only or tables), options.out)
 
 
 if __name__ == "__main__":

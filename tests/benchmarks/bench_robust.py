@@ -4,6 +4,7 @@
 
 Two cameras, 14 frames, corners good to 0.1 px; a share of them lies up to 40 px elsewhere. *chi-square* is that of all
 estimated parameters per degree of freedom (mean and largest of the draws), 1 if the stated covariance is right.
+*refused*: draws that raise an error.
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ import torch
 from tqdm import tqdm
 
 from arraygeom import Rig
-from arraygeom.atomic import write_text
 from calib.boards.detect import Detection
 from calib.boards.intrinsics import BoardViews
 from calib.boards.rig import Calibration, calibrate
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.printed import print_tables
 from tests.calib.board_scenes import BOARD, board_poses, errors_of, four_cameras, see
 
 NOISE = 0.1
@@ -68,19 +69,22 @@ def judged(share: float, draw: int) -> Draw:
 
 
 def rows(draws: int, shares: Sequence[float]) -> Iterator[str]:
-    yield markdown_header(["wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px"])
-    beyond = []
+    columns = ("wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px", "refused")
+    yield markdown_header(columns)
+    notes = []
     for share in shares:
-        judgements: list[Draw] = []
-        for draw in (progress := tqdm(range(draws), desc=f"{share:.0%}")):
-            judgements.append(judged(share, draw))
-            progress.set_postfix(worst=max(d.worst for d in judgements))
-        bad = [i for i, d in enumerate(judgements) if d.worst > 5]
-        worst, squares, rms = (np.array(column) for column in zip(*judgements))
-        cells = f"{worst.max():.1f}", len(bad), f"{squares.mean():.2f}, {squares.max():.2f}", f"{rms.max():.3f}"
-        yield markdown_row([f"{share:.0%}", draws, *cells])
-        beyond += [f"{share:.0%} draw {i}: {judgements[i].worst:.1f} sigma" for i in bad]
-    yield "\n".join(["", *beyond])
+        found: dict[int, Draw] = {}
+        for draw in tqdm(range(draws), desc=f"{share:.0%}"):
+            try:
+                found[draw] = judged(share, draw)
+            except ValueError as error:
+                notes.append(f"{share:.0%} draw {draw}: {error}")
+        beyond = [f"{share:.0%} draw {i}: {d.worst:.1f} sigma" for i, d in found.items() if d.worst > 5]
+        worst, squares, rms = (np.array(column) for column in zip(*found.values()))
+        cells = f"{worst.max():.1f}", len(beyond), f"{squares.mean():.2f}, {squares.max():.2f}", f"{rms.max():.3f}"
+        yield markdown_row([f"{share:.0%}", draws, *cells, draws - len(found)])
+        notes += beyond
+    yield "\n".join(["", *notes])
 
 
 def main() -> None:
@@ -91,12 +95,7 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
-    lines = []
-    for row in rows(options.draws, options.shares):
-        print(row, flush=True)
-        lines.append(row)
-    if options.out:
-        write_text(options.out, "# Board calibration with wrong corners\n\n" + "\n".join(lines).rstrip() + "\n")
+    print_tables("Board calibration with wrong corners", [rows(options.draws, options.shares)], options.out)
 
 
 if __name__ == "__main__":

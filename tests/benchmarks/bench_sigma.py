@@ -15,13 +15,14 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from arraygeom.atomic import write_text
-from calib.boards.bundle import BundleProblem, BundleResult, intrinsic_values, readjusted
+from calib.boards.bundle import BundleProblem, BundleResult, readjusted
+from calib.boards.camera_parameters import intrinsic_values
 from calib.boards.collect import collect_folder
 from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import without_blocks
 from pat.evaluation.tables import markdown_header, markdown_row
+from tests.benchmarks.printed import print_tables
 
 
 def sets(data: Path) -> Iterator[tuple[str, Calibration]]:
@@ -85,12 +86,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    lines = []
-    for row in rows(options.data):
-        print(row, flush=True)
-        lines.append(row)
-    if options.out:
-        write_text(options.out, "# Stated sigma on real boards\n\n" + "\n".join(lines) + "\n")
+    print_tables("Stated sigma on real boards", [rows(options.data)], options.out)
 
 
 if __name__ == "__main__":

@@ -4,7 +4,8 @@ import numpy as np
 import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.boards.bundle import BoardPoses, BundleProblem, Observations, parameter_names
+from calib.boards.bundle import BoardPoses, BundleProblem, Observations
+from calib.boards.camera_parameters import parameter_names
 from calib.boards.detect import Detection
 from calib.boards.intrinsics import BoardViews
 from calib.boards.target import Board, parse_board
@@ -86,10 +87,9 @@ def errors_of(fit, rig):
         ground_truth = rig[name]
         R = (camera_found.R @ ground_truth.R.T).numpy()
         turn = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
-        K, lens = (
-            (camera_found.K - ground_truth.K).numpy(),
-            camera_found.distortion.coefficients - ground_truth.distortion.coefficients,
-        )
+        K = (camera_found.K - ground_truth.K).numpy()
+        lenses = [c.distortion.coefficients for c in (camera_found, ground_truth) if c.distortion is not None]
+        lens = lenses[0] - lenses[1] if lenses else torch.zeros(0)
         values = [*turn, *(camera_found.t - ground_truth.t).numpy(), K[0, 0], K[1, 1], K[0, 2], K[1, 2], *lens.numpy()]
         entries = [f"{name}.{entry}" for entry in parameter_names(camera_found)]
         found += [v for v, entry in zip(values, entries) if entry in fit.names]

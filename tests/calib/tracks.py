@@ -15,7 +15,8 @@ from jaxtyping import Float
 
 from arraygeom import Rig, triangulate
 from arraygeom.io import read_rig
-from calib.boards.bundle import BundleProblem, Observations, parameter_names
+from calib.boards.bundle import BundleProblem, Observations
+from calib.boards.camera_parameters import parameter_names
 from calib.boards.detect import Detection
 from calib.boards.intrinsics import BoardViews
 

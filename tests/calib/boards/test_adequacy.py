@@ -12,8 +12,9 @@ from calib.boards.adequacy import (
     proposed_views,
     uncertainty,
 )
-from calib.boards.bundle import camera_jacobian, parameter_names
+from calib.boards.camera_parameters import camera_jacobian, parameter_names
 from calib.boards.lens_comparison import LensComparison, compare_lenses
+from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
 from calib.boards.simulation import simulate_photos
 from calib.boards.target import parse_board
@@ -127,3 +128,8 @@ def test_a_folder_is_watched(tmp_path):
     assert "Next: the board at the" in pages[2]
     assert 'http-equiv="refresh"' in pages[2]
     assert pages[3] == pages[2]
+
+
+def test_notes_of_several_cameras_are_one():
+    notes = ["a: no points: here", "b: no points: here", "held to the start", "b: bent", "a: no points: here"]
+    assert by_cameras(notes) == ["a, b: no points: here", "held to the start", "b: bent"]

@@ -9,18 +9,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import (
-    BoardPoses,
-    BundleProblem,
-    IntrinsicsPrior,
-    Observations,
-    _changed,
-    adjust,
-    camera_jacobian,
-    intrinsic_values,
-    normal_equations,
-    parameter_names,
-)
+from calib.boards.bundle import BoardPoses, BundleProblem, Observations, adjust, normal_equations
+from calib.boards.camera_parameters import CameraPrior, camera_jacobian, changed, intrinsic_values, parameter_names
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import board_poses, camera, errors_of, four_cameras, pose_errors, scene_of, see, tensor
@@ -43,7 +33,7 @@ def shaken(problem, size, seed=0):
     cameras = {}
     for (name, c), mask in zip(problem.cameras.items(), free_of(problem, lens=2).values()):
         scale = np.array([0.01] * 6 + [5.0] * 4 + [0.02] * (len(mask) - 10))
-        cameras[name] = _changed(c, torch.from_numpy(size * mask * scale * random.normal(size=len(mask))))
+        cameras[name] = changed(c, torch.from_numpy(size * mask * scale * random.normal(size=len(mask))))
     change = size * 0.01 * random.normal(size=(len(problem.structure), 6))
     return BundleProblem(cameras, problem.structure.stepped(change), problem.seen)
 
@@ -73,7 +63,7 @@ def test_derivatives_are_those_of_finite_differences(lens, model):
     for i, name in enumerate(parameter_names(c)):
         step = torch.zeros(found.shape[-1], dtype=torch.float64)
         step[i] = 1e-6
-        ends = [_changed(c, s * step).project(torch.from_numpy(X)).x.numpy() for s in (1, -1)]
+        ends = [changed(c, s * step).project(torch.from_numpy(X)).x.numpy() for s in (1, -1)]
         assert np.abs((ends[0] - ends[1]) / 2e-6 - found[..., i]).max() < 1e-5 * (1 + np.abs(found[..., i]).max()), name
 
 
@@ -115,7 +105,7 @@ def test_the_least_squares_are_scipys(small):
         ):
             full = np.zeros(len(mask))
             full[mask] = part
-            cameras[name] = _changed(c, torch.from_numpy(full))
+            cameras[name] = changed(c, torch.from_numpy(full))
         return BundleProblem(cameras, fit.problem.structure.stepped(change[sum(counts) :].reshape(-1, 6)), problem.seen)
 
     def residuals(change):
@@ -138,7 +128,7 @@ def test_a_prior_has_its_stated_weight(small):
     mean[6] += 2 * deviation
     information = np.zeros((len(mean), len(mean)))
     information[6, 6] = deviation**-2
-    held = adjust(replace(alone.problem, priors={"mono": IntrinsicsPrior(mean, information)}), free)
+    held = adjust(replace(alone.problem, priors={"mono": CameraPrior(mean, information)}), free)
     moved = float(held.problem.cameras["mono"].K[0, 0] - alone.problem.cameras["mono"].K[0, 0])
     assert moved == pytest.approx(deviation, rel=0.05)
     assert held.covariance[at, at] == pytest.approx(deviation**2 / 2, rel=0.05)

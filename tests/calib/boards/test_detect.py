@@ -109,3 +109,6 @@ def test_a_larger_chessboard_is_noticed_though_a_part_of_it_is_found():
     assert other_size([grey, grey], parse_board("chessboard:8x6:25mm")) == "9x6"
     assert other_size([grey, grey], board) is None
     assert other_size([grey, grey], parse_board("chessboard:6x9:25mm")) is None
+    assert other_size([grey, grey], parse_board("chessboard:8x6:25mm"), larger=True) == "9x6"
+    assert other_size([grey, grey], parse_board("chessboard:10x7:25mm")) == "9x6"
+    assert other_size([grey, grey], parse_board("chessboard:10x7:25mm"), larger=True) is None, "a patch of it"

@@ -58,6 +58,16 @@ def test_names_that_begin_with_the_camera(tmp_path):
     assert {n: list(m) for n, m in find_photos(tmp_path).items()} == {"left": [1, 2], "right": [1, 3]}
 
 
+def test_one_image_of_each_camera_is_one_moment(tmp_path):
+    for name in ("cam-0", "cam-1"):
+        write(tmp_path / f"{name}.png")
+    found = find_photos(tmp_path, patterns={"cam-0": "cam-0.png", "cam-1": "cam-1.png"})
+    assert [list(moments) for moments in found.values()] == [["image 1"], ["image 1"]]
+    write(tmp_path / "cam-1b.png")
+    found = find_photos(tmp_path, patterns={"cam-0": "cam-0.png", "cam-1": "cam-1*.png"})
+    assert found["cam-0"].keys() == {0} != found["cam-1"].keys()
+
+
 def test_patterns_say_it_outright(tmp_path):
     for name in ("1_L", "2_L", "1_R", "2_R"):
         write(tmp_path / f"{name}.png")

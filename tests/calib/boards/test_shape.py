@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
-from calib.boards.bundle import jackknife
 from calib.boards.detect import Detection, detect
 from calib.boards.intrinsics import BoardViews
+from calib.boards.jackknife import jackknife
 from calib.boards.rig import calibrate
 from calib.boards.shape import BoardShape
 from calib.boards.simulation import photograph
@@ -121,3 +121,17 @@ def test_leaving_a_frame_out_keeps_the_others():
     assert len(part.structure) == len(problem.structure) - 1 == len(part.shape.part)
     before, after = problem.residuals()["mono"], part.residuals()["mono"]
     assert np.allclose(before[problem.seen["mono"].block != 3], after)
+
+
+@pytest.mark.slow
+def test_a_rendered_cylinder_is_recovered():
+    """A board bent about 2 m, and printed 0.3 % too long, by photographs of it."""
+    board, c = parse_board("charuco:9x7:40mm"), camera(700.0, (480, 640), lens=(-0.2, 0.05, 0, 0, 0))
+    shape, poses, seen = shaped([0.003, 0.5, 0.0, 0.0], board), board_poses(14, depth=(0.5, 0.9), spread=0.1), {}
+    for i in range(14):
+        middle = poses.R[i] @ torch.from_numpy(board.points.mean(0) - BOARD.points.mean(0))
+        pose = Pose(poses.R[i], poses.t[i] - middle)
+        seen[i] = detect(photograph(c, pose, board, shape=shape), board)
+    found = calibrate({"c": BoardViews(c.hw, {i: d for i, d in seen.items() if d is not None})}, board)
+    assert np.abs(found.fit.problem.shape.values[0] - [0.003, 0.5, 0.0, 0.0]).max() < 0.03
+    assert float(found.rig["c"].K[0, 0]) == pytest.approx(700, rel=0.005)

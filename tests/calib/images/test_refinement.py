@@ -7,18 +7,11 @@ import pytest
 import torch
 
 from arraygeom import Camera, Link, Rig, View
+from calib.images.held_out import line_distances
 from calib.images.matches import Matches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
 from calib.images.photometric import PhotometricFrame, photometric_errors
-from calib.images.refinement import (
-    RefinementProblem,
-    jacobian,
-    line_distances,
-    polish,
-    refine,
-    refine_matches,
-    solve,
-)
+from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
 from calib.images.remedies import swap
 from calib.images.residuals import epipolar_residuals, sampson
 from pat.attention import attend_with_statistics

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from arraygeom import Rig
+from calib.images.held_out import line_distances
 from calib.images.matches import Matches, with_map
-from calib.images.refinement import line_distances
 from calib.images.self_calibration import RefinedPair, dense_matches, joined, refined_by_depth, self_calibrated
 from tests.calib.scenes import HW, rectified_images, rectified_pair, seen_points, unlike_pair
 

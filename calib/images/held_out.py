@@ -1,0 +1,84 @@
+"""Points to fit and points to hold out, their distances from their lines, and parts of the image."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from arraygeom import Rig
+
+from .matches import Matches
+from .refined import LineStatistics
+from .residuals import epipolar_residuals
+
+Pairs = Mapping[tuple[str, str], Matches]
+
+HELD_OUT = 4
+"""One in this many points or frames is held out."""
+CELL = 24
+"""Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
+SIGNIFICANT = 2.0
+"""Standard errors by which the distances of held-out points must decrease."""
+PARTS = 3
+"""The jackknife leaves out one of so many by so many parts of the image."""
+
+
+def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:
+    """Statistics of the distances of points from their lines."""
+    nearest = distance.abs().sort().values[: max(1, int(0.85 * len(distance)))]
+    return LineStatistics(len(distance), float(distance.abs().median()), float(nearest.square().mean().sqrt()))
+
+
+def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
+    """Whether distances from the lines decreased significantly: a paired test, distances clipped at 5 px."""
+    gain = before.abs().clamp(max=5) - after.abs().clamp(max=5)
+    return float(gain.mean()) > SIGNIFICANT * float(gain.std()) / len(gain) ** 0.5
+
+
+def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
+    """Signed distances in pixels of all points from their lines, in beta."""
+    return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
+
+
+def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:
+    """Points to use and points to hold out: whole frames if there are several, else squares of alpha's image."""
+    if len(frames) > 1:
+        held_out = max(1, len(frames) // HELD_OUT)
+        return _joined(frames[:-held_out]), _joined(frames[-held_out:])
+    (pairs,) = frames
+    marks = {names: _held_out_points(matches) for names, matches in pairs.items()}
+    return (
+        {names: matches.only(~marks[names]) for names, matches in pairs.items()},
+        {names: matches.only(marks[names]) for names, matches in pairs.items() if bool(marks[names].any())},
+    )
+
+
+def _held_out_points(matches: Matches) -> Tensor:
+    """Points in one square out of `HELD_OUT`."""
+    column, row = (matches.alpha / CELL).floor().long().unbind(-1)
+    return (column + 2 * row) % HELD_OUT == 0
+
+
+def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], Matches]:
+    names = dict.fromkeys(name for frame in frames for name in frame)
+    parts = {name: [frame[name] for frame in frames if name in frame] for name in names}
+    return {name: Matches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
+
+
+def held_out_pixels(error: Tensor) -> Tensor:
+    """Held-out pixels of a grid: one square of 4 x 4 in `HELD_OUT`."""
+    rows, columns = (torch.arange(n) // 4 for n in error.shape)
+    return (columns + 2 * rows[:, None]) % HELD_OUT == 0
+
+
+def image_parts(rig: Rig, pairs: Pairs) -> Int[Tensor, " n"]:
+    """Which of `PARTS` x `PARTS` parts of alpha's image each point is in."""
+    found = []
+    for names, matches in pairs.items():
+        h, w = rig[names[0]].hw
+        cell = (matches.alpha * PARTS / matches.alpha.new_tensor([w, h])).floor().long().clamp(0, PARTS - 1)
+        found.append(cell[:, 0] + PARTS * cell[:, 1])
+    return torch.cat(found)

@@ -1,0 +1,111 @@
+"""Calibration from a start: the nine-band array from one image of a board by each camera.
+
+    python -m tests.benchmarks.bench_start --out tests/benchmarks/RESULTS_start.md
+
+Its makers state the positions (a grid of 40 mm), focal length and size of the sensor, and the print says "30 mm". With
+positions stated to 0.5 mm the rig is what a user gets; stated to 5 mm it shows what the boards alone say of them.
+*scene*: median distance of points matched in the images of a scene, which are not used, from their lines, pixels, for
+the pairs with most points (median and worst pair).
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping
+from itertools import pairwise
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+
+from arraygeom import Camera, Pose, Rig, intrinsics
+from calib.boards.collect import collect_folder
+from calib.boards.covariance import baseline_deviation
+from calib.boards.report import rig_covariance
+from calib.boards.rig import Calibration, calibrate
+from calib.boards.start import StartDeviations
+from calib.boards.target import parse_board
+from calib.images.held_out import line_distances
+from calib.images.matches import Matches, match_cameras
+from pat.evaluation.tables import markdown_header, markdown_row
+from pat.media.images import read_image
+from tests.benchmarks.printed import print_tables
+
+BOARD = "chessboard:11x8:30mm"
+ROWS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
+GRID = 0.04
+ENOUGH = 150
+"""Points of a pair whose distances are reported."""
+
+
+def start_rig(folder: Path) -> Rig:
+    """The array as its makers state it: X to the right, Y up, parallel cameras."""
+    stated = json.loads((folder / "camera_array.json").read_text())
+    cameras = {}
+    for i in range(9):
+        c = stated[f"Camera {i}"]
+        hw = c["image_height"], c["image_width"]
+        centre = torch.tensor([c["X"], -c["Y"], 0.0], dtype=torch.float64) * 1e-3
+        pose = Pose.from_centre(torch.eye(3, dtype=torch.float64), centre)
+        focal = c["focal_length"] / c["sensor_width"] * c["image_width"]
+        cameras[f"Cam-{i}"] = Camera(K=intrinsics(focal, hw), cam_from_world=pose, hw=hw)
+    return Rig(cameras)
+
+
+def calibrated(folder: Path, deviations: StartDeviations) -> Calibration:
+    """The array from its boards."""
+    start, board = start_rig(folder), parse_board(BOARD)
+    views = collect_folder(folder / "calibration", board, patterns={name: f"{name}.png" for name in start.names}).views
+    return calibrate(views, board, start=start, deviations=deviations)
+
+
+def neighbours() -> Iterator[tuple[str, str]]:
+    """Pairs of cameras that stand next to each other."""
+    for line in (*ROWS, *zip(*ROWS)):
+        yield from ((f"Cam-{a}", f"Cam-{b}") for a, b in pairwise(line))
+
+
+def scene_matches(folder: Path) -> dict[tuple[str, str], Matches]:
+    images = {f"Cam-{i}": read_image(folder / "scene" / f"Cam-{i}.png") for i in range(9)}
+    return {names: m for names, m in match_cameras(images).items() if len(m.alpha) >= ENOUGH}
+
+
+def rows(folder: Path) -> Iterator[str]:
+    head = "positions stated", "RMS px", "baselines off by, mm", "their sigma, mm", "f", "scene px", "worst pair"
+    yield markdown_header(list(head))
+    matches = scene_matches(folder)
+    for position in (5e-4, 5e-3):
+        found = calibrated(folder, StartDeviations(position=position))
+        yield markdown_row([f"± {1e3 * position:g} mm", f"{found.rms:.3f}", *_cells(found, matches)])
+
+
+def _cells(found: Calibration, matches: Mapping[tuple[str, str], Matches]) -> Iterator[str]:
+    covariance, rig = rig_covariance(found), found.rig
+    assert covariance is not None
+    off = [float((rig[b].centre - rig[a].centre).norm()) - GRID for a, b in neighbours()]
+    deviations = [baseline_deviation(found.fit.problem.cameras, a, b, covariance) for a, b in neighbours()]
+    focal = [float(c.K[0, 0]) for c in found.fit.problem.cameras.values()]
+    scene = [float(line_distances(rig, {names: m}).abs().median()) for names, m in matches.items()]
+    yield f"{1e3 * np.abs(off).max():.2f} at most"
+    yield f"{1e3 * np.median(deviations):.2f}"
+    yield f"{min(focal):.0f} to {max(focal):.0f} px"
+    yield f"{np.median(scene):.2f}"
+    yield f"{max(scene):.2f}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
+    parser.add_argument("--out", type=Path)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    cv2.setRNGSeed(0)
+    print_tables(
+        "An array from one image of a board by each camera", [rows(options.data / "nine_band_array")], options.out
+    )
+
+
+if __name__ == "__main__":
+    main()

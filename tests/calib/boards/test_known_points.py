@@ -1,0 +1,118 @@
+"""Markers at known positions as a target: their file, their detection, and rigs from one image of each camera."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, Rig
+from calib.boards.detect import detect
+from calib.boards.known_points import known_points
+from calib.boards.rig import calibrate
+from calib.boards.target import marker_dictionary, parse_board
+from tests.calib.board_scenes import errors_of, four_cameras, see
+
+
+@pytest.fixture
+def room(tmp_path):
+    """Forty markers on the walls of a corner, two metres away."""
+    return parse_board(str(written(tmp_path, in_a_room(40))))
+
+
+def in_a_room(count, relief=0.6):
+    random = np.random.default_rng(0)
+    return np.column_stack([random.uniform(-0.7, 0.7, (count, 2)), random.uniform(-relief, relief, count)])
+
+
+def written(folder, points, head="id,x,y,z"):
+    lines = [f"{i},{x:.6f},{y:.6f},{z:.6f}" for i, (x, y, z) in enumerate(points)]
+    path = folder / "Targets.csv"
+    path.write_text("\n".join([head, *lines]) + "\n")
+    return path
+
+
+def seen(board, count=1, noise=0.1):
+    cameras = four_cameras().cameras
+    rig = Rig({name: cameras[name] for name in ("mono", "colour")})
+    vectors = torch.zeros(count, 3, dtype=torch.float64)
+    shift = torch.linspace(0, 0.2, count, dtype=torch.float64)[:, None]
+    poses = Pose(
+        torch.eye(3, dtype=torch.float64).expand(count, 3, 3), vectors + shift + vectors.new_tensor([0, 0, 2.2])
+    )
+    poses = poses.perturbed(
+        rotation=torch.linspace(-0.5, 0.5, count, dtype=torch.float64)[:, None] * vectors.new_ones(3)
+    )
+    return rig, see(rig, poses, board, noise=noise)
+
+
+def test_one_image_of_a_room_is_enough(room):
+    rig, views = seen(room)
+    found = calibrate(views, room)
+    errors = errors_of(found.fit, rig) / np.sqrt(found.fit.covariance.diagonal())
+    assert len(found.frames) == 1
+    assert np.abs(errors).max() < 4
+    assert float((found.rig["colour"].centre - rig["colour"].centre).norm()) < 0.01
+    assert found.rig["mono"].K[0, 0] == pytest.approx(1150, rel=0.01)
+
+
+def test_markers_on_a_wall_need_several_images(tmp_path):
+    wall = parse_board(
+        str(written(tmp_path, in_a_room(40, relief=0.002) @ np.linalg.qr(np.ones((3, 3)) + np.eye(3))[0]))
+    )
+    assert wall.flat
+    with pytest.raises(ValueError, match="found in 1 of its images and 3 is the least"):
+        calibrate(seen(wall)[1], wall)
+    rig, views = seen(wall, count=8)
+    errors = errors_of((found := calibrate(views, wall)).fit, rig) / np.sqrt(found.fit.covariance.diagonal())
+    assert np.abs(errors).max() < 4
+
+
+def test_centres_and_corners_of_markers_are_found(tmp_path):
+    """Markers seen at an angle: their centres are where the diagonals cross, not the mean of the corners."""
+    image, squares = np.full((480, 640), 200, np.uint8), {}
+    for number in range(6):
+        left, top = 40 + 200 * (number % 3), 60 + 220 * (number // 3)
+        squares[number] = np.array([[0, 0], [90, 12], [80, 130], [-5, 150]]) + np.array([left, top])
+        marker = cv2.copyMakeBorder(
+            cv2.aruco.generateImageMarker(marker_dictionary("4x4_50"), number, 120),
+            *[20] * 4,
+            cv2.BORDER_CONSTANT,
+            value=200,
+        )
+        H, _ = cv2.findHomography(
+            np.array([[20, 20], [139, 20], [139, 139], [20, 139]], float), squares[number].astype(float)
+        )
+        cv2.warpPerspective(marker, H, (640, 480), image, borderMode=cv2.BORDER_TRANSPARENT, flags=cv2.INTER_LINEAR)
+    board = parse_board(str(written(tmp_path, in_a_room(6))))
+    found = detect(image, board)
+    assert found.ids.tolist() == list(range(6))
+    for number, x in zip(found.ids, found.x):
+        a, b, c, d = squares[number].astype(float)
+        s, _ = np.linalg.solve(np.stack([c - a, b - d], -1), b - a)
+        assert np.abs(x - (a + s * (c - a))).max() < 0.5
+        assert np.abs(x - squares[number].mean(0)).max() > 1
+    path = tmp_path / "corners.csv"
+    path.write_text("id,corner,x,y,z\n" + "".join(f"{n},{n % 4},{n},{n * n},{n % 3}\n" for n in range(6)))
+    found = detect(image, known_points(str(path)))
+    assert np.abs(found.x - [squares[n][n % 4] for n in range(6)]).max() < 1
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x,y,z\n1,2,3\n", "write id,x,y,z or id,corner,x,y,z"),
+        ("id,x,y,z\n1,0,0,0\n", "has 1 points and 6 is the least"),
+        ("id,x,y,z\n1,0,0\n", "line 2: wanted id,x,y,z, numbers in metres"),
+        ("id,x,y,z\n1,0,0,nan\n", "line 2: wanted"),
+        ("id,corner,x,y,z\n1,4,0,0,0\n", "corners 0 to 3"),
+        ("id,x,y,z\n" + "3,0,0,0\n" * 6, "marker 3 is there twice"),
+        ("id,x,y,z\n" + "".join(f"{2000 + i},0,{i},0\n" for i in range(6)), "no dictionary '4x4'"),
+    ],
+)
+def test_wrong_files_are_explained(text, message, tmp_path):
+    path = tmp_path / "points.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        parse_board(str(path))
+    with pytest.raises(FileNotFoundError):
+        parse_board(str(tmp_path / "none.csv"))

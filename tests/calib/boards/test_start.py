@@ -1,0 +1,178 @@
+"""Calibration from a rig known roughly: what images leave open keeps near it, with the deviations that were stated."""
+
+import re
+import shutil
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from arraygeom import Pose, Rig
+from calib.boards.camera_parameters import CameraPrior, intrinsic_values, parameter_sizes
+from calib.boards.rig import calibrate
+from calib.boards.simulation import photograph
+from calib.boards.start import StartDeviations, start_prior
+from calib.boards.target import parse_board
+from calib.images.held_out import line_distances
+from calib.images.matches import match_cameras
+from pat.cli.main import main
+from pat.media.images import read_image
+from tests.benchmarks.bench_start import GRID, calibrated, neighbours
+from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, see
+
+STATED = StartDeviations(position=1e-3, rotation=1.0, focal=0.02, centre=0.01)
+
+
+def four() -> Rig:
+    """Cameras of one kind on a square of 80 mm, all parallel, at nominal values."""
+    corners = [(x, y, 0.0) for y in (0.0, 0.08) for x in (0.0, 0.08)]
+    return Rig({f"c{i}": camera(1400.0, (480, 640), corner, offset=(0.0, 0.0)) for i, corner in enumerate(corners)})
+
+
+def drawn(start: Rig, seed: int) -> Rig:
+    """A rig that differs from the start by the stated deviations."""
+    g, cameras = np.random.default_rng(seed), {}
+    for name, c in start.cameras.items():
+        centre = c.centre + torch.from_numpy(g.normal(0, STATED.position, 3))
+        R = Pose(c.R, c.t).perturbed(rotation=torch.from_numpy(g.normal(0, np.radians(STATED.rotation), 3))).R
+        K = c.K.clone()
+        K[0, 0] = K[1, 1] = K[0, 0] * (1 + g.normal(0, STATED.focal))
+        K[:2, 2] += torch.from_numpy(g.normal(0, STATED.centre * c.hw[1], 2))
+        cameras[name] = c.replace(K=K, cam_from_world=Pose.from_centre(R, centre))
+    return Rig(cameras)
+
+
+def one_board(seed: int) -> Pose:
+    return board_poses(1, seed=seed, depth=(1.6, 1.9), spread=0.02)
+
+
+def test_the_stated_deviations_hold():
+    """One image of each camera: errors of all parameters in stated deviations, over rigs drawn around the start."""
+    errors = []
+    for seed in range(6):
+        rig = drawn(four(), seed)
+        found = calibrate(
+            see(rig, one_board(seed), noise=0.1, seed=seed), BOARD, lens="none", start=four(), deviations=STATED
+        )
+        errors.append(errors_of(found.fit, rig) / np.sqrt(found.fit.covariance.diagonal()))
+        assert len(errors[-1]) == 40
+        assert not any("far from the start" in note for note in found.notes)
+    assert 0.7 < np.sqrt(np.mean(np.square(errors))) < 1.3
+    assert np.abs(errors).max() < 4
+
+
+def test_what_one_board_leaves_open_is_said():
+    """One board does not show where a camera is: the deviation of its position stays as it was stated."""
+    found = calibrate(
+        see(drawn(four(), 0), one_board(0), noise=0.1), BOARD, lens="none", start=four(), deviations=STATED
+    )
+    focal, centre, position = (
+        tuple(map(float, re.search(rf"{kind} ±([\d.]+) > ±([\d.]+)", found.notes[0]).groups()))
+        for kind in ("focal lengths", "principal points", "positions")
+    )
+    assert focal[0] == pytest.approx(0.02 * 1400, rel=0.02)
+    assert focal[1] < 0.5 * focal[0]
+    assert centre[1] < centre[0] == pytest.approx(6.4)
+    assert 0.6 < position[1] <= position[0] == 1.0
+
+
+def test_a_wrong_start_is_named():
+    wrong = four().perturbed({"c2.focal": torch.full((2,), 250.0, dtype=torch.float64)})
+    found = calibrate(see(four(), one_board(0), noise=0.1), BOARD, lens="none", start=wrong, deviations=STATED)
+    assert any(note.startswith("c2: far from the start: focal length") for note in found.notes)
+
+
+def test_the_priors_derivatives_are_those_of_finite_differences():
+    rig = drawn(four(), 1)
+    prior, at = start_prior(four()["c3"], STATED), rig["c3"]
+    sizes = parameter_sizes(at)
+    information, slope = prior.equations(at)
+    steps = np.concatenate([np.full(6, 1e-6), np.full(4, 1e-3)])
+    for i, step in enumerate(steps):
+        change = torch.zeros(10, dtype=torch.float64)
+        change[i] = step
+        moved = [
+            Rig({"": at}).perturbed(dict(zip(sizes, (sign * change).split(list(sizes.values())))))[""]
+            for sign in (1, -1)
+        ]
+        loss = [prior.loss(c) for c in moved]
+        assert -slope[i] == pytest.approx((loss[0] - loss[1]) / (2 * step), rel=1e-3, abs=1e-3)
+    assert np.linalg.eigvalsh(information).min() > 0
+    still = CameraPrior(intrinsic_values(at), prior.information, at.cam_from_world)
+    assert still.loss(at) == pytest.approx(0, abs=1e-12)
+
+
+@pytest.fixture
+def photos(tmp_path):
+    """One photograph of a board by each of two cameras, called like them, and the start."""
+    start = Rig({name: four()[name] for name in ("c0", "c1")})
+    start.save(tmp_path / "start.yaml")
+    (tmp_path / "photos").mkdir()
+    boards, rig = one_board(0), drawn(start, 3)
+    for name, c in rig.cameras.items():
+        image = photograph(
+            c, c.cam_from_world @ Pose(boards.R[0], boards.t[0]), parse_board("charuco:9x7:60mm"), dpi=60
+        )
+        cv2.imwrite(str(tmp_path / "photos" / f"{name}.png"), image)
+    return tmp_path
+
+
+def test_one_photograph_of_each_camera(photos, capsys):
+    command = ["calibrate", str(photos / "photos"), "--board", "charuco:9x7:60mm", "-o", str(photos / "rig.yaml")]
+    main([*command, "--start", str(photos / "start.yaml"), "--deviation", "position=0.001"])
+    said = capsys.readouterr().out
+    assert "2 cameras, 1 frames" in said
+    assert "positions ±1 >" in said
+    centres = [c.centre for c in Rig.load(photos / "rig.yaml").cameras.values()]
+    assert float((centres[0] - centres[1]).norm()) == pytest.approx(0.08, abs=3e-3)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--deviation", "place=1"], "has no deviation 'place': it has position, rotation, focal, centre"),
+        (["--deviation", "focal=0"], "focal=0 is not a positive number"),
+        (["--lens", "auto"], "with --start name one"),
+        (["--start", "other.yaml"], "c1: the start has no camera of this name"),
+        (["--start", "smaller.yaml"], "c0: its images are 640x480 and the start states 320x240"),
+    ],
+)
+def test_mistakes_with_a_start(options, message, photos, capsys):
+    start = Rig.load(photos / "start.yaml")
+    Rig({"c0": start["c0"]}).save(photos / "other.yaml")
+    Rig({name: c.replace(hw=(240, 320)) for name, c in start.cameras.items()}).save(photos / "smaller.yaml")
+    (photos / "photos" / "c0").mkdir()
+    (photos / "photos" / "c1").mkdir()
+    for name in ("c0", "c1"):
+        shutil.move(photos / "photos" / f"{name}.png", photos / "photos" / name / "1.png")
+    options = [str(photos / o) if o.endswith(".yaml") else o for o in options]
+    if "--start" not in options:
+        options = [*options, "--start", str(photos / "start.yaml")]
+    with pytest.raises(SystemExit):
+        main(
+            [
+                "calibrate",
+                str(photos / "photos"),
+                "--board",
+                "charuco:9x7:60mm",
+                "-o",
+                str(photos / "rig.yaml"),
+                *options,
+            ]
+        )
+    assert message in capsys.readouterr().err
+    assert not (photos / "rig.yaml").exists()
+
+
+@pytest.mark.slow
+def test_the_nine_band_array(shared_data):
+    """Baselines of 40 mm, and a scene whose points lie near their lines though no image of it was used."""
+    found = calibrated(shared_data / "nine_band_array", StartDeviations())
+    off = [float((found.rig[b].centre - found.rig[a].centre).norm()) - GRID for a, b in neighbours()]
+    assert np.abs(off).max() < 5e-4
+    assert found.rms < 0.11
+    images = {
+        name: read_image(shared_data / "nine_band_array" / "scene" / f"{name}.png") for name in ("Cam-3", "Cam-6")
+    }
+    assert float(line_distances(found.rig, match_cameras(images)).abs().median()) < 0.25
