@@ -24,7 +24,7 @@ WAITING = 12
 class Outcome(NamedTuple):
     """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident bytes.
 
-    What the forking process held already is not counted in the peak.
+    What the child holds from its parent is not counted in the peak.
     """
 
     verdict: str
@@ -38,10 +38,11 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
 
     A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
     """
-    begin, held = time.monotonic(), _resident()
+    begin = time.monotonic()
     child = os.fork()
     if child == 0:
         _child(case, log)
+    held = _resident(child)
     status, usage = _wait(child, begin)
     seconds, peak = usage.ru_utime + usage.ru_stime, max(usage.ru_maxrss * 1024 - held, 0)
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
@@ -55,8 +56,8 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
     return Outcome("traceback" if traced else verdict, last, seconds, peak)
 
 
-def _resident() -> int:
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
+def _resident(process: int) -> int:
+    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
     return pages * resource.getpagesize()
 
 

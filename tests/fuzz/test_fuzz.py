@@ -56,6 +56,11 @@ def test_the_sandbox_sees(case, verdict, tmp_path, monkeypatch):
     assert sandbox.ended(case, tmp_path / "log").verdict == verdict
 
 
+def test_the_sandbox_measures_the_memory_of_the_case(tmp_path):
+    peak = sandbox.ended(lambda: "read" if len(bytearray(200 << 20)) else "", tmp_path / "log").peak
+    assert 190 << 20 < peak < 230 << 20
+
+
 def bomb(hw: tuple[int, int]) -> bytes:
     """A PNG file of black pixels, small on the disk."""
 

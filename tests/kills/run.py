@@ -31,6 +31,7 @@ COUNTS: dict[str, dict[str, int]] = {
     "training": {"moment": 6, "write": 6, "cut": 3},
     "calibration": {"moment": 4, "write": 4, "cut": 2},
     "rendering": {"moment": 4, "worker": 4, "write": 4},
+    "rendering by Blender": {"moment": 3, "worker": 3, "write": 3},
 }
 """How often each job is killed in each way."""
 COLUMNS = {
