@@ -1,7 +1,9 @@
 import os
 import struct
+import sys
 import warnings
 import zlib
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -247,6 +249,23 @@ def test_the_size_is_compared_before_anything_is_decoded(tmp_path, monkeypatch):
         read_image(tmp_path / "a.png", name="mono", hw=(400, 640))
     with pytest.raises(ValueError, match=r"a.png: is 30000x30000, more than 268 million pixels"):
         read_image(tmp_path / "a.png")
+
+
+def test_the_size_of_a_heic_file_is_compared_before_it_is_decoded(tmp_path, monkeypatch):
+    """By a stand-in for pillow-heif, which opens a file without decoding it."""
+
+    class Stored:
+        size = 30_000, 20_000
+
+        def __array__(self, *_, **__):
+            pytest.fail("decoded")
+
+    stand_in = SimpleNamespace(open_heif=lambda *_, **__: Stored())
+    monkeypatch.setitem(sys.modules, "pillow_heif", stand_in)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    for hw, words in ((None, "more than 268 million pixels"), ((400, 640), "the rig says 640x400")):
+        with pytest.raises(ValueError, match=rf"a.heic: is 30000x20000, {words}"):
+            read_image(tmp_path / "a.heic", hw=hw)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "jpg", "ppm", "pgm", "bmp", "webp"])
