@@ -38,11 +38,14 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
 
     A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
     """
-    begin = time.monotonic()
+    begin, (reader, writer) = time.monotonic(), os.pipe()
     child = os.fork()
     if child == 0:
+        os.write(writer, str(_resident()).encode())
         _child(case, log)
-    held = _resident(child)
+    held = int(os.read(reader, 32))
+    os.close(reader)
+    os.close(writer)
     status, usage = _wait(child, begin)
     seconds, peak = usage.ru_utime + usage.ru_stime, max(usage.ru_maxrss * 1024 - held, 0)
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []
@@ -56,8 +59,8 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
     return Outcome("traceback" if traced else verdict, last, seconds, peak)
 
 
-def _resident(process: int) -> int:
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
+def _resident() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize()
 
 
