@@ -1,8 +1,10 @@
+import errno
 import os
 import struct
 import sys
 import warnings
 import zlib
+from pathlib import Path
 from types import SimpleNamespace
 
 import cv2
@@ -158,6 +160,19 @@ def test_luma_and_chroma_come_back():
     torch.testing.assert_close(from_luma_chroma(luma, chroma), image, atol=1e-14, rtol=0)
     grey = image[:, :1].expand(-1, 3, -1, -1)
     assert to_luma_chroma(grey)[1].abs().max() < 1e-14
+
+
+def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, monkeypatch):
+    """It refuses the removal of the temporary file, too."""
+
+    def refuse(path, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    for name in ("write_text", "unlink"):
+        monkeypatch.setattr(Path, name, refuse)
+    with pytest.raises(OSError, match="Read-only") as caught, write_atomically(tmp_path / "a.txt") as temporary:
+        temporary.write_text("a")
+    assert caught.value.filename == str(tmp_path / "a.txt")
 
 
 def test_the_luminance_of_a_recoloured_image_is_the_given_one():
