@@ -84,7 +84,7 @@ class Fuse:
     keep_alpha: bool = False
     """With --noise, leave alpha's values as recorded; always so if alpha has hardly any noise."""
     luminance: Literal["alpha", "mix", "beta"] = "alpha"
-    """Whose brightness the (single) fused image has: beta's, in alpha's detail, suits a near infrared alpha."""
+    """Whose brightness the fused image has: beta's, in alpha's detail, suits a near infrared alpha."""
     bits: Literal[8, 16, 32] = 8
     """Bits a channel of the fused image: 8 or 16 sRGB-encoded, or 32 for linear light as floats (tif, exr)."""
     kind: Literal["png", "tif", "exr"] = "png"
@@ -312,9 +312,6 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
-        if self.noise or self.luminance != "alpha":
-            option = "--noise" if self.noise else "--luminance"
-            raise ValueError(f"{option} is of a single frame: fuse frames with it one by one, or use pat.fuse")
         batch = Batch(
             rig,
             files,
@@ -327,6 +324,9 @@ class Fuse:
             match_levels=self.normalise_radiometry,
             response=options.response_of(self.response),
             align=self.align,
+            noise=options.noise_of(self.noise),
+            keep_alpha=self.keep_alpha,
+            luminance=self.luminance,
             max_memory=self.max_memory,
             bits=self.bits,
             kind=self.kind,

@@ -47,13 +47,18 @@ from ..media.images import read_image
 from ..media.raw import developed_rig
 from ..media.video import write_video
 from ..networks.weights import Network, find_weights, load_weights
+from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
 from ..support.tensor_files import write_tensors
 from .checks import confidence_checked
+from .frames import ImageFiles
 from .fuse import fuse
+from .low_light import Noise
+from .luminance import Luminance
 from .results import Frame, ImageFormat, save_frame, view_of
-from .sequence import ImageFiles, KeyColour, KeyFrame, SequenceFusion
+from .sequence import KeyColour, SequenceFusion
+from .timeline import KeyFrame
 from .views import ViewFiles
 
 IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", *RAW_SUFFIXES}
@@ -89,6 +94,9 @@ class Batch:
     match_levels: bool = False
     response: Literal["fit", "rec601"] | tuple[float, float, float] = "fit"
     align: bool = True
+    noise: Noise | None = None
+    keep_alpha: bool = False
+    luminance: Luminance = "alpha"
     max_memory: str | None = None
     bits: int = 8
     kind: ImageFormat = "png"
@@ -132,6 +140,10 @@ class Batch:
             "first": {name: str(files[0]) for name, files in self.files.items()},
             "rig": rig_text(self.rig),
         }
+        if self.noise is not None:
+            facts |= {"noise": noise_document(self.noise), "keep_alpha": self.keep_alpha}
+        if self.luminance != "alpha":
+            facts["luminance"] = self.luminance
         return yaml.safe_dump(facts, sort_keys=False)
 
     @property
@@ -210,6 +222,7 @@ class Batch:
         entries["files"] = {name: [str(file) for file in files] for name, files in self.files.items()}
         entries["out"] = str(self.out)
         entries["field"] = field_document(self.field)
+        entries["noise"] = noise_document(self.noise)
         return json.dumps({"format": PLAN_FORMAT, **entries})
 
     @classmethod
@@ -223,6 +236,8 @@ class Batch:
             entries["files"] = {name: [Path(file) for file in files] for name, files in entries["files"].items()}
             entries["out"] = Path(entries["out"])
             entries["field"] = field_of(entries["field"])
+            if isinstance(entries["noise"], dict):
+                entries["noise"] = {name: NoiseLevel(**level) for name, level in entries["noise"].items()}
             if not isinstance(entries["response"], str):
                 entries["response"] = tuple(entries["response"])
             return cls(**entries)
@@ -233,7 +248,7 @@ class Batch:
     def fusion(self) -> SequenceFusion:
         """The sequence, with the images that its frames have in common."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
-        options = {"max_memory": self.max_memory}
+        options = {"max_memory": self.max_memory, "luminance": self.luminance}
         return SequenceFusion(
             _network(self.weights),
             developed_rig(self.rig, self.files),
@@ -244,6 +259,8 @@ class Batch:
             self.match_levels,
             self.response,
             self.align,
+            self.noise,
+            self.keep_alpha,
             options,
         )
 
@@ -283,9 +300,22 @@ class Batch:
                 match_levels=self.match_levels,
                 response=self.response,
                 align=self.align,
+                noise=self.noise,
+                keep_alpha=self.keep_alpha,
+                luminance=self.luminance,
             )
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
+
+
+def noise_document(noise: Noise | None) -> str | dict[str, Any] | None:
+    """Noise levels as their entries by camera; "estimate" and None as they are."""
+    if noise is None or isinstance(noise, str):
+        return noise
+    return {
+        name: {"shot": float(level.shot), "read": float(level.read), "added_to": level.added_to}
+        for name, level in noise.items()
+    }
 
 
 def field_document(field: ReceptiveField | None) -> dict[str, Any] | None:

@@ -152,12 +152,13 @@ def corrections_of(
     match_levels: bool = False,
     response: Given = "fit",
     align: bool = True,
+    noise: Noise | None = None,
 ) -> Corrections:
     """What `fuse` finds and puts right before it fuses; give it to `fuse` for other frames of the same cameras.
 
     Arguments and errors are as of `fuse`.
     """
-    views = Views.of(rig, images, alpha=alpha, depth=depth, field=field)
+    views = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise).views
     return find_corrections(network, _prepared(network, views, match_levels)[0], response, align=align)
 
 

@@ -136,6 +136,9 @@ def depth_and_confidence(
 LOST = 0.3
 """Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
 
+ONE_SIDE = 0.9
+"""Length of the sum of all betas' segments, over the sum of their lengths, from which all count as on one side."""
+
 
 def background_filled(
     depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], inputs: Inputs
@@ -143,13 +146,17 @@ def background_filled(
     """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
 
     What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
-    are above or below alpha. What is unknown stays NaN.
+    are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded in one of them:
+    depth is then as it is.
     """
     steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
     if not steps:
         return depth
-    apart = torch.stack([(part.end - part.start).abs().mean((0, 1, 2)) for part in steps]).sum(0)
-    along_rows = bool(apart[0] >= apart[1])
+    apart = torch.stack([(part.end - part.start).mean((0, 1, 2)) for part in steps])
+    if apart.sum(0).norm() < ONE_SIDE * apart.norm(dim=1).sum():
+        return depth
+    across, down = apart.sum(0).abs().tolist()
+    along_rows = across >= down
     inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
     known = (confidence >= LOST) & depth.isfinite()
     if not along_rows:

@@ -115,19 +115,29 @@ def denoised_views(views: Views, noise: Noise | None) -> DenoisedViews:
 
     Raises ValueError for a camera that is not among the views.
     """
-    levels = {} if noise is None else noise
-    if isinstance(levels, str):
-        levels = {name: NoiseLevel.estimated(image[None]) for name, image in views.images.items()}
     noisy: dict[str, NoisyView] = {}
-    for name, level in levels.items():
+    for name, level in noise_levels(views.images, noise).items():
         if name not in views.images:
             raise ValueError(f"noise of '{name}': there is no image of it, only of {', '.join(views.images)}")
-        image = views.images[name][None]
-        deviation = level.deviation(image)
-        if float(deviation.mean()) > LEAST_DEVIATION:
-            recorded = level.unbiased(image)
-            noisy[name] = NoisyView(recorded, denoised(recorded, deviation), deviation)
+        if (view := noisy_view(views.images[name], level)) is not None:
+            noisy[name] = view
     return DenoisedViews(views, views.replace({name: view.denoised[0] for name, view in noisy.items()}), noisy)
+
+
+def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[str, NoiseLevel]:
+    """The level of each camera that has noise: as stated, or estimated from its image (C, H, W)."""
+    if isinstance(noise, str):
+        return {name: NoiseLevel.estimated(image[None]) for name, image in images.items()}
+    return noise or {}
+
+
+def noisy_view(image: Float[Tensor, "c h w"], level: NoiseLevel) -> NoisyView | None:
+    """An image as recorded but unbiased, and without its noise; None if there is hardly any."""
+    deviation = level.deviation(image[None])
+    if float(deviation.mean()) <= LEAST_DEVIATION:
+        return None
+    recorded = level.unbiased(image[None])
+    return NoisyView(recorded, denoised(recorded, deviation), deviation)
 
 
 @torch.no_grad()

@@ -45,6 +45,7 @@ class ResponseSettings(NamedTuple):
     sensor: weights of a usual unfiltered sensor, which sees more blue than Rec. 601.
     greenest: share of green beyond which weights are of no sensor, where they have less blue than Rec. 601's and alpha
         is brighter than luma where a sensor would be darker, or the other way round.
+    light: logarithm of the brightness over luma up to which light that differs between the views may be its cause.
     """
 
     prior: float = 0.15
@@ -61,6 +62,7 @@ class ResponseSettings(NamedTuple):
     explained: float = 0.5
     sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
     greenest: float = 0.62
+    light: float = 0.12
 
 
 SETTINGS = ResponseSettings()
@@ -247,11 +249,12 @@ def _only_a_gain(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) 
 def _unlike_sensors(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
     """Whether alpha is brighter than luma where a usual sensor would be darker, or the other way round.
 
-    In a scene of one hue light or exposure explain that as well as a response does, and are as likely.
+    In a scene of one hue light or exposure explain that as well as a response does, and if it is little are as likely.
     """
     luma = Response.rec601().weights @ x
     sensor = luma.new_tensor(settings.sensor) @ x
-    return (_ratio(y, luma, found) - 1) * (_ratio(sensor, luma, found) - 1) < 0
+    brighter = _ratio(y, luma, found)
+    return abs(math.log(brighter)) < settings.light and (brighter - 1) * (_ratio(sensor, luma, found) - 1) < 0
 
 
 def _ratio(y: Tensor, luma: Tensor, found: _Fit) -> float:

@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import pairwise
-from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from jaxtyping import Float
@@ -28,25 +26,18 @@ from arraygeom.fields import default_field
 
 from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
+from ..sensors import NoiseLevel
 from .corrections import Corrections
+from .frames import CachedFrames, DenoisedFrames, Frames
 from .fuse import corrections_of, fuse
+from .low_light import Noise, noise_levels
 from .optical_flow import flow_between, still, warped
 from .response import Given, Response
 from .results import Frame
-from .views import grey_alpha, read_view
+from .timeline import KeyFrame, Timeline
+from .views import grey_alpha
 
-
-@runtime_checkable
-class Frames(Protocol):
-    """Images (C, H, W) of one camera in the order of time: a list, or read when asked for (`ImageFiles`)."""
-
-    def __len__(self) -> int:
-        """How many."""
-        ...
-
-    def __getitem__(self, i: int, /) -> Tensor:
-        """One of them."""
-        ...
+T = TypeVar("T")
 
 
 LOG = logging.getLogger(__name__)
@@ -59,52 +50,6 @@ INTERVALS = 2.0
 """Colour is warped from key frames up to this many intervals of theirs away."""
 NEIGHBOURS = 4
 """Radiometry is normalised over this many key frames before and after."""
-CACHED = 96 * 2**20
-"""Bytes of images cached of each camera: 25 grey frames of 1280x800."""
-
-
-class ImageFiles:
-    """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
-
-    `alpha` names the camera to whose scale of light the images are brought.
-    """
-
-    def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
-        self.paths, self.name = list(paths), name
-        self.rig, self.like = rig, rig[alpha].sensor
-
-    def __len__(self) -> int:
-        return len(self.paths)
-
-    def __getitem__(self, i: int, /) -> Tensor:
-        """Raises FileNotFoundError or ValueError naming camera and file."""
-        return read_view(self.rig, self.name, self.paths[i], like=self.like)
-
-
-class CachedFrames:
-    """Frames, of which those asked for last are cached, up to `CACHED` bytes: neighbours in time need them again."""
-
-    def __init__(self, frames: Frames) -> None:
-        self.frames = frames
-        self.cached: OrderedDict[int, Tensor] = OrderedDict()
-
-    def __len__(self) -> int:
-        return len(self.frames)
-
-    def __getitem__(self, i: int, /) -> Tensor:
-        if i not in self.cached:
-            self.cached[i] = self.frames[i]
-        self.cached.move_to_end(i)
-        while len(self.cached) > 1 and sum(image.nbytes for image in self.cached.values()) > CACHED:
-            self.cached.popitem(last=False)
-        return self.cached[i]
-
-
-class KeyFrame(NamedTuple):
-    """A frame of alpha that gets colour from betas: its number, and for each beta that of the frame nearest in time."""
-
-    alpha: int
-    betas: dict[str, int]
 
 
 class KeyColour(NamedTuple):
@@ -113,73 +58,6 @@ class KeyColour(NamedTuple):
     added: Float[Tensor, "c h w"]
     confidence: Float[Tensor, "h w"]
     inverse_depth: Float[Tensor, "h w"]
-
-
-@dataclass(frozen=True)
-class Timeline:
-    """When the frames of a sequence were recorded: camera `name`'s frame i at time_offset + i / frame_rate, seconds.
-
-    Raises ValueError for a camera without a frame rate, or without frames.
-    """
-
-    rig: Rig
-    counts: Mapping[str, int]
-    alpha: str
-
-    def __post_init__(self) -> None:
-        for name, count in self.counts.items():
-            if self.rig[name].sensor.frame_rate is None:
-                raise ValueError(f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig")
-            if count < 1:
-                raise ValueError(f"no frames of '{name}'")
-        if self.alpha not in self.counts:
-            raise ValueError(f"no frames of alpha, '{self.alpha}'")
-        if not self.betas:
-            raise ValueError("no frames of any other camera than alpha: fusion needs at least one beta")
-
-    @property
-    def betas(self) -> list[str]:
-        """The betas that have frames."""
-        return [name for name in self.rig.betas(self.alpha) if name in self.counts]
-
-    def rate(self, name: str) -> float:
-        """Frames a second."""
-        return self.rig[name].sensor.frame_rate or 1.0
-
-    def time(self, name: str, i: int) -> float:
-        """When frame i was recorded, seconds of the rig's clock."""
-        return self.rig[name].sensor.time_offset + i / self.rate(name)
-
-    def nearest(self, name: str, time: float) -> int:
-        """The frame recorded nearest to a time."""
-        i = round((time - self.rig[name].sensor.time_offset) * self.rate(name))
-        return min(max(i, 0), self.counts[name] - 1)
-
-    @property
-    def interval(self) -> float:
-        """The time between key frames, seconds."""
-        return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
-
-    def key_frames(self) -> list[KeyFrame]:
-        """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an interval.
-
-        Raises ValueError if there is none: then the recordings do not overlap.
-        """
-        fastest = max(self.betas, key=self.rate)
-        found: dict[int, float] = {}
-        for i in range(self.counts[fastest]):
-            time = self.time(fastest, i)
-            index = self.nearest(self.alpha, time)
-            gap = abs(self.time(self.alpha, index) - time)
-            if gap <= 0.5 * self.interval + 1e-9:
-                found[index] = min(gap, found.get(index, gap))
-        if not found:
-            raise ValueError("no frame of a beta is near one of alpha in time: check 'frame_rate' and 'time_offset'")
-        return [KeyFrame(i, self.at(i)) for i in sorted(found)]
-
-    def at(self, index: int) -> dict[str, int]:
-        """For each beta its frame nearest in time to alpha's frame `index`."""
-        return {name: self.nearest(name, self.time(self.alpha, index)) for name in self.betas}
 
 
 @dataclass(frozen=True)
@@ -198,6 +76,8 @@ class SequenceFusion:
     match_levels: bool = False
     response: Given = "fit"
     align: bool = True
+    noise: Noise | None = None
+    keep_alpha: bool = False
     options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -209,23 +89,31 @@ class SequenceFusion:
         """When the frames were recorded."""
         return Timeline(self.rig, {name: len(frames) for name, frames in self.frames.items()}, self.alpha)
 
-    def grey(self, i: int) -> Float[Tensor, "1 h w"]:
+    def recorded(self, i: int) -> Float[Tensor, "1 h w"]:
         """Alpha's frame."""
         return grey_alpha(self.alpha, self.frames[self.alpha][i])
 
+    def grey(self, i: int) -> Float[Tensor, "1 h w"]:
+        """Alpha's frame, without noise if that is known or estimated: what colours follow."""
+        return grey_alpha(self.alpha, self._quiet[i])
+
+    def base(self, i: int) -> Float[Tensor, "1 h w"]:
+        """What colours are added to: with `keep_alpha` alpha's frame as recorded."""
+        return self.recorded(i) if self.keep_alpha else self.grey(i)
+
     def alone(self, i: int) -> Frame:
         """The frame fused by itself with the betas nearest in time, motion or not: what warping is compared with."""
-        return self._fused(i, self.timeline.at(i), {}, self.match_levels)
+        return self._fused(i, self.timeline.at(i), {}, alone=True)
 
     def colour(self, key: KeyFrame) -> KeyColour:
         """Fuse a key frame, each beta searched where alpha's points are at its time."""
         fields, weight = {}, torch.ones(self.rig[self.alpha].hw)
         for name, i in key.betas.items():
-            fields[name], weight = self._field(name, key.alpha, self.timeline.time(name, i))
-            weight = torch.minimum(weight, weight)
-        frame = self._fused(key.alpha, key.betas, fields, False)
+            fields[name], certain = self._field(name, key.alpha, self.timeline.time(name, i))
+            weight = torch.minimum(weight, certain)
+        frame = self._fused(key.alpha, key.betas, fields)
         inverse = (1 / frame.depth).nan_to_num(0.0)
-        return KeyColour(frame.image - self.grey(key.alpha), frame.confidence * weight, inverse)
+        return KeyColour(frame.image - self.base(key.alpha), frame.confidence * weight, inverse)
 
     def frame(self, i: int, keys: Sequence[KeyFrame], fetch: Callable[[KeyFrame], KeyColour | None]) -> Frame:
         """Any frame, its colour warped from the key frames around it.
@@ -236,7 +124,7 @@ class SequenceFusion:
         sources = [self._warped(i, own, key, colour) for key in self._around(i, keys) if (colour := fetch(key))]
         if not sources:
             raise ValueError(f"frame {i}: none of the key frames around it could be fused")
-        return mixed(own, sources)
+        return mixed(self.base(i), sources)
 
     def keys_of(self, frames: Iterable[int]) -> list[KeyFrame]:
         """The key frames that some frames get their colour from."""
@@ -283,19 +171,26 @@ class SequenceFusion:
             return self.speed * abs(gap)
         return UNKNOWN_MOTION * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
 
-    def _fused(self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], alone: bool) -> Frame:
+    def _fused(
+        self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], *, alone: bool = False
+    ) -> Frame:
+        """Alpha's frame with those of betas. Levels are matched over several frames, or in this one if it is alone or
+        its noise, which is of images as recorded, is to be removed."""
         images = {name: self.frames[name][j] for name, j in betas.items()}
+        alone = alone or self.noise is not None
         if self.match_levels and not alone:
             images = {name: self._normalised(name, image, i) for name, image in images.items()}
         common = dict.fromkeys(betas, self.field) if self.field else {}
         return fuse(
             self.network,
             self.rig,
-            {self.alpha: self.grey(i), **images},
+            {self.alpha: self.recorded(i), **images},
             alpha=self.alpha,
             field={**common, **fields},
-            match_levels=alone,
+            match_levels=self.match_levels and alone,
             corrections=self._corrections,
+            noise=self._noise,
+            keep_alpha=self.keep_alpha,
             **self.options,
         )
 
@@ -303,32 +198,54 @@ class SequenceFusion:
     def _corrections(self) -> Corrections:
         """What is put right in every frame: found once, near the middle, so that nothing flickers.
 
-        At the key frame nearest to the middle whose images can be read: what cannot is reported when it is fused. Betas
-        that did not record at alpha's time are not aligned: motion too moves points off their segments.
+        Betas that did not record at alpha's time are not aligned: motion too moves points off their segments.
         """
-        keys = self.timeline.key_frames()
         LOG.info("corrections of the sequence")
+        return self._at_middle(self._found_at, Corrections(Response.rec601()))
+
+    @cached_property
+    def _noise(self) -> Mapping[str, NoiseLevel] | None:
+        """The noise of each camera, stated or estimated once, near the middle; None if views are not denoised."""
+        if not isinstance(self.noise, str):
+            return self.noise
+        nothing: Mapping[str, NoiseLevel] = {}
+        return self._at_middle(lambda key: noise_levels(self._images_at(key), self.noise), nothing)
+
+    @cached_property
+    def _quiet(self) -> Frames:
+        """Alpha's frames, without noise if it has some."""
+        frames, level = self.frames[self.alpha], (self._noise or {}).get(self.alpha)
+        return frames if level is None else CachedFrames(DenoisedFrames(frames, level))
+
+    def _at_middle(self, find: Callable[[KeyFrame], T], otherwise: T) -> T:
+        """What is found at the key frame nearest to the middle whose images can be read: what cannot is reported when
+        it is fused."""
+        keys = self.timeline.key_frames()
         for key in sorted(keys, key=lambda key: abs(key.alpha - keys[len(keys) // 2].alpha)):
             try:
-                return self._found_at(key)
+                return find(key)
             except (OSError, ValueError):
                 continue
-        return Corrections(Response.rec601())
+        return otherwise
+
+    def _images_at(self, key: KeyFrame) -> dict[str, Tensor]:
+        """Alpha's image and those of the betas, as recorded."""
+        return {self.alpha: self.recorded(key.alpha), **{name: self.frames[name][j] for name, j in key.betas.items()}}
 
     def _found_at(self, key: KeyFrame) -> Corrections:
-        images = {name: self.frames[name][j] for name, j in key.betas.items()}
         gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())
         together = all(abs(gap) * self.timeline.rate(self.alpha) < SYNCHRONOUS for gap in gaps)
         return corrections_of(
             self.network,
             self.rig,
-            {self.alpha: self.grey(key.alpha), **images},
+            self._images_at(key),
             alpha=self.alpha,
             depth=self.options.get("depth"),
             field=self.field,
             match_levels=self.match_levels,
             response=self.response,
             align=self.align and together,
+            noise=self._noise,
         )
 
     def _normalised(self, name: str, image: Tensor, i: int) -> Tensor:
@@ -385,13 +302,16 @@ def fuse_sequence(
     match_levels: bool = False,
     response: Given = "fit",
     align: bool = True,
+    noise: Noise | None = None,
+    keep_alpha: bool = False,
     **options: Any,
 ) -> Iterator[Frame]:
     """Fuse every frame of alpha, in order, as they are asked for.
 
     Args:
         network: as of `fuse`, and so are `field`, `match_levels`, `response`, `align` (both found once, at the key
-            frame in the middle) and other options (`depth`, `max_memory`).
+            frame in the middle), `noise` (estimated there too), `keep_alpha` and other options (`depth`, `max_memory`,
+            `luminance`).
         rig: cameras with `frame_rate` (a second) and `time_offset` (seconds after a common clock).
         frames: by camera name, in the order of time. Cameras without are left out.
         alpha: the camera whose frames are wanted.
@@ -400,7 +320,9 @@ def fuse_sequence(
 
     Raises ValueError for frame rates that are not known and for recordings that do not overlap in time.
     """
-    job = SequenceFusion(network, rig, frames, alpha, speed, field, match_levels, response, align, options)
+    job = SequenceFusion(
+        network, rig, frames, alpha, speed, field, match_levels, response, align, noise, keep_alpha, options
+    )
     keys = job.timeline.key_frames()
 
     @lru_cache(maxsize=2 * int(INTERVALS) + 1)

@@ -41,9 +41,11 @@ COARSE = 4
 """Context is computed at a quarter of the size."""
 LEAST_WEIGHT = 1e-3
 """The least weight of a pixel in propagation."""
-CONFIDENCE_OFFSET = 1.0
-"""Added to the logit of the confidence where colour is blended: matches are better than when the weights were trained.
-Chosen on Middlebury's pairs of the tune half."""
+CONFIDENCE_OFFSETS = 0.3, 1.5
+"""Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's, and where
+it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
+LIKENESS = 0.06
+"""Difference of brightness at which likeness falls to 1 / e."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
 
@@ -79,6 +81,7 @@ class BetaEstimate(NamedTuple):
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
     choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of `diffused`.
     position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut there.
+    likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1.
     """
 
     attended: Attended
@@ -87,11 +90,18 @@ class BetaEstimate(NamedTuple):
     logit: Tensor
     choice: Tensor
     position: Tensor
+    likeness: Tensor
 
     @property
     def confidence(self) -> Float[Tensor, "b h w"]:
         """That `colour` is of the point that alpha sees, 0 to 1."""
         return self.logit[:, 0].sigmoid() * (self.attended.peak > 0)
+
+    @property
+    def blending(self) -> Float[Tensor, "b 1 h w"]:
+        """The weight of `colour` in the image, 0 to 1."""
+        unlike, alike = CONFIDENCE_OFFSETS
+        return (self.logit + unlike + (alike - unlike) * self.likeness).sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
         """One band alone, counted from a base instead of from alpha; `base` (B, C, H, W) is bands minus alpha."""
@@ -194,7 +204,7 @@ class GuidedPAT(nn.Module):
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
     ) -> Float[Tensor, "b c h w"]:
         """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
-        confidence = torch.cat([(s.logit + CONFIDENCE_OFFSET).sigmoid().expand_as(s.colour) for s in estimates], 1)
+        confidence = torch.cat([s.blending.expand_as(s.colour) for s in estimates], 1)
         colour = torch.cat([s.colour for s in estimates], 1)
         rest = torch.cat([self._unseen(own, s) for s in estimates], 1)
         blend = torch.lerp(rest, colour, confidence)
@@ -238,7 +248,9 @@ class GuidedPAT(nn.Module):
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
         colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
         position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
-        return BetaEstimate(attended, colour, found.colour, logit, choice, position)
+        unlike = avg_pool2d(facts[0].abs(), 3, 1, 1, count_include_pad=False)
+        likeness = torch.exp(-(unlike / LIKENESS).square())
+        return BetaEstimate(attended, colour, found.colour, logit, choice, position, likeness)
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -282,6 +294,7 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
         logits.amax(0),
         mean([e.choice for e in estimates]),
         first.position,
+        mean([e.likeness for e in estimates]),
     )
 
 

@@ -2,8 +2,8 @@
 
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
 semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
-are positions along each pixel's own segment, so it works for any rig with straight fields, rectified or not. It is
-computed on images of half the size, as a whole frame and without gradients.
+are positions along each pixel's own segment, so it works for any rig with straight fields, rectified or not. Here it
+is computed on images of half the size; `matching` goes on from there to the full size. Without gradients.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ RENAMED = {
     "pat.images.luminance": "pat.media.colour.luminance",
     "pat.images.to_luma_chroma": "pat.media.colour.to_luma_chroma",
     "pat.model.FusionNetwork": "pat.networks.protocol.FusionNetwork",
-    "pat.sequence.PictureFiles": "pat.fusion.sequence.ImageFiles",
+    "pat.sequence.PictureFiles": "pat.fusion.frames.ImageFiles",
 }
 """New addresses of names that are not in the new module under the same name."""
 

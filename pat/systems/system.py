@@ -26,9 +26,10 @@ from arraygeom.io.native import write as rig_text
 from pat.evaluation.baseline import classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_table
+from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import fuse
 from pat.fusion.results import Frame, save_frame, view_of
-from pat.fusion.sequence import ImageFiles, SequenceFusion, flicker
+from pat.fusion.sequence import SequenceFusion, flicker
 from pat.fusion.views import read_views
 from pat.media.colour import linear_from_srgb, luminance, to_luma_chroma
 from pat.media.figures import colour_depth, save_panels

@@ -22,6 +22,7 @@ from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.networks.guided import GuidedPAT, GuidedPATConfig
 from pat.networks.weights import save_weights
+from pat.sensors import NoiseLevel
 from pat.support.jobs import JobError
 from tests.pat.fusion import moving
 
@@ -258,6 +259,19 @@ def test_a_plan_comes_back_exactly(material, tmp_path, field):
         for part in ("K", "R", "t"):
             assert torch.equal(getattr(again.rig[name], part), getattr(job.rig[name], part))
     assert replace(again, rig=job.rig) == job
+
+
+@pytest.mark.parametrize("noise", ["estimate", {"fast": NoiseLevel.of_electrons(200.0, 2.0)}])
+def test_noise_and_luminance_are_planned_and_among_the_settings(material, tmp_path, noise):
+    job = batch(material, tmp_path, noise=noise, keep_alpha=True)
+    again = Batch.from_json(job.to_json())
+    assert (again.noise, again.keep_alpha) == (noise, True)
+    other = (
+        batch(material, tmp_path),
+        batch(material, tmp_path, noise=noise),
+        batch(material, tmp_path, luminance="mix"),
+    )
+    assert len({job.settings, *(b.settings for b in other)}) == 4
 
 
 def test_a_field_that_is_a_function_is_refused_before_anything_is_fused(material, tmp_path):

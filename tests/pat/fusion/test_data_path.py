@@ -9,8 +9,9 @@ import torch
 import pat.fusion.tiles
 import pat.fusion.views
 from arraygeom import Camera, Distortion, Epipolar, Pose, Rig, Sensor, intrinsics
+from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import fuse
-from pat.fusion.sequence import ImageFiles, fuse_sequence
+from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
 from pat.media.images import write_image

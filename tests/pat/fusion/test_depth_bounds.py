@@ -39,12 +39,14 @@ def test_positions_beyond_a_segment_are_its_ends(share):
         assert (depth[seen] < FAR * 1.001).all()
 
 
-def field_along(step):
+def fields_along(*steps):
+    return Inputs(torch.zeros(1, 1, 6, 6), tuple(beta_along(step) for step in steps))
+
+
+def beta_along(step):
     end = torch.zeros(1, 6, 6, 2)
     segments = Segments(end + torch.tensor(step), end, torch.ones(1, 6, 6, dtype=torch.bool))
-    return Inputs(
-        torch.zeros(1, 1, 6, 6), (Beta(torch.zeros(1, 1, 6, 6), FieldOnGrid(lambda x: segments, 2, segments)),)
-    )
+    return Beta(torch.zeros(1, 1, 6, 6), FieldOnGrid(lambda x: segments, 2, segments))
 
 
 @pytest.mark.parametrize("step", [[4.0, 0.0], [0.0, 4.0]])
@@ -60,4 +62,14 @@ def test_depth_of_low_confidence_is_that_of_the_background_beside_it(step):
     wanted[0, 2] = torch.nan
     if step[1]:
         depth, confidence, wanted = depth.mT, confidence.mT, wanted.mT
-    torch.testing.assert_close(background_filled(depth, confidence, field_along(step)), wanted, equal_nan=True)
+    torch.testing.assert_close(background_filled(depth, confidence, fields_along(step)), wanted, equal_nan=True)
+
+
+@pytest.mark.parametrize("other", [[-4.0, 0.0], [0.0, 4.0]])
+def test_depth_stays_where_betas_are_on_several_sides(other):
+    depth = torch.full((6, 6), 5.0)
+    depth[:, 2:4] = 1.0
+    confidence = torch.where(depth < 2, 0.1, 1.0)
+    assert torch.equal(background_filled(depth, confidence, fields_along([4.0, 0.0], other)), depth)
+    beside = background_filled(depth, confidence, fields_along([4.0, 0.0], [3.0, 0.5]))
+    assert torch.equal(beside, torch.full((6, 6), 5.0))

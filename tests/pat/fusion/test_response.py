@@ -64,6 +64,9 @@ def test_in_one_hue_a_darker_alpha_is_a_sensor_and_a_brighter_one_may_be_light()
     assert not sensor.is_rec601
     brighter = fit(x, 1.12 * luminance(x[:, None])[0, 0] + noise)
     assert brighter.gain == pytest.approx(1.12**0.5, abs=0.02)
+    red = fit(x, (torch.tensor([0.65, 0.3, 0.05])[:, None] * x).sum(0) + noise)
+    assert red.gain == 1, "15 % brighter: more than light explains"
+    assert red.weights[0] > 0.45
 
 
 def test_fusion_of_another_response():

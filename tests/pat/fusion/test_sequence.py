@@ -1,12 +1,17 @@
 """Sequences: clocks, motion, colour that stays on what moves and does not flicker, confidence that knows."""
 
+from functools import partial
+
 import pytest
 import torch
 
 from arraygeom import Epipolar, Moved, Rig, Sensor, View, Widened, pixel_grid
 from pat.fusion.optical_flow import flow_between, warped
-from pat.fusion.sequence import KeyContribution, SequenceFusion, Timeline, flicker, fuse_sequence, mixed
+from pat.fusion.sequence import KeyContribution, SequenceFusion, flicker, fuse_sequence, mixed
+from pat.fusion.timeline import Timeline
+from pat.media.colour import luminance
 from pat.networks.weights import load_weights
+from pat.sensors import NoiseLevel, generator_for
 from tests.pat.fusion import moving
 
 
@@ -136,3 +141,52 @@ def test_alphas_own_detail_stays(fused):
     weights = torch.tensor([0.299, 0.587, 0.114])[:, None, None]
     for frame, grey in zip(ours, frames["fast"]):
         assert ((frame.image * weights).sum(0) - grey[0]).abs().max() < 1e-5
+
+
+def noisy(frames, level):
+    return {
+        name: [level.recorded(image[None], generator_for(0, name, i))[0] for i, image in enumerate(images)]
+        for name, images in frames.items()
+    }
+
+
+def psnr(frames, ground_truth):
+    pairs = zip(frames, ground_truth, strict=True)
+    return -10 * torch.stack([error(f, t).mean() for f, t in pairs]).mean().log10()
+
+
+def test_a_noisy_sequence_is_denoised(fused):
+    """One level for all frames, stated or estimated; alpha's values stay where that is asked for."""
+    frames, ground_truth, _, _ = fused
+    level = NoiseLevel.of_electrons(60, 2)
+    recorded, network, rig = noisy(frames, level), load_weights("mono-colour-small"), moving.rig(0.003)
+    fusion = partial(fuse_sequence, network, rig, recorded, alpha="fast")
+    plain = psnr(fusion(), ground_truth)
+    assert psnr(fusion(noise=dict.fromkeys(recorded, level)), ground_truth) > plain + 2.0
+    estimated = SequenceFusion(network, rig, recorded, "fast", noise="estimate")._noise
+    assert estimated is not None
+    assert set(estimated) == {"fast", "slow"}
+    assert estimated["fast"].deviation(recorded["fast"][0][None]).mean() == pytest.approx(
+        float(level.deviation(recorded["fast"][0][None]).mean()), rel=0.3
+    )
+    kept = list(fusion(noise=dict.fromkeys(recorded, level), keep_alpha=True))
+    for frame, grey in zip(kept, recorded["fast"]):
+        torch.testing.assert_close(luminance(frame.image), grey, atol=1e-4, rtol=0)
+
+
+def test_motion_that_is_unknown_for_one_beta_is_doubt(fused, monkeypatch):
+    """Of several betas each has its own time: the least certain motion counts."""
+    frames, _, _, _ = fused
+    rig = moving.rig()
+    rig = rig.with_camera("other", rig["slow"])
+    job = SequenceFusion(load_weights("mono-colour"), rig, {**frames, "other": frames["slow"]}, "fast")
+    field = SequenceFusion._field
+
+    def doubtful(self, name, index, time):
+        found, weight = field(self, name, index, time)
+        return found, weight * (0.25 if name == "slow" else 1.0)
+
+    key = job.timeline.key_frames()[0]
+    sure = job.colour(key).confidence
+    monkeypatch.setattr(SequenceFusion, "_field", doubtful)
+    torch.testing.assert_close(job.colour(key).confidence, sure * 0.25)

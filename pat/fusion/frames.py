@@ -1,0 +1,84 @@
+"""Images of one camera in the order of time: read when they are asked for, cached, without noise."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from torch import Tensor
+
+from arraygeom import Rig
+
+from ..sensors import NoiseLevel
+from .low_light import noisy_view
+from .views import read_view
+
+CACHED = 96 * 2**20
+"""Bytes of images cached of each camera: 25 grey frames of 1280x800."""
+
+
+@runtime_checkable
+class Frames(Protocol):
+    """Images (C, H, W) of one camera in the order of time: a list, or read when asked for (`ImageFiles`)."""
+
+    def __len__(self) -> int:
+        """How many."""
+        ...
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        """One of them."""
+        ...
+
+
+class ImageFiles:
+    """Image files of one camera, read and developed (`pat.media.raw`) when asked for.
+
+    `alpha` names the camera to whose scale of light the images are brought.
+    """
+
+    def __init__(self, paths: Sequence[Path], rig: Rig, name: str, *, alpha: str) -> None:
+        self.paths, self.name = list(paths), name
+        self.rig, self.like = rig, rig[alpha].sensor
+
+    def __len__(self) -> int:
+        return len(self.paths)
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        """Raises FileNotFoundError or ValueError naming camera and file."""
+        return read_view(self.rig, self.name, self.paths[i], like=self.like)
+
+
+class CachedFrames:
+    """Frames, of which those asked for last are cached, up to `CACHED` bytes: neighbours in time need them again."""
+
+    def __init__(self, frames: Frames) -> None:
+        self.frames = frames
+        self.cached: OrderedDict[int, Tensor] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        if i not in self.cached:
+            self.cached[i] = self.frames[i]
+        self.cached.move_to_end(i)
+        while len(self.cached) > 1 and sum(image.nbytes for image in self.cached.values()) > CACHED:
+            self.cached.popitem(last=False)
+        return self.cached[i]
+
+
+class DenoisedFrames:
+    """Frames of alpha without noise of a known level."""
+
+    def __init__(self, frames: Frames, level: NoiseLevel) -> None:
+        self.frames, self.level = frames, level
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def __getitem__(self, i: int, /) -> Tensor:
+        image = self.frames[i]
+        view = noisy_view(image, self.level)
+        return image if view is None else view.denoised[0]

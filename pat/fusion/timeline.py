@@ -1,0 +1,83 @@
+"""When the cameras of a sequence recorded, and the frames of alpha that get colour from betas."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from arraygeom import Rig
+
+
+class KeyFrame(NamedTuple):
+    """A frame of alpha that gets colour from betas: its number, and for each beta that of the frame nearest in time."""
+
+    alpha: int
+    betas: dict[str, int]
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """When the frames of a sequence were recorded: camera `name`'s frame i at time_offset + i / frame_rate, seconds.
+
+    Raises ValueError for a camera without a frame rate, or without frames.
+    """
+
+    rig: Rig
+    counts: Mapping[str, int]
+    alpha: str
+
+    def __post_init__(self) -> None:
+        for name, count in self.counts.items():
+            if self.rig[name].sensor.frame_rate is None:
+                raise ValueError(f"the frame rate of '{name}' is not known: add 'frame_rate' to it in the rig")
+            if count < 1:
+                raise ValueError(f"no frames of '{name}'")
+        if self.alpha not in self.counts:
+            raise ValueError(f"no frames of alpha, '{self.alpha}'")
+        if not self.betas:
+            raise ValueError("no frames of any other camera than alpha: fusion needs at least one beta")
+
+    @property
+    def betas(self) -> list[str]:
+        """The betas that have frames."""
+        return [name for name in self.rig.betas(self.alpha) if name in self.counts]
+
+    def rate(self, name: str) -> float:
+        """Frames a second."""
+        return self.rig[name].sensor.frame_rate or 1.0
+
+    def time(self, name: str, i: int) -> float:
+        """When frame i was recorded, seconds of the rig's clock."""
+        return self.rig[name].sensor.time_offset + i / self.rate(name)
+
+    def nearest(self, name: str, time: float) -> int:
+        """The frame recorded nearest to a time."""
+        i = round((time - self.rig[name].sensor.time_offset) * self.rate(name))
+        return min(max(i, 0), self.counts[name] - 1)
+
+    @property
+    def interval(self) -> float:
+        """The time between key frames, seconds."""
+        return 1 / min(max(self.rate(name) for name in self.betas), self.rate(self.alpha))
+
+    def key_frames(self) -> list[KeyFrame]:
+        """The key frames: for each frame of the fastest beta the nearest of alpha, if that is within half an interval.
+
+        Raises ValueError if there is none: then the recordings do not overlap.
+        """
+        fastest = max(self.betas, key=self.rate)
+        found: dict[int, float] = {}
+        for i in range(self.counts[fastest]):
+            time = self.time(fastest, i)
+            index = self.nearest(self.alpha, time)
+            gap = abs(self.time(self.alpha, index) - time)
+            if gap <= 0.5 * self.interval + 1e-9:
+                found[index] = min(gap, found.get(index, gap))
+        if not found:
+            raise ValueError("no frame of a beta is near one of alpha in time: check 'frame_rate' and 'time_offset'")
+        return [KeyFrame(i, self.at(i)) for i in sorted(found)]
+
+    def at(self, index: int) -> dict[str, int]:
+        """For each beta its frame nearest in time to alpha's frame `index`."""
+        return {name: self.nearest(name, self.time(self.alpha, index)) for name in self.betas}
