@@ -6,6 +6,8 @@ K' = A K, fundamental matrices by F' = A_beta^-T F A_alpha^-1.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float, Real
 from torch import Tensor
@@ -73,6 +75,11 @@ def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Ten
     return total
 
 
+def broadcasts(batch: Sequence[int], points: Sequence[int]) -> bool:
+    """Whether axes of points begin with those of a batch, or with axes of length 1 (on either side) in their place."""
+    return len(points) >= len(batch) and all(a == b or 1 in (a, b) for a, b in zip(batch, points))
+
+
 def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Float[Tensor, "*m k"]:
     """M (x, y, 1) for every point, in the precision of `x` (`floating`).
 
@@ -82,7 +89,7 @@ def map_homogeneous(M: Float[Tensor, "*b k 3"], x: Real[Tensor, "*n 2"]) -> Floa
     """
     x = floating(x)
     batch = M.ndim - 2
-    if x.ndim - 1 < batch:
+    if not broadcasts(M.shape[:-2], x.shape[:-1]):
         raise ValueError(
             f"a rig batched over {tuple(M.shape[:-2])} needs pixels (*batch, ..., 2), got {tuple(x.shape)}"
         )

@@ -10,7 +10,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from .batching import Batched
-from .pixels import floating, product
+from .pixels import broadcasts, floating, product
 from .text import pose_text
 
 
@@ -49,7 +49,7 @@ class Pose(Batched):
         Raises ValueError for points without the batch's axes.
         """
         X, batch = floating(X), self.batch_shape
-        if X.ndim - 1 < len(batch):
+        if not broadcasts(batch, X.shape[:-1]):
             raise ValueError(f"poses batched over {tuple(batch)} need points (*batch, ..., 3), got {tuple(X.shape)}")
         beside = (..., *[None] * (X.ndim - 1 - len(batch)))
         t = self.t.expand(*batch, 3).movedim(-1, 0)[beside].movedim(0, -1)

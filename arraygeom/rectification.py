@@ -13,6 +13,7 @@ from .homography import infinite_homography
 from .pixels import HW, product
 from .pose import Pose, cross_matrix, matvec, rotation_from_vector, rotation_vector
 from .rig import Pair
+from .tracing import needs_numbers
 
 
 class Rectification(NamedTuple):
@@ -44,6 +45,7 @@ def rectify(pair: Pair, *, K: Float[Tensor, "3 3"] | None = None, hw: HW | None 
     if alpha.K.ndim > 2 or beta.K.ndim > 2:
         raise ValueError("rectification works on one pair at a time: take one of the batch")
     pose = pair.beta_from_alpha
+    needs_numbers("whether a pair can be rectified", alpha.K, beta.K, pose.R, pose.t)
     if not pose.t.norm() > 1e-12:
         raise ValueError("two co-located cameras cannot be rectified: there is no baseline")
     R_alpha, R_beta = rectifying_rotations(pose)

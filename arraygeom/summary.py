@@ -45,6 +45,8 @@ class PairSummary(NamedTuple):
     depth_step: tuple[float, float] | None
 
 
+MOST_BETAS = 50
+"""Of one alpha."""
 MOST_PIXELS = 1 << 18
 """Pixels of alpha for which segments are computed; a sixteenth of them through lenses."""
 
@@ -54,10 +56,14 @@ def summarise_cameras(rig: Rig) -> list[CameraSummary]:
     return [_camera(name, rig) for name in rig.names]
 
 
-def summarise_pairs(rig: Rig) -> list[PairSummary]:
-    """One summary for each ordered pair of calibrated cameras."""
-    names = [n for n in rig.names if isinstance(rig[n], Camera)]
-    return [_pair(a, b, rig.pair(a, b)) for a in names for b in names if a != b]
+def summarise_pairs(rig: Rig, alpha: str | None = None) -> list[PairSummary]:
+    """One summary for each ordered pair of calibrated cameras, or of one alpha and its `MOST_BETAS` nearest betas."""
+    cameras = {n: c for n, c in rig.cameras.items() if isinstance(c, Camera)}
+    if alpha is None:
+        return [_pair(a, b, rig.pair(a, b)) for a in cameras for b in cameras if a != b]
+    centres = {n: c.centre.detach() for n, c in cameras.items()}
+    nearest = sorted(centres.keys() - {alpha}, key=lambda n: (float((centres[n] - centres[alpha]).norm()), n))
+    return [_pair(alpha, b, rig.pair(alpha, b)) for b in nearest[:MOST_BETAS]] if alpha in cameras else []
 
 
 def _camera(name: str, rig: Rig) -> CameraSummary:
@@ -81,9 +87,8 @@ def field_of_view(camera: Camera) -> tuple[float, float]:
     h, w = camera.hw
     middle = ((w - 1) / 2, (h - 1) / 2)
     ends = [(-0.5, middle[1]), (w - 0.5, middle[1]), (middle[0], -0.5), (middle[0], h - 0.5)]
-    centre_ray = camera.rays(camera.K.new_tensor([middle]))[0]
-    rays, valid = camera.rays(camera.K.new_tensor(ends))
-    halves = torch.where(valid, _angles(rays, centre_ray), torch.nan).tolist()
+    rays, valid = camera.rays(camera.K.new_tensor([middle, *ends]))
+    halves = torch.where(valid[1:], _angles(rays[1:], rays[:1]), torch.nan).tolist()
     return halves[0] + halves[1], halves[2] + halves[3]
 
 

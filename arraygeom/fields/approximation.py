@@ -11,6 +11,7 @@ from torch import Tensor
 from ..homography import apply_homography, fit_homography, fit_similarity
 from ..pixels import coarse_grid
 from ..rig import Link, Pair
+from ..tracing import needs_numbers
 from .straight import Epipolar
 
 
@@ -28,6 +29,7 @@ def approximated(pair: Pair, kind: Literal["homography", "similarity"] = "homogr
     x = coarse_grid(pair.alpha.hw).to(alpha.K)
     segments = Epipolar()(pair, x)
     seen = segments.valid
+    needs_numbers("which pixels an approximation is fitted to", segments.start)
     if int(seen.sum()) < 4:
         raise ValueError("beta sees next to nothing of alpha's image between near and far: nothing to fit a map to")
     fit = fit_homography if kind == "homography" else fit_similarity

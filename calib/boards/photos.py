@@ -16,7 +16,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 
 from .detect import Grey, to_grey
 
@@ -161,11 +161,14 @@ def _orientation(file: Path) -> int:
 
 
 def _decode_file(path: Path) -> np.ndarray:
-    _orientation(path)
+    tag, content = _orientation(path), path.read_bytes()
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR  # orientation tags are applied, as when images are fused
-    image = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), flags)
+    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
     if image is None:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
+    if tag > 1 and content[8:12] == b"WEBP":  # of which OpenCV applies none
+        with Image.open(path) as stored:
+            image = np.ascontiguousarray(np.asarray(ImageOps.exif_transpose(stored).convert("RGB"))[..., ::-1])
     return image
 
 

@@ -116,6 +116,10 @@ class Explore:
         serve(rig, images, alpha=self.alpha, port=self.port, browser=self.browser)
 
 
+MOST_CAMERAS = 12
+"""Of which `pat rig info` describes every pair."""
+
+
 @dataclass
 class Info:
     """Print fields of view, baselines, pixel footprints, and how long segments are for every pair."""
@@ -123,6 +127,8 @@ class Info:
     rig: RigFile
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """Only pairs with this alpha, the 50 nearest; by default all pairs, and of over 12 cameras those of the first."""
     json: bool = False
     """Print JSON instead of tables."""
 
@@ -133,7 +139,11 @@ class Info:
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
         rig = load_rig(self.rig, self.depth)
-        cameras, pairs = summarise_cameras(rig), summarise_pairs(rig)
+        alpha = None if self.alpha is None else rig.require(self.alpha)
+        if alpha is None and len(rig.names) > MOST_CAMERAS:
+            alpha = rig.names[0]
+            say(f"pairs with alpha '{alpha}' and its nearest cameras, of {len(rig.names)}: --alpha NAME for others")
+        cameras, pairs = summarise_cameras(rig), summarise_pairs(rig, alpha)
         if self.json:
             document = {"cameras": [c._asdict() for c in cameras], "pairs": [p._asdict() for p in pairs]}
             return options.print_json(document)

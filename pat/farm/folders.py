@@ -91,8 +91,8 @@ class JobFolder:
         return self.work / f"{tag}-{index:06d}-{uuid4().hex[:12]}"
 
     def clean(self, tag: str) -> None:
-        """Remove unfinished scenes of a former run of the same shard."""
-        names = (f"{tag}-*", f".{tag}-*", f"log-{tag}-*")
+        """Remove unfinished scenes and files of a former run of the same shard."""
+        names = (f"{tag}-*", f".{tag}-*", f"log-{tag}-*", f".job-{tag}-*")
         for left in (path for name in names for path in self.work.glob(name)):
             shutil.rmtree(left) if left.is_dir() else left.unlink()
 

@@ -10,6 +10,8 @@ from typing import Any
 
 from rich.console import Console
 
+from arraygeom.atomic import sweep
+
 from ..support.jobs import Workers, followed
 from .folders import RESERVE, JobFolder, Shard
 from .job import Job, RenderConfig
@@ -108,6 +110,8 @@ def _prepared(job: Job, wanted: list[int]) -> tuple[RenderSummary, list[int], Or
     """What there is, the scenes that are missing, and the order for the workers. Raises ValueError."""
     folder, config = job.folder, job.config
     folder.clean(job.tag)
+    if job.tag == Shard().tag:  # no other run writes to this folder
+        sweep(job.root)
     job.write_manifest()
     job.save()
     done, given_up = set(folder.done()), set(folder.given_up())

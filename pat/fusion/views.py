@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -45,7 +46,7 @@ class Views:
         """Check names and images; each is asked for once, and alpha made grey.
 
         Raises ValueError for a camera that the rig lacks, no image of alpha or of any beta, an image of another size
-        than the rig says, or with values that are not finite.
+        than the rig says, of another type, or with values that are not finite or far outside 0..1.
         """
         for name in (alpha, *images):
             rig.require(name)
@@ -78,6 +79,10 @@ class Views:
         return dataclasses.replace(self, rig=rig or self.rig, images={**self.images, **images})
 
 
+LARGEST_VALUE = 32.0
+"""Of an image in 0..1: developed ones of a short exposure exceed 1, and those of 8 bits have values to 255."""
+
+
 def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w"]:
     """Alpha's image in grey. Warns if it was in colour."""
     if len(image) == 3 and not (torch.equal(image[0], image[1]) and torch.equal(image[0], image[2])):
@@ -88,13 +93,19 @@ def grey_alpha(name: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "1 h w
 
 def _checked(rig: Rig, images: Images, name: str) -> Tensor:
     image, (h, w) = images[name], rig[name].hw
+    if image.ndim != 3 or image.dtype not in (torch.float32, torch.float64):
+        got = f"{str(image.dtype).removeprefix('torch.')} of shape {tuple(image.shape)}"
+        raise ValueError(f"the image of '{name}' is {got}: wanted float32 (C, H, W) in 0..1")
     if tuple(image.shape[1:]) != (h, w):
         got = f"{image.shape[2]}x{image.shape[1]}"
         raise ValueError(
             f"the image of '{name}' is {got}, the rig says {w}x{h}: resize the rig, or give the right image"
         )
-    if not torch.isfinite(image).all():
+    largest = max(abs(float(v)) for v in image.detach().aminmax())
+    if not math.isfinite(largest):
         raise ValueError(f"the image of '{name}' has NaN or infinite values")
+    if largest > LARGEST_VALUE:
+        raise ValueError(f"the image of '{name}' has values up to {largest:g}: divide them, images are in 0..1")
     return image
 
 

@@ -71,9 +71,10 @@ def read_image(
 ) -> Float[Tensor, "c h w"]:
     """The image in a PNG, TIFF, JPEG, PNM, BMP, WebP or HEIC file: grey (1, H, W) or RGB (3, H, W), float32, 0..1.
 
-    HEIC, which needs the extra `heic`, has 8 bits here. Raw files of cameras (DNG and others), which need the extra
-    `raw`, are developed to sRGB by LibRaw. An image of 8 bits with another colour profile is converted to sRGB, with a
-    warning; its profile is ignored with `orientation="ignore"`, and so are those of images of 16 bits.
+    HEIC, which needs the extra `heic`, has 8 bits here and is rotated as its own header says. Raw files of cameras
+    (DNG and others), which need the extra `raw`, are developed to sRGB by LibRaw. An image of 8 bits with another
+    colour profile is converted to sRGB, with a warning; its profile is ignored with `orientation="ignore"`, and so are
+    those of images of 16 bits.
     8-bit values are divided by 255 and 16-bit ones by 65535, or by 2^bits - 1: a 12-bit camera that stores
     0..4095 in 16 bits needs `bits=12`. TIFF files that pack 10, 12 or 14 bits a value need nothing. Float files
     must hold 0..1. A wholly opaque alpha channel is dropped. `name` (such as a camera's) goes in front of messages.
@@ -94,7 +95,7 @@ def read_image(
     else:
         content = path.read_bytes()
     if content[4:12] in _HEIF:
-        content = _png_of_heif(path, label)
+        content = _png_of_heif(path, label, hw)
     header = image_header(content)
     if header is None:
         raise ValueError(f"{label}: not an image that can be read: give a whole PNG, TIFF, JPEG or PNM file")
@@ -144,18 +145,24 @@ def write_image(
         temporary.write_bytes(content)
 
 
-def _png_of_heif(path: Path, label: str) -> bytes:
-    """The image of a HEIC or HEIF file, upright, as a PNG file."""
+def _png_of_heif(path: Path, label: str, hw: HW | None) -> bytes:
+    """The image of a HEIC or HEIF file, upright, as a PNG file; its size is compared before it is decoded."""
     try:
         import pillow_heif
     except ImportError:
         raise ValueError(
             f"{label}: reading HEIC needs the package pillow-heif: pip install 'arraygeom-pat[heic]', or save it as PNG"
         ) from None
+    problem = f"{label}: not a HEIC image that can be read (%s): save it as PNG"
     try:
-        image = np.asarray(pillow_heif.open_heif(path, convert_hdr_to_8bit=True))
+        stored = pillow_heif.open_heif(path, convert_hdr_to_8bit=True)
     except (OSError, ValueError) as error:
-        raise ValueError(f"{label}: not a HEIC image that can be read ({error}): save it as PNG") from None
+        raise ValueError(problem % error) from None
+    _check_header(stored.size[::-1], hw, label)
+    try:
+        image = np.asarray(stored)
+    except (OSError, ValueError) as error:
+        raise ValueError(problem % error) from None
     return cv2.imencode(".png", image if image.ndim == 2 else image[..., [2, 1, 0]])[1].tobytes()
 
 

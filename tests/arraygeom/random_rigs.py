@@ -10,30 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from arraygeom import (
-    Camera,
-    Curved,
-    Dense,
-    Distortion,
-    Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Local,
-    Moved,
-    NearestVoxels,
-    Pair,
-    Pose,
-    Positions,
-    Rectified,
-    Rig,
-    Segments,
-    ThroughLenses,
-    Widened,
-    intrinsics,
-    pinhole_view,
-    rotation_from_vector,
-    stack,
-)
+import arraygeom as ag
 from tests.arraygeom import explicit
 
 FRONT = 1e-3
@@ -49,12 +26,12 @@ class Drawn:
     """A rig, pixels of alpha (n, 2) with their rays (n, 3, z = 1), and what kind of rig it is."""
 
     kind: str
-    rig: Rig
+    rig: ag.Rig
     x: np.ndarray
     rays: np.ndarray
 
     @property
-    def pair(self) -> Pair:
+    def pair(self) -> ag.Pair:
         return self.rig.pair("alpha", "beta")
 
 
@@ -86,15 +63,17 @@ def drawn(seed: int, *, lenses: bool = False) -> Drawn:
     if lenses:
         alpha, beta = (camera.replace(distortion=_lens(rng)) for camera in (alpha, beta))
     moved = _moved_world(rng)
-    rig = Rig({"alpha": _in_world(alpha, moved), "beta": _in_world(beta, moved)}, depth=(near, far))
+    rig = ag.Rig({"alpha": _in_world(alpha, moved), "beta": _in_world(beta, moved)}, depth=(near, far))
     return Drawn(kind, rig, *_pixels(rng, kind, alpha, beta))
 
 
-def _camera(rng: np.random.Generator, hw: Any, share: tuple[float, float], w: np.ndarray, centre: np.ndarray) -> Camera:
+def _camera(
+    rng: np.random.Generator, hw: Any, share: tuple[float, float], w: np.ndarray, centre: np.ndarray
+) -> ag.Camera:
     focal = hw[1] * rng.uniform(*share, 2)
     middle = np.array([hw[1], hw[0]]) * rng.uniform(0.35, 0.65, 2)
-    pose = Pose.from_centre(rotation_from_vector(torch.from_numpy(w)), torch.from_numpy(centre))
-    return Camera(K=intrinsics(tuple(focal), hw, tuple(middle)), cam_from_world=pose, hw=hw)
+    pose = ag.Pose.from_centre(ag.rotation_from_vector(torch.from_numpy(w)), torch.from_numpy(centre))
+    return ag.Camera(K=ag.intrinsics(tuple(focal), hw, tuple(middle)), cam_from_world=pose, hw=hw)
 
 
 def _motion(rng: np.random.Generator, kind: str) -> tuple[np.ndarray, np.ndarray]:
@@ -113,25 +92,27 @@ def _motion(rng: np.random.Generator, kind: str) -> tuple[np.ndarray, np.ndarray
     return w, c * {"tiny baseline": 1e-6, "long baseline": 20}.get(kind, 1.0)
 
 
-def _lens(rng: np.random.Generator) -> Distortion | None:
+def _lens(rng: np.random.Generator) -> ag.Distortion | None:
     kind = rng.integers(4)
     if kind == 0:
         return None
     if kind == 1:
-        return Distortion("kannala-brandt", torch.from_numpy(rng.uniform(-0.05, 0.05, 4) / [1, 2, 4, 8]))
+        return ag.Distortion("kannala-brandt", torch.from_numpy(rng.uniform(-0.05, 0.05, 4) / [1, 2, 4, 8]))
     small = rng.uniform(-1, 1, 5) * [0.25, 0.1, 2e-3, 2e-3, 0.02]
-    return Distortion("brown-conrady", torch.from_numpy(small))
+    return ag.Distortion("brown-conrady", torch.from_numpy(small))
 
 
-def _moved_world(rng: np.random.Generator) -> Pose:
-    return Pose(rotation_from_vector(torch.from_numpy(rng.uniform(-3, 3, 3))), torch.from_numpy(rng.uniform(-3, 3, 3)))
+def _moved_world(rng: np.random.Generator) -> ag.Pose:
+    return ag.Pose(
+        ag.rotation_from_vector(torch.from_numpy(rng.uniform(-3, 3, 3))), torch.from_numpy(rng.uniform(-3, 3, 3))
+    )
 
 
-def _in_world(camera: Camera, world: Pose) -> Camera:
+def _in_world(camera: ag.Camera, world: ag.Pose) -> ag.Camera:
     return camera.replace(cam_from_world=camera.cam_from_world @ world)
 
 
-def _pixels(rng: np.random.Generator, kind: str, alpha: Camera, beta: Camera) -> tuple[np.ndarray, np.ndarray]:
+def _pixels(rng: np.random.Generator, kind: str, alpha: ag.Camera, beta: ag.Camera) -> tuple[np.ndarray, np.ndarray]:
     """Whole pixels and others, alpha's corners, and the epipole where it is in front."""
     h, w = alpha.hw
     x = rng.uniform([0, 0], [w - 1, h - 1], (PIXELS, 2))
@@ -168,24 +149,24 @@ def fields_of(one: Drawn) -> list[tuple[str, Any, float | None, float | None]]:
     near, far = (float(d) for d in one.rig.depth)
     # Not by a half: whether a corner moved onto the very edge of the image is inside is up to rounding.
     step = torch.full((2, *one.pair.alpha.hw), 0.4)
-    both: list[tuple[str, Any, float | None, float | None]] = [("Curved", Curved(48), near, far)]
-    both += [("Moved", Moved(Curved(16), step), None, None)]
+    both: list[tuple[str, Any, float | None, float | None]] = [("Curved", ag.Curved(48), near, far)]
+    both += [("Moved", ag.Moved(ag.Curved(16), step), None, None)]
     if _have_pinhole_views(one):
-        both += [("ThroughLenses", ThroughLenses(Epipolar(), 48), None, None)]
-    both += [("Widened(Curved)", Widened(Curved(48), 1.4, 2), near, far)]
+        both += [("ThroughLenses", ag.ThroughLenses(ag.Epipolar(), 48), None, None)]
+    both += [("Widened(Curved)", ag.Widened(ag.Curved(48), 1.4, 2), near, far)]
     if one.pair.has_lens:
         return both
     return [
         *both,
-        ("Epipolar", Epipolar(), near, far),
-        ("EpipolarLine", EpipolarLine(), 1e-4, math.inf),
-        ("HomographyDisplacement", HomographyDisplacement(), None, None),
-        ("Widened", Widened(Epipolar(), along=2), near, far),
-        ("Widened across", Widened(Epipolar(), 2, 1, samples=48), near, far),
-        ("Rectified", Rectified(10.0, alpha_is="either"), None, None),
-        ("NearestVoxels", NearestVoxels(24, 8), None, None),
-        ("Local", Local(3), None, None),
-        ("Dense", Dense(5), None, None),
+        ("Epipolar", ag.Epipolar(), near, far),
+        ("EpipolarLine", ag.EpipolarLine(), 1e-4, math.inf),
+        ("HomographyDisplacement", ag.HomographyDisplacement(), None, None),
+        ("Widened", ag.Widened(ag.Epipolar(), along=2), near, far),
+        ("Widened across", ag.Widened(ag.Epipolar(), 2, 1, samples=48), near, far),
+        ("Rectified", ag.Rectified(10.0, alpha_is="either"), None, None),
+        ("NearestVoxels", ag.NearestVoxels(24, 8), None, None),
+        ("Local", ag.Local(3), None, None),
+        ("Dense", ag.Dense(5), None, None),
     ]
 
 
@@ -193,7 +174,7 @@ def _have_pinhole_views(one: Drawn) -> bool:
     """Whether each image has a pixel less than 62 degrees off axis; tiny ones of wide lenses may not."""
     try:
         for camera in one.pair.cameras:
-            pinhole_view(camera)
+            ag.pinhole_view(camera)
     except ValueError:
         return False
     return True
@@ -238,9 +219,9 @@ def _holds_what_is_seen(name: str, one: Drawn, found: Any, near: float, far: flo
 
 
 def _ends(found: Any) -> tuple[Any, Any, np.ndarray, bool]:
-    if isinstance(found, Segments):
+    if isinstance(found, ag.Segments):
         return *(v.double().numpy() for v in (found.start, found.end)), found.valid.numpy(), False
-    assert isinstance(found, Positions)
+    assert isinstance(found, ag.Positions)
     xy, mask = found.xy.double().numpy(), found.mask.numpy()
     return [points[m] for points, m in zip(xy, mask)], None, mask.any(-1), True
 
@@ -271,8 +252,8 @@ def _explicit_lists(one: Drawn, dtype: torch.dtype) -> None:
     pair, x = one.pair, torch.from_numpy(one.x)
     H, F = pair.homography.numpy(), pair.fundamental.numpy()
     h, w = pair.beta.hw
-    local, nearest = Local(3)(pair, x), NearestVoxels(24, 8)(pair, x)
-    displaced = HomographyDisplacement(5.0)(pair, x)
+    local, nearest = ag.Local(3)(pair, x), ag.NearestVoxels(24, 8)(pair, x)
+    displaced = ag.HomographyDisplacement(5.0)(pair, x)
     for i, p in enumerate(one.x):
         q = H @ [*p, 1]
         line = F @ [*p, 1]
@@ -318,7 +299,7 @@ def _gradients(one: Drawn, dtype: torch.dtype) -> None:
     x = torch.from_numpy(one.x).to(dtype).requires_grad_()
     for name, field, *_ in fields_of(one):
         found = field(one.rig.perturbed(changes).pair("alpha", "beta"), x)
-        ends = (found.start + found.end).sum() if isinstance(found, Segments) else found.xy.sum()
+        ends = (found.start + found.end).sum() if isinstance(found, ag.Segments) else found.xy.sum()
         if not ends.requires_grad:
             continue
         slopes = torch.autograd.grad(ends, [x, *changes.values()], allow_unused=True)
@@ -339,8 +320,8 @@ def check_variants(one: Drawn, other: Drawn) -> None:
             _same(f"{name}: {one.kind}: autocast", field(fresh, x), expected)
     if one.pair.has_lens or other.pair.has_lens or one.kind == "tiny image" or other.kind == "tiny image":
         return
-    other_rig = Rig({n: other.rig[n].replace(hw=one.rig[n].hw) for n in one.rig.names}, depth=other.rig.depth)
-    batch = stack([one.rig, other_rig]).pair("alpha", "beta")
+    other_rig = ag.Rig({n: other.rig[n].replace(hw=one.rig[n].hw) for n in one.rig.names}, depth=other.rig.depth)
+    batch = ag.stack([one.rig, other_rig]).pair("alpha", "beta")
     pixels = torch.from_numpy(np.stack([one.x, other.x]))
     for name, field, *_ in fields_of(one):
         found = field(batch, pixels)

@@ -245,9 +245,10 @@ def test_batched_rigs_agree_with_single_ones(field):
             torch.testing.assert_close(getattr(together, f.name)[i], getattr(alone, f.name))
 
 
-def test_pixels_without_the_batch_axis_are_refused():
-    with pytest.raises(ValueError, match="batched over"):
-        Epipolar()(pair_of(batch_of([random_rig(0)])), torch.zeros(2))
+@pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
+def test_pixels_without_the_batch_axis_are_refused(shape):
+    with pytest.raises(ValueError, match=r"batched over \(3,\) needs pixels"):
+        Epipolar()(pair_of(batch_of([random_rig(i) for i in range(3)])), torch.zeros(*shape, 2))
 
 
 def test_whole_images_in_chunks_are_what_single_rows_are():

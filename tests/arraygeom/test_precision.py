@@ -202,10 +202,11 @@ def test_a_batch_of_cameras_meets_the_leading_axes_of_points(shape):
     torch.testing.assert_close(back, X)
 
 
-def test_points_without_the_batch_axis_are_refused():
+@pytest.mark.parametrize("shape", [(), (5,), (4, 3)])
+def test_points_without_the_batch_axis_are_refused(shape):
     pose = stack([Pose.identity()] * 3)
     with pytest.raises(ValueError, match="need points"):
-        pose.apply(torch.zeros(3, dtype=torch.float64))
+        pose.apply(torch.zeros(*shape, 3, dtype=torch.float64))
 
 
 def test_samples_outside_an_image_are_zero_whatever_its_first_pixel():

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from arraygeom import Rig
+from arraygeom import Distortion, Rig
 from arraygeom.io import read_rig, write_rig
 from calib.boards.covariance import RigCovariance
 from pat.cli.main import main
@@ -67,20 +67,24 @@ def rig_seeds(folder: Path) -> Iterator[Seed]:
             own = file.parent != FIXTURES
             yield Seed("rig", file.parent.name if own else file.stem, file, own)
     rich = Rig.load(Path(__file__).parent / "native.yaml")
-    plain = read_rig(FIXTURES / "kalibr.yaml")
-    for format, name in (
-        ("native", "rig.yaml"),
-        ("colmap", ""),
-        ("kalibr", "c.yaml"),
-        ("nerfstudio", "t.json"),
-        ("opencv", ""),
+    plain, wide = (read_rig(FIXTURES / name) for name in ("kalibr.yaml", "kalibr_wide.yaml"))
+    lens = Distortion("kannala-brandt", torch.tensor([0.05, -0.01, 0.003, -5e-4], dtype=torch.float64))
+    fisheyes = plain.replace(cameras={n: c.replace(distortion=lens) for n, c in plain.cameras.items()})
+    for label, rig, name in (
+        ("native", rich, "rig.yaml"),
+        ("native, wide", wide, "rig.yaml"),
+        ("colmap", plain, ""),
+        ("kalibr", plain, "c.yaml"),
+        ("nerfstudio", plain, "t.json"),
+        ("nerfstudio, fisheye", fisheyes, "t.json"),
+        ("opencv", plain, ""),
     ):
-        target = folder / f"written_{format}" / name if name else folder / f"written_{format}"
+        target = folder / f"written_{label}" / name if name else folder / f"written_{label}"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            write_rig(rich if format == "native" else plain, target, format=format)
+            write_rig(rig, target, format=label.partition(",")[0])
         for file in sorted(target.iterdir()) if target.is_dir() else [target]:
-            yield Seed("rig", f"{format} (written)", file, target.is_dir())
+            yield Seed("rig", f"{label} (written)", file, target.is_dir())
     yield from _matlab(folder / "matlab")
     yield from _colmap_binary(folder / "colmap_binary")
 

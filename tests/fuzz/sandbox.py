@@ -24,7 +24,7 @@ WAITING = 12
 class Outcome(NamedTuple):
     """How a case ended: "read", "refused" or what went wrong, its last line, seconds of a core, peak resident bytes.
 
-    What the forking process held already is not counted in the peak.
+    What the child holds from its parent is not counted in the peak.
     """
 
     verdict: str
@@ -38,10 +38,14 @@ def ended(case: Callable[[], str], log: Path) -> Outcome:
 
     A traceback, a signal and a time-out are faults. What the case prints goes to `log`.
     """
-    begin, held = time.monotonic(), _resident()
+    begin, (reader, writer) = time.monotonic(), os.pipe()
     child = os.fork()
     if child == 0:
+        os.write(writer, str(_resident()).encode())
         _child(case, log)
+    held = int(os.read(reader, 32))
+    os.close(reader)
+    os.close(writer)
     status, usage = _wait(child, begin)
     seconds, peak = usage.ru_utime + usage.ru_stime, max(usage.ru_maxrss * 1024 - held, 0)
     lines = log.read_text(errors="replace").splitlines() if log.exists() else []

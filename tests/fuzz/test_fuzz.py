@@ -56,6 +56,11 @@ def test_the_sandbox_sees(case, verdict, tmp_path, monkeypatch):
     assert sandbox.ended(case, tmp_path / "log").verdict == verdict
 
 
+def test_the_sandbox_measures_the_memory_of_the_case(tmp_path):
+    peak = sandbox.ended(lambda: "read" if len(bytearray(200 << 20)) else "", tmp_path / "log").peak
+    assert 190 << 20 < peak < 230 << 20
+
+
 def bomb(hw: tuple[int, int]) -> bytes:
     """A PNG file of black pixels, small on the disk."""
 
@@ -162,6 +167,24 @@ def test_numbers_that_no_camera_has_are_refused(old, new, tmp_path):
     (tmp_path / "rig.yaml").write_text(rig.replace(old, new))
     with pytest.raises(RigFileError, match=r"use pixels|use metres|in metres"):
         Rig.load(tmp_path / "rig.yaml")
+
+
+@pytest.mark.parametrize(("cameras", "distorted"), [(200, True), (3000, False)])
+def test_rigs_of_many_cameras_are_read_and_summarised_within_seconds(cameras, distorted, tmp_path, monkeypatch):
+    """The tests' own checks of shapes take half of it; of so many, not every pair is described."""
+    monkeypatch.setattr(sandbox, "SECONDS", 30)
+    lens = ", distortion: {model: brown-conrady, coefficients: [-0.1, 0.02, 0.001, 0.001]}" if distorted else ""
+    entries = (f"  c{i}: {{size: [64, 48], focal: 50, translation: [{i}, 0, 0]{lens}}}" for i in range(cameras))
+    text = "\n".join(["format: arraygeom-rig 1", "depth: [1, 10]", "cameras:", *entries])
+    rig, model = tmp_path / "rig.yaml", tmp_path / "model"
+    rig.write_text(text)
+    for command in (
+        ("info", rig),
+        ("convert", rig, model, "--write-as", "colmap"),
+        ("convert", model, tmp_path / "again.yaml"),
+    ):
+        outcome = sandbox.ended(lambda command=command: cases.command("rig", *map(str, command)), tmp_path / "log")
+        assert outcome.verdict == "read", outcome
 
 
 def test_a_rig_of_huge_images_is_summarised_within_seconds(tmp_path):

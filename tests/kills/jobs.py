@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import cv2
@@ -218,7 +220,7 @@ def rendering_job(folder: Path, backend: str = "layered", scenes: int = 4) -> Jo
     def kept(out: Path) -> dict[str, int]:
         return {path.name: path.stat().st_mtime_ns for path in (out / "scenes").glob("*")}
 
-    return Job("rendering" if backend == "layered" else backend, arguments, compared, faults, kept=kept)
+    return Job("rendering" if backend == "layered" else "rendering by Blender", arguments, compared, faults, kept=kept)
 
 
 def all_jobs(folder: Path) -> Iterator[Job]:
@@ -231,3 +233,7 @@ def all_jobs(folder: Path) -> Iterator[Job]:
     yield training_job(folder)
     yield calibration_job(folder)
     yield rendering_job(folder)
+    if find_spec("bpy"):
+        yield rendering_job(folder, "blender", scenes=3)
+    else:
+        print("rendering by Blender is left out: pip install '.[synthesis]'", file=sys.stderr)

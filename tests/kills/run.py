@@ -31,6 +31,7 @@ COUNTS: dict[str, dict[str, int]] = {
     "training": {"moment": 6, "write": 6, "cut": 3},
     "calibration": {"moment": 4, "write": 4, "cut": 2},
     "rendering": {"moment": 4, "worker": 4, "write": 4},
+    "rendering by Blender": {"moment": 3, "worker": 3, "write": 3},
 }
 """How often each job is killed in each way."""
 COLUMNS = {
@@ -53,26 +54,22 @@ class Kills:
     seed: int = 0
     """Of the moments."""
     out: Path | None = None
-    """A document whose block `kills` the table replaces."""
+    """A document whose block `kills` the table replaces; with `only`, its row."""
 
     def run(self) -> int:
         torch.set_num_threads(1)
-        begin, rows, faults = time.monotonic(), [], []
+        begin, rows, faults = time.monotonic(), {}, []
         with tempfile.TemporaryDirectory() as folder:
             for job in all_jobs(Path(folder)):
                 if self.only in (None, job.name):
                     found = self._kill(job, Path(folder))
                     faults += [fault for one in found.values() for fault in one.faults]
-                    rows.append(row(job.name, found))
-                    print(rows[-1], *faults, sep="\n", file=sys.stderr, flush=True)
-        lines = [
-            f"| job | {' | '.join(COLUMNS.values())} | compared | faults |",
-            f"|---|{'---:|' * (len(COLUMNS) + 2)}",
-        ]
-        text = "\n".join([*lines, *rows])
-        print("\n".join([text, *faults, f"{(time.monotonic() - begin) / 60:.0f} minutes"]))
+                    rows[job.name] = row(job.name, found)
+                    print(rows[job.name], *faults, sep="\n", file=sys.stderr, flush=True)
+        print("\n".join([table(rows), *faults, f"{(time.monotonic() - begin) / 60:.0f} minutes"]))
         if self.out is not None:
-            write_text(self.out, with_block(self.out.read_text(), "kills", text))
+            document = self.out.read_text()
+            write_text(self.out, with_block(document, "kills", table(rows_of(document) | rows if self.only else rows)))
         return int(bool(faults))
 
     def _kill(self, job: Job, folder: Path) -> dict[str, Killed]:
@@ -85,6 +82,17 @@ class Kills:
             else:
                 found[way] = killed(job, right, folder, way=way, kills=kills, seed=self.seed)
         return found
+
+
+def table(rows: dict[str, str]) -> str:
+    """Rows by job, in Markdown."""
+    head = [f"| job | {' | '.join(COLUMNS.values())} | compared | faults |", f"|---|{'---:|' * (len(COLUMNS) + 2)}"]
+    return "\n".join([*head, *(rows[name] for name in COUNTS if name in rows)])
+
+
+def rows_of(document: str) -> dict[str, str]:
+    """The rows of a table that a document holds, by job."""
+    return {name: line for name in COUNTS for line in document.splitlines() if line.startswith(f"| {name} |")}
 
 
 def row(name: str, found: dict[str, Killed]) -> str:

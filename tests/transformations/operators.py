@@ -100,12 +100,17 @@ GEOMETRY = {
     "fundamental_matrix": Operator(lambda w: moved_pair(w).fundamental * 1e3, W),
     "infinite_homography": Operator(lambda w: ag.infinite_homography(A.K, B.K, ag.rotation_from_vector(w[:3])), W),
     "homography_at": Operator(lambda w: moved_pair(w).homography_at(vector(3.0)[0]), W),
+    "plane_homography": Operator(lambda w: _of_plane(moved_pair(w).beta_from_alpha), W),
+    "rectify": Operator(lambda w: ag.rectify(moved_pair(w)).H_beta, W),
+    "approximated": Operator(lambda w: ag.approximated(moved_pair(w)).homography, W),
     "rotation_from_vector": Operator(lambda w: ag.rotation_from_vector(w[:3]), W),
     "intrinsics": Operator(lambda w: ag.intrinsics(w[:2] + 100, (48, 64), w[2:4] + 30), W),
     "shift_origin": Operator(lambda w: ag.shift_origin(moved_pair(w).fundamental, 1) * 1e3, W),
     "track": Operator(lambda x: ag.track(A.K, B.K, PAIR.beta_from_alpha, pixels(x)).a, X),
     "segments_between": Operator(lambda x: ends(ag.segments_between(_track(x), NEAR, FAR, B.hw)), X),
     "depth_from_track": Operator(lambda x: ag.depth_from_track(_track(X), pixels(x)).depth, X + 2),
+    "depth_of": Operator(lambda x: ag.depth_of(PAIR, pixels(X), pixels(x)).depth, X + 2),
+    "depth_of, through lenses": Operator(lambda x: ag.depth_of(CURVED, pixels(X), pixels(x)).depth, X + 2),
     "triangulate": Operator(lambda x: ag.triangulate([A, B], torch.stack([pixels(x), pixels(x) + 2])).X, X),
     "fit_similarity": Operator(
         lambda x: ag.fit_similarity(pixels(EIGHT), pixels(x)), EIGHT * 1.1 + EIGHT.flip(0) * 0.1
@@ -114,6 +119,8 @@ GEOMETRY = {
     "sample": Operator(lambda x: ag.sample(_image(), x.reshape(1, -1, 2) / 10).values, X),
     "to_grid": Operator(lambda x: ag.to_grid(pixels(x), (48, 64)), X),
     "Camera.project": Operator(lambda x: A.project(x.reshape(-1, 3) @ A.R + A.centre).x, POINTS),
+    "Camera.resize": Operator(lambda w: A.replace(K=A.K + w[0]).resize((24, 30)).rot90(1).K, W),
+    "Pose.perturbed, inverse": Operator(lambda w: A.cam_from_world.perturbed(w[:3], w[3:]).inverse().t, W),
     "Camera.unproject": Operator(lambda x: A.unproject(pixels(x), x[::2]), X),
     "Camera.rays": Operator(lambda x: A.rays(pixels(x))[0], X),
     "distort, brown-conrady": Operator(lambda x: BROWN.distort(pixels(x))[0], X),
@@ -146,6 +153,10 @@ ATTENTION = {
     'attend, backend="cpu"': attention(cpu, "query"),
 }
 OPERATORS = {**GEOMETRY, **FIELDS, **ATTENTION}
+
+
+def _of_plane(pose: Pose) -> Tensor:
+    return ag.plane_homography(A.K, B.K, pose.R, pose.t, normal=vector(0, 0, 1), d=vector(-3)[0])
 
 
 def _track(x: Tensor) -> ag.Track:

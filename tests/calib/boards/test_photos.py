@@ -119,15 +119,16 @@ def test_missing_folders_and_broken_images(tmp_path):
         find_photos(tmp_path)
 
 
-def test_orientation_tags_are_applied_and_have_to_be_the_same(tmp_path):
+@pytest.mark.parametrize("suffix", ["png", "tif", "webp"])
+def test_orientation_tags_are_applied_and_have_to_be_the_same(suffix, tmp_path):
     pixels = np.arange(24, dtype=np.uint8).reshape(4, 6) * 10
     for i, orientation in enumerate((6, 6, 3)):
         exif = Image.Exif()
         exif[274] = orientation
-        Image.fromarray(pixels).save(tmp_path / f"cam_{i}.png", exif=exif)
-    with pytest.raises(ValueError, match=r"cam: its images have different orientation tags \(6 in cam_0.png, 3 in"):
+        Image.fromarray(pixels).save(tmp_path / f"cam_{i}.{suffix}", exif=exif, lossless=True)
+    with pytest.raises(ValueError, match=r"cam: its images have different orientation tags \(6 in cam_0.\w+, 3 in"):
         find_photos(tmp_path)
-    (tmp_path / "cam_2.png").unlink()
+    (tmp_path / f"cam_2.{suffix}").unlink()
     photo = find_photos(tmp_path)["cam"][0]
     assert (photo.decode()[..., 0] == np.rot90(pixels, -1)).all()
 

@@ -177,6 +177,17 @@ def test_rig_info_as_json(small, capsys):
     told = json.loads(capsys.readouterr().out)
     assert [camera["name"] for camera in told["cameras"]] == ["mono", "colour"]
     assert told["pairs"][0]["baseline"] == pytest.approx(0.1241, abs=1e-3)
+    main(["rig", "info", str(small / "rig.yaml"), "--json", "--alpha", "colour"])
+    assert [(p["alpha"], p["beta"]) for p in json.loads(capsys.readouterr().out)["pairs"]] == [("colour", "mono")]
+
+
+def test_rig_info_of_many_cameras_describes_the_pairs_of_one(tmp_path, capsys):
+    cameras = "\n".join(f"  c{i}: {{size: [64, 48], focal: 50, translation: [{i}, 0, 0]}}" for i in range(60))
+    (tmp_path / "rig.yaml").write_text(f"format: arraygeom-rig 1\ncameras:\n{cameras}\n")
+    main(["rig", "info", str(tmp_path / "rig.yaml"), "--json"])
+    out, error = capsys.readouterr()
+    assert [(p["alpha"], p["beta"]) for p in json.loads(out)["pairs"]] == [("c0", f"c{i}") for i in range(1, 51)]
+    assert "pairs with alpha 'c0' and its nearest cameras, of 60: --alpha NAME for others" in error
 
 
 def test_an_interruption_is_one_line_and_status_130(monkeypatch, capsys):

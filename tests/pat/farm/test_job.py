@@ -18,7 +18,7 @@ from pat.cli.main import main
 from pat.farm.backends import rig_from_alpha
 from pat.farm.folders import JobFolder, Shard
 from pat.farm.job import Job, RenderConfig
-from pat.farm.run import RenderSummary, check_space, render
+from pat.farm.run import RenderSummary, _prepared, check_space, render
 from pat.farm.worker import _Server
 from pat.farm.workshop import SceneOutcome
 from pat.support.jobs import JobError
@@ -134,6 +134,17 @@ def test_other_mistakes_are_one_line(config, tmp_path, capfd):
     (tmp_path / "rig.yaml").write_text("cameras: {mono: {size: [8, 8]}}")
     said = fails(["render", config, "--scenes", 2, "--out", out], capfd)
     assert "camera 'mono' is not calibrated: rendering needs its K, R and t" in said
+
+
+@pytest.mark.parametrize(("shard", "stays"), [(Shard(), False), (Shard(1, 2), True)])
+def test_what_a_killed_run_had_begun_to_write_is_removed_where_no_other_writes(shard, stays, config, tmp_path):
+    out = tmp_path / "data"
+    left = [out / name for name in (f".scenes-{'0' * 32}.jsonl", f".work/.job-{shard.tag}-{'0' * 32}.json")]
+    left[1].parent.mkdir(parents=True)
+    for path in left:
+        path.touch()
+    _prepared(Job(config=RenderConfig.load(config), root=out, tag=shard.tag), [0])
+    assert [path.exists() for path in left] == [stays, False]
 
 
 def test_a_folder_of_another_configuration_is_refused(config, tmp_path):

@@ -125,8 +125,11 @@ def test_a_shard_cleans_only_after_itself(tmp_path):
     left = [folder.partial(0, tag) for tag in ("1of12", "11of12", "1of2")]
     for path in left:
         path.mkdir()
+    left += [folder.work / f".job-{tag}-{'0' * 32}.json" for tag in ("1of12", "11of12", "1of2")]
+    for path in left[3:]:
+        path.touch()
     folder.clean("1of12")
-    assert [p.exists() for p in left] == [False, True, True]
+    assert [p.exists() for p in left] == [False, True, True] * 2
 
 
 def test_one_run_at_a_time(tmp_path):

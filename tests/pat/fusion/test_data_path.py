@@ -119,6 +119,10 @@ def test_views_name_what_is_wrong():
         (images | {"c": images["b"]}, "no camera 'c'"),
         (images | {"b": images["b"][:, :-1]}, "the image of 'b' is 96x63, the rig says 96x64"),
         (images | {"b": images["b"] * torch.nan}, "NaN or infinite"),
+        (images | {"b": images["b"] * 255}, r"the image of 'b' has values up to 2\d\d.*: divide them"),
+        (images | {"b": (images["b"] * 255).to(torch.uint8)}, r"'b' is uint8 of shape \(3, 64, 96\): wanted float32"),
+        (images | {"a": images["a"].half()}, "'a' is float16 of shape"),
+        (images | {"a": images["a"][0]}, r"'a' is float32 of shape \(64, 96\): wanted float32 \(C, H, W\)"),
     ):
         with pytest.raises(ValueError, match=message):
             Views.of(rig, wrong, alpha="a")

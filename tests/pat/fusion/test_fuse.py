@@ -307,6 +307,36 @@ def test_mistakes_are_named(change, message):
         fuse(network_of("PAT"), rig, images, alpha="mono")
 
 
+@pytest.mark.parametrize("names", [("mono",), ("colour",), ("mono", "colour")])
+def test_cameras_of_several_types_are_fused(names):
+    """K in float64 and the pose in float32, as a file's and an optimiser's."""
+    rig = rig_of((50, 70), (40, 60))
+    images = {"mono": texture(1, (50, 70)), "colour": texture(3, (40, 60))}
+    wanted = fuse(network_of("GuidedPAT"), rig, images, alpha="mono").image
+    for name in names:
+        pose = rig[name].cam_from_world
+        rig = rig.with_camera(name, rig[name].replace(cam_from_world=Pose(pose.R.float(), pose.t.float())))
+    assert rig[names[0]].K.dtype != rig[names[0]].R.dtype
+    assert (fuse(network_of("GuidedPAT"), rig, images, alpha="mono").image - wanted).abs().mean() < 1e-4
+
+
+def test_depth_and_confidence_are_the_same_bits_on_any_number_of_threads():
+    rig = rig_of((96, 128), (80, 120))
+    images = {"mono": texture(1, (96, 128)), "colour": texture(3, (80, 120))}
+    before = torch.get_num_threads()
+    try:
+        found = []
+        for threads in (1, 2, 3):
+            torch.set_num_threads(threads)
+            found.append(fuse(network_of("GuidedPAT"), rig, images, alpha="mono"))
+    finally:
+        torch.set_num_threads(before)
+    for one in found[1:]:
+        assert torch.equal(one.depth.nan_to_num(-1), found[0].depth.nan_to_num(-1))
+        assert torch.equal(one.confidence, found[0].confidence)
+        torch.testing.assert_close(one.image, found[0].image, atol=1e-4, rtol=0)
+
+
 def test_views_must_overlap():
     rig = rig_of((50, 70), (40, 60))
     back = torch.diag(torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64))

@@ -1,7 +1,11 @@
+import errno
 import os
 import struct
+import sys
 import warnings
 import zlib
+from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -158,6 +162,19 @@ def test_luma_and_chroma_come_back():
     assert to_luma_chroma(grey)[1].abs().max() < 1e-14
 
 
+def test_a_file_system_that_is_read_only_is_said_of_the_file_itself(tmp_path, monkeypatch):
+    """It refuses the removal of the temporary file, too."""
+
+    def refuse(path, *_, **__):
+        raise OSError(errno.EROFS, "Read-only file system", str(path))
+
+    for name in ("write_text", "unlink"):
+        monkeypatch.setattr(Path, name, refuse)
+    with pytest.raises(OSError, match="Read-only") as caught, write_atomically(tmp_path / "a.txt") as temporary:
+        temporary.write_text("a")
+    assert caught.value.filename == str(tmp_path / "a.txt")
+
+
 def test_the_luminance_of_a_recoloured_image_is_the_given_one():
     luma, chroma = torch.rand(1, 5, 6, dtype=torch.float64), torch.randn(2, 5, 6, dtype=torch.float64)
     torch.testing.assert_close(luminance(from_luma_chroma(luma, chroma)), luma, atol=1e-14, rtol=0)
@@ -247,6 +264,23 @@ def test_the_size_is_compared_before_anything_is_decoded(tmp_path, monkeypatch):
         read_image(tmp_path / "a.png", name="mono", hw=(400, 640))
     with pytest.raises(ValueError, match=r"a.png: is 30000x30000, more than 268 million pixels"):
         read_image(tmp_path / "a.png")
+
+
+def test_the_size_of_a_heic_file_is_compared_before_it_is_decoded(tmp_path, monkeypatch):
+    """By a stand-in for pillow-heif, which opens a file without decoding it."""
+
+    class Stored:
+        size = 30_000, 20_000
+
+        def __array__(self, *_, **__):
+            pytest.fail("decoded")
+
+    stand_in = SimpleNamespace(open_heif=lambda *_, **__: Stored())
+    monkeypatch.setitem(sys.modules, "pillow_heif", stand_in)
+    (tmp_path / "a.heic").write_bytes(b"\0\0\0\x18ftypheic\0\0\0\0mif1heic")
+    for hw, words in ((None, "more than 268 million pixels"), ((400, 640), "the rig says 640x400")):
+        with pytest.raises(ValueError, match=rf"a.heic: is 30000x20000, {words}"):
+            read_image(tmp_path / "a.heic", hw=hw)
 
 
 @pytest.mark.parametrize("suffix", ["png", "tif", "jpg", "ppm", "pgm", "bmp", "webp"])
