@@ -133,6 +133,7 @@ def fuse(
     frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
     if luminance != "alpha":
         frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
+    del inputs, fused, state  # the segments and matches of a large frame: what follows needs memory, too
     steps = steps_for(network, normalise=match_levels)
     frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
     LOG.info("back to the pixels of %s", alpha)

@@ -89,7 +89,9 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
     """
     known = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[known].min()))
-    counts = np.where(known.numpy(), np.rint(depth.double().numpy() * scale).clip(1, MOST), 0).astype(np.uint16)
+    counts = np.zeros(depth.shape, np.uint16)
+    for rows, found, seen in zip(counts, depth, known):
+        rows[seen.numpy()] = np.rint(found[seen].double().numpy() * scale).clip(1, MOST)
     said = PngInfo()
     said.add_text("Description", f"depth: {scale:g} counts a metre; 0 is unknown, {MOST} that far or farther")
     Image.fromarray(counts).save(path, format="PNG", pnginfo=said)

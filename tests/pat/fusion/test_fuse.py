@@ -173,13 +173,13 @@ def test_memory_decides_the_tiles():
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
     assert area * network.bytes_per_pixel <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
-    with pytest.raises(ValueError, match="need at least 83 MiB"):
+    with pytest.raises(ValueError, match="need at least 87 MiB"):
         tiles_within(network, frame, 2.0**20)
 
 
 def test_tiles_are_those_with_the_least_work():
     """Square tiles under the same limit make more."""
-    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), 2.0**30
+    network, hw, limit = network_of("GuidedPAT"), (3036, 4024), SLACK * 0.99e9
 
     def work(tiles):
         return sum((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
@@ -195,7 +195,7 @@ def test_the_plan_is_told_before_the_work():
     told, rig = [], rig_of((50, 70), (40, 60))
     images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
     fuse(network_of("PAT"), rig, images, alpha="mono", announce=told.append)
-    assert str(told[0]).startswith("1 piece, 0.6")
+    assert str(told[0]).startswith("1 piece, 0.5")
     assert told[0].seconds is None
 
 
