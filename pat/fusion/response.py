@@ -230,9 +230,9 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     no_sensor = unlike and bool((share[1] > settings.greenest) & (share[2] < rec601[2]))
     if no_sensor or change < settings.least_change[gamma != 1 or (exposed and unknown)]:
         return Response(rec601, _ratio(y, rec601 @ x, found) if exposed else 1.0, gamma, found.explained)
-    if unknown and not exposed and unlike:
-        halfway = (weights / weights.sum() + rec601) / 2
-        return Response(halfway, math.sqrt(_ratio(y, rec601 @ x, found)), gamma, found.explained)
+    brighter = _ratio(y, rec601 @ x, found)
+    if unknown and not exposed and unlike and abs(math.log(brighter)) < settings.light:
+        return Response((weights / weights.sum() + rec601) / 2, math.sqrt(brighter), gamma, found.explained)
     return Response(weights, gain, gamma, found.explained)
 
 
@@ -249,12 +249,11 @@ def _only_a_gain(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) 
 def _unlike_sensors(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
     """Whether alpha is brighter than luma where a usual sensor would be darker, or the other way round.
 
-    In a scene of one hue light or exposure explain that as well as a response does, and if it is little are as likely.
+    In a scene of one hue light or exposure explain that as well as a response does, and are as likely if it is little.
     """
     luma = Response.rec601().weights @ x
     sensor = luma.new_tensor(settings.sensor) @ x
-    brighter = _ratio(y, luma, found)
-    return abs(math.log(brighter)) < settings.light and (brighter - 1) * (_ratio(sensor, luma, found) - 1) < 0
+    return (_ratio(y, luma, found) - 1) * (_ratio(sensor, luma, found) - 1) < 0
 
 
 def _ratio(y: Tensor, luma: Tensor, found: _Fit) -> float:

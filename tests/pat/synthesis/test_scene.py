@@ -9,7 +9,7 @@ from pat.synthesis.shapes import inside, mesh
 from tests.pat.synthesis.scenes import room_scene, thing
 
 VOLUMES = {"cube": 1.0, "sphere": np.pi / 6, "cylinder": np.pi / 4, "cone": np.pi / 12, "torus": np.pi**2 * 0.35 * 0.15}
-SOLIDS = [s for s in get_args(Shape) if s not in ("plane", "room")]
+SOLIDS = [s for s in get_args(Shape) if s not in ("plane", "room", "lathe")]
 
 
 def corners(shape):
