@@ -14,7 +14,7 @@ from arraygeom import ReceptiveField, Rig
 from ..media.images import Images
 from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
-from ..support.memory import parse_bytes
+from ..support.memory import give_back, parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, expected_work, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
@@ -134,6 +134,8 @@ def fuse(
     if luminance != "alpha":
         frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
     del inputs, fused, state  # the segments and matches of a large frame: what follows needs memory, too
+    if limit is not None:
+        give_back()
     steps = steps_for(network, normalise=match_levels)
     frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
     LOG.info("back to the pixels of %s", alpha)
