@@ -34,6 +34,7 @@ from .semi_global import (
     SemiGlobalMatches,
     along,
     diffused_from,
+    likeness,
     matched_colours,
     matches,
 )
@@ -226,9 +227,8 @@ class GuidedPAT(nn.Module):
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
         colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
         position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
-        unlike = avg_pool2d(facts[0].abs(), 3, 1, 1, count_include_pad=False)
-        likeness = torch.exp(-(unlike / LIKENESS).square())
-        return BetaEstimate(attended, colour, found.colour, logit, choice, position, likeness)
+        alike = likeness(facts[0], LIKENESS)
+        return BetaEstimate(attended, colour, found.colour, logit, choice, position, alike)
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""

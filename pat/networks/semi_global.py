@@ -357,8 +357,13 @@ def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]
 
 def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
     """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
+    return (INCONSISTENT + (1 - INCONSISTENT) * consistent) * valid * likeness(unlike, LIKENESS) + 1e-4
+
+
+def likeness(unlike: Float[Tensor, "b 1 h w"], scale: float) -> Float[Tensor, "b 1 h w"]:
+    """1 where two images have the same brightness around a pixel, 1 / e where they differ by `scale` there."""
     unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
-    return (INCONSISTENT + (1 - INCONSISTENT) * consistent) * valid * torch.exp(-(unlike / LIKENESS).square()) + 1e-4
+    return torch.exp(-(unlike / scale).square())
 
 
 def diffused_from(

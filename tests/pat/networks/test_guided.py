@@ -96,3 +96,18 @@ def test_without_a_head_the_image_is_what_was_matched_and_propagated():
     fused, (seen,) = network.explain(Inputs.of(alpha, [beta], [rectified()]))
     assert seen.logit.max() > 15
     assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)
+
+
+def test_colour_counts_more_where_brightness_is_alike():
+    """At the same confidence."""
+    torch.manual_seed(0)
+    network = GuidedPAT(SMALL)
+    beta = torch.full((1, 3, *HW), 0.5)
+    alike, unlike = (
+        network.explain(Inputs.of(torch.full((1, 1, *HW), value), [beta], [rectified()]))[1][0] for value in (0.5, 0.9)
+    )
+    inside = (..., slice(16, 40))
+    assert (alike.likeness[inside] > 0.99).all()
+    assert (unlike.likeness[inside] < 0.01).all()
+    same = unlike._replace(logit=alike.logit)
+    assert ((alike.blending - same.blending)[inside] > 0.05).all()
