@@ -92,7 +92,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")
     reader = READERS[format]
     try:
-        rig = reader.read(path) if reader is native else reader.read(RigSource(path, hw=hw))
+        rig = reader.read(RigSource(path, hw=hw))
     except (RigFileError, FileNotFoundError):
         raise
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:

@@ -80,11 +80,10 @@ class RigSource:
         except tomllib.TOMLDecodeError as error:
             raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
 
-    def yaml(self) -> dict[str, Any]:
-        """The file as a YAML mapping without repeated keys."""
-        text = self.text()
+    def yaml(self, text: str | None = None) -> dict[str, Any]:
+        """The file, or a text instead of it, as a YAML mapping without repeated keys."""
         try:
-            return self.mapping(load_yaml(text), None)
+            return self.mapping(load_yaml(self.text() if text is None else text), None)
         except yaml.YAMLError as error:
             line, problem = yaml_problem(error)
             raise self.fail(f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?") from None
@@ -116,6 +115,14 @@ class RigSource:
             raise self.fail(entry, "holds NaN or infinity; did the calibration fail?")
         return tensor.reshape(shape or (-1,))
 
+    def numbers_in(self, text: str, shape: tuple[int, ...] | None, entry: str) -> Tensor:
+        """The `numbers` that a text consists of."""
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            raise self.fail(entry, f"holds something other than numbers: {text[:60]!r}") from None
+        return self.numbers(values, shape, entry)
+
     def number(self, value: Any, entry: str) -> float:
         """One finite number."""
         return float(self.numbers(value, (1,), entry))
@@ -126,6 +133,11 @@ class RigSource:
         if min(w, h) < 1 or w != int(w) or h != int(h):
             raise self.fail(entry, f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
         return self.bounded((int(h), int(w)), entry)
+
+    def size_of(self, wh: Any, entry: str) -> HW:
+        """(height, width) from a list of width and height."""
+        width, height = self.numbers(wh, (2,), entry).tolist()
+        return self.size(width, height, entry)
 
     def bounded(self, hw: HW, entry: str) -> HW:
         """A size, once it is one that images have."""

@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from arraygeom.distortion import Distortion
-from pat.evaluation.baseline import classical
-from pat.evaluation.low_light import non_local_means
+from pat.evaluation.baseline import classical, non_local_means
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.low_light import Found, denoised, denoised_views, warped
