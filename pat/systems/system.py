@@ -218,7 +218,6 @@ def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> None:
 
 
 Panels = dict[str, Tensor]
-ImagePaths = Mapping[str, list[Path]]
 
 
 def _still(

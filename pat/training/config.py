@@ -12,7 +12,7 @@ import tyro
 import yaml
 
 from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
-from pat.support.schema import from_document, near, to_document
+from pat.support.schema import from_document, near, parse_yaml, to_document
 from pat.synthesis.rig_distribution import RigDistribution
 
 RECIPES = Path(__file__).parent / "recipes"
@@ -163,12 +163,7 @@ def load_config(name: str | Path) -> TrainConfig:
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
-    from arraygeom.safe_yaml import load_yaml
-
-    try:
-        values = load_yaml(text) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{name}: not YAML: {' '.join(str(error).split())}") from None
+    values = parse_yaml(text, name) or {}
     try:
         return _config(values)
     except ValueError as error:

@@ -273,7 +273,7 @@ def test_kalibr_keeps_time_offsets_and_a_world_at_camera_0(tmp_path):
     assert_same(rig["b"], again["cam1"])
 
 
-def test_quaternions_of_half_turns(tmp_path):
+def test_quaternions_of_rotations_by_180_degrees(tmp_path):
     """Rotations by 180 degrees, where the scalar is 0 and any of the others may be the largest."""
     axes = torch.eye(3, dtype=torch.float64)
     turns = [camera(i).replace(cam_from_world=Pose(2 * a[:, None] * a - axes, a)) for i, a in enumerate(axes)]
@@ -586,7 +586,7 @@ def test_a_size_that_is_missing_is_called_missing(tmp_path):
         Rig.load(tmp_path / "rig.yaml")
 
 
-def test_a_image_turned_upside_down_survives_the_native_file(tmp_path):
+def test_an_image_upside_down_survives_the_native_file(tmp_path):
     """Its K has negative focal lengths, which `focal` cannot state."""
     K = intrinsics(300.0, (240, 320))
     rig = Rig({"a": Camera(K=K, cam_from_world=Pose.identity(), hw=(240, 320))}).rot90("a", 2)

@@ -23,7 +23,7 @@ def pair(name="pair", hw=(64, 96), disparity=8):
     return StereoPair(name, left, right, 16.0, truth)
 
 
-def test_halves_are_told_apart_by_whole_parts_of_names():
+def test_halves_are_distinguished_by_whole_parts_of_names():
     names = ["2006_third/Wood1", "2006_third/Wood2", "2005_half/Bowling1x", "train/0001", "x/2006_third/Cloth1"]
     pairs = [pair(name) for name in names]
     assert [p.name for p in of_half(pairs, "tune")] == ["2006_third/Wood1", "train/0001", "x/2006_third/Cloth1"]
@@ -36,7 +36,7 @@ def test_rows_are_moved_down():
     torch.testing.assert_close(moved[:, 10:60], pair().right[:, 7:57], atol=1e-5, rtol=0)
 
 
-def test_alpha_weighs_the_truth_and_the_truth_is_as_it_was():
+def test_alpha_weighs_the_ground_truth_which_stays_as_it_was():
     p = pair()
     task, noise = CONDITIONS["alpha = .2/.4/.4"].recorded(p)
     torch.testing.assert_close(task.alpha, luminance(p.left, (0.2, 0.4, 0.4)))

@@ -47,7 +47,7 @@ def test_clocks_that_do_not_fit_are_named(line, message):
         line()
 
 
-def test_moved_looks_where_points_will_be():
+def test_moved_samples_where_points_will_be():
     pair = moving.rig().pair("fast", "slow")
     x = pixel_grid(moving.HW)[10:20, 30:40].reshape(-1, 2)
     step = torch.stack([torch.full(moving.HW, 7.0), torch.full(moving.HW, -3.0)])
@@ -59,7 +59,7 @@ def test_moved_looks_where_points_will_be():
     assert torch.allclose(wide.length[wide.valid], wanted.length[wide.valid] + 8.0, atol=1e-4)
 
 
-def test_flow_finds_a_shift_and_its_trust_the_border():
+def test_flow_finds_a_shift_and_its_weight_the_border():
     a = moving.WALL[1:2, :96, 20:180]
     b = moving.WALL[1:2, 2:98, 25:185]
     flow = flow_between(a, b * 0.97)
@@ -70,7 +70,7 @@ def test_flow_finds_a_shift_and_its_trust_the_border():
     assert (warped(b, flow.step) - a)[:, 10:-10, 10:-10].abs().mean() < 0.01
 
 
-def test_colours_mix_by_confidence_and_disagreement_is_doubt():
+def test_colours_mix_by_confidence_which_disagreement_lowers():
     own = torch.full((1, 1, 2), 0.5)
     red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
     sure = torch.tensor([[0.9, 0.9]])
@@ -174,7 +174,7 @@ def test_a_noisy_sequence_is_denoised(fused):
         torch.testing.assert_close(luminance(frame.image), grey, atol=1e-4, rtol=0)
 
 
-def test_motion_that_is_unknown_for_one_beta_is_doubt(fused, monkeypatch):
+def test_of_several_betas_the_lowest_weight_of_motion_counts(fused, monkeypatch):
     """Of several betas each has its own time: the least certain motion counts."""
     frames, _, _, _ = fused
     rig = moving.rig()

@@ -80,7 +80,7 @@ def pair_of(turn: float) -> Pair:
     return Pair(camera, beta, (torch.tensor(1.0).double(), torch.tensor(10.0).double()))
 
 
-def looked_at(pair: Pair, step: int) -> Segments:
+def sampled_at(pair: Pair, step: int) -> Segments:
     hw = HW[0] // step, HW[1] // step
     x = (pixel_grid(hw, dtype=torch.float64) + 0.5) * step - 0.5
     found = lazily(Epipolar(), pair)(x.reshape(-1, 2))
@@ -114,8 +114,8 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     pair = pair_of(turn)
     alpha, beta, where = plane_seen(pair, 2.0)
     colours = beta * torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1).double()
-    segments = looked_at(pair, 1)
-    found = semi_global_matching(alpha, beta, colours, segments, looked_at(pair, 2))
+    segments = sampled_at(pair, 1)
+    found = semi_global_matching(alpha, beta, colours, segments, sampled_at(pair, 2))
     position = matches(segments, found.disparity)[0]
     inner = torch.zeros(HW, dtype=torch.bool)
     inner[8:-8, 8:-8] = True
@@ -132,7 +132,7 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
 def test_threads_and_blocks_change_nothing(monkeypatch):
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    call = alpha, beta, beta, looked_at(pair, 1), looked_at(pair, 2)
+    call = alpha, beta, beta, sampled_at(pair, 1), sampled_at(pair, 2)
     whole = semi_global_matching(*call)
     threads = torch.get_num_threads()
     try:
@@ -150,7 +150,7 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
 def test_a_batch_is_its_images_one_by_one():
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    fine, coarse = looked_at(pair, 1), looked_at(pair, 2)
+    fine, coarse = sampled_at(pair, 1), sampled_at(pair, 2)
     one = semi_global_matching(alpha, beta, beta, fine, coarse)
     other = semi_global_matching(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
     both = semi_global_matching(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
@@ -158,7 +158,7 @@ def test_a_batch_is_its_images_one_by_one():
         assert torch.equal(torch.cat([a, b]), c)
 
 
-def test_nowhere_to_look_is_nothing_found():
+def test_no_segment_is_nothing_found():
     x = torch.zeros(1, 32, 48, 2)
     nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
     found = semi_global_matching(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
@@ -275,7 +275,7 @@ def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
     return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
 
 
-def test_what_lies_beyond_the_edge_of_beta_is_not_looked_for_within_it():
+def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
     """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
