@@ -22,7 +22,14 @@ from arraygeom import (
 from pat.media.colour import luminance
 from pat.networks import semi_global_kernels as kernels
 from pat.networks.matching import semi_global_matching
-from pat.networks.semi_global import Normalisation, SemiGlobalMatches, equalising_blurs, matches
+from pat.networks.semi_global import (
+    LIKENESS,
+    Normalisation,
+    SemiGlobalMatches,
+    equalising_blurs,
+    match_weight,
+    matches,
+)
 
 HW = (64, 96)
 
@@ -308,6 +315,14 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
     alpha, beta, segments = beside(scene, 48)
     found = semi_global_matching(alpha, beta, beta * tint, *segments)
     assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
+
+
+def test_a_match_of_other_brightness_has_less_weight():
+    unlike = torch.zeros(1, 1, 5, 12)
+    unlike[..., 6:] = -LIKENESS
+    weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
+    torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
+    torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))
 
 
 def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
