@@ -34,16 +34,7 @@ from torch import Tensor
 
 from .batching import Batched
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
-from .lenses.central import (
-    DOUBLE_SPHERE,
-    EXTENDED_UNIFIED,
-    FOV,
-    SCARAMUZZA,
-    THIN_PRISM_FISHEYE,
-    UNIFIED,
-    central_project,
-    central_unproject,
-)
+from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, homogeneous, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .text import distortion_text
@@ -53,12 +44,7 @@ KANNALA_BRANDT = "kannala-brandt"
 COEFFICIENT_COUNTS = {
     BROWN_CONRADY: (4, 5, 8, 12, 14),
     KANNALA_BRANDT: (4,),
-    THIN_PRISM_FISHEYE: (8,),
-    DOUBLE_SPHERE: (2,),
-    EXTENDED_UNIFIED: (2,),
-    UNIFIED: (5,),
-    FOV: (1,),
-    SCARAMUZZA: (3,),
+    **{name: (len(model.harmless),) for name, model in MODELS.items()},
 }
 
 

@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import BROWN_CONRADY, FOV, KANNALA_BRANDT, THIN_PRISM_FISHEYE, Distortion
+from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
+from ..lenses.central import FOV, THIN_PRISM_FISHEYE
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig

@@ -16,7 +16,8 @@ import torch
 import yaml
 
 from ..camera import Camera
-from ..distortion import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, KANNALA_BRANDT, UNIFIED, Distortion
+from ..distortion import KANNALA_BRANDT, Distortion
+from ..lenses.central import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, UNIFIED
 from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor

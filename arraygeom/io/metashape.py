@@ -16,7 +16,8 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import THIN_PRISM_FISHEYE, Distortion
+from ..distortion import Distortion
+from ..lenses.central import THIN_PRISM_FISHEYE
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig

@@ -13,7 +13,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -24,21 +24,9 @@ from rich.console import Console
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from arraygeom import (
-    Curved,
-    Dense,
-    Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Local,
-    NearestVoxels,
-    ReceptiveField,
-    Rectified,
-    Rig,
-    ThroughLenses,
-    Widened,
-)
+from arraygeom import ReceptiveField, Rig, ThroughLenses, Widened
 from arraygeom.atomic import sweep, write_text
+from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
 
@@ -66,13 +54,7 @@ INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
-FIELD_CLASSES: dict[str, Callable[..., ReceptiveField]] = {
-    kind.__name__: kind
-    for kind in (
-        *(Curved, Dense, Epipolar, EpipolarLine, HomographyDisplacement),
-        *(Local, NearestVoxels, Rectified, ThroughLenses, Widened),
-    )
-}
+FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLenses, Widened)}
 
 
 @dataclass(frozen=True)
