@@ -35,8 +35,9 @@ from torch import Tensor
 from .batching import Batched
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
 from .lenses.central import FOV, MODELS, central_project, central_unproject
-from .lenses.common import WIDEST, finite_points, homogeneous, unit
+from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
+from .pixels import to_homogeneous
 from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
@@ -87,7 +88,7 @@ class Distortion(Batched):
         if self.model == BROWN_CONRADY:
             xy_d, valid = brown_distort(self._lifted(xy), xy)
         else:
-            xy_d, valid = self._project(homogeneous(xy))
+            xy_d, valid = self._project(to_homogeneous(xy))
         return xy_d, valid & finite
 
     def undistort(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
@@ -125,7 +126,7 @@ class Distortion(Batched):
             ray, valid = self._unproject(xy_d)
             return ray, valid & finite
         xy, valid = self.undistort(xy_d)
-        return unit(homogeneous(xy)), valid
+        return unit(to_homogeneous(xy)), valid
 
     def _project(self, X: Tensor) -> tuple[Tensor, Tensor]:
         c = self._lifted(X)

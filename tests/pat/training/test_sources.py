@@ -126,6 +126,9 @@ def test_all_items_are_drawn_equally_often():
     assert len(times) == count
     assert times.max() <= 1.2 * times.min()
     assert active_items(40, count, 3) == drawn[40] != active_items(40, count, 4)
+    newest = [active[0] for active in drawn[::GROUPS_PER_EXCHANGE]]
+    assert sorted(newest[:count]) == sorted(newest[count : 2 * count])
+    assert newest[:count] != newest[count : 2 * count]
 
 
 # Rendered scenes -------------------------------------------------------------------------------------------
