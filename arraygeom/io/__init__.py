@@ -40,8 +40,7 @@ from . import (
     strecha,
     syntim,
 )
-from .errors import RigFileError
-from .source import RigFileWarning, RigSource, unit_warning
+from .source import RigFileError, RigFileWarning, RigSource, unit_warning
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {

@@ -19,7 +19,6 @@ from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
 from ..safe_yaml import load_yaml, yaml_problem
-from .errors import RigFileError
 
 # A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array.
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
@@ -29,6 +28,14 @@ LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
 ROUNDED = 1e-3
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
+
+
+class RigFileError(ValueError):
+    """A rig file that cannot be read: which file, which entry of it, and what to do, in one line."""
+
+    def __init__(self, path: str | Path, entry: str | None, message: str) -> None:
+        super().__init__(f"{path}: {entry}: {message}" if entry else f"{path}: {message}")
+        self.path, self.entry = Path(path), entry
 
 
 class RigFileWarning(UserWarning):
