@@ -246,14 +246,17 @@ def _row(
     image = result.image.clamp(0, 1)
     error = (image - truth).square().mean(0)
     psnr = {n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None for n, at in regions.items()}
-    depth = _depth_errors(result.disparity, pair.disparity, regions)
+    depth = depth_errors(result.disparity, pair.disparity, regions)
     return ConditionRow(pair.name, condition, method, score(image, truth).ssim, psnr, *depth)
 
 
-def _depth_errors(
+def depth_errors(
     found: Tensor | None, truth: Disparity | None, regions: Mapping[str, Tensor]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """A pixel of unknown disparity is not within one pixel, and is left out of the end-point error."""
+    """The end-point error, and the shares within a pixel: of all whose truth is known, and of those seen.
+
+    A pixel of unknown disparity is not within one pixel, and is left out of the end-point error.
+    """
     if found is None or truth is None:
         return None, None
     error, of_all = disparity_errors(found, truth)

@@ -580,6 +580,12 @@ def test_wrong_facts_of_a_sensor_are_named(tmp_path, entry, message):
         Rig.load(tmp_path / "rig.yaml")
 
 
+def test_rotation_vectors_are_in_degrees(tmp_path):
+    (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], focal: 5, rotation: [0, 0, 90]}\n")
+    expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(Rig.load(tmp_path / "rig.yaml")["a"].R, expected)
+
+
 def test_a_size_that_is_missing_is_called_missing(tmp_path):
     (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
     with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):

@@ -7,7 +7,14 @@ import torch
 
 from pat.data.pairs import Disparity, StereoPair
 from pat.evaluation import conditions
-from pat.evaluation.conditions import CONDITIONS, ConditionRow, conditions_markdown, evaluate_conditions, regions_of
+from pat.evaluation.conditions import (
+    CONDITIONS,
+    ConditionRow,
+    conditions_markdown,
+    depth_errors,
+    evaluate_conditions,
+    regions_of,
+)
 from pat.evaluation.halves import of_half
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
@@ -82,6 +89,16 @@ def test_every_method_is_scored_under_every_condition(tmp_path):
     assert "OpenCV's SGBM" in text
     conditions.save_condition_curves(rows, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_shares_within_a_pixel_are_of_all_and_of_what_beta_sees():
+    truth = Disparity(torch.full((4, 10), 3.0), (torch.arange(10) > 0).expand(4, 10))
+    found = torch.where(torch.arange(10) < 5, truth.value, 9.0)
+    found[:, 1] = torch.nan
+    seen = truth.valid & (torch.arange(10) < 5)
+    error, shares = depth_errors(found, truth, {"seen": seen})
+    assert (error, *shares) == pytest.approx((30 / 8, 12 / 36, 12 / 16))
+    assert depth_errors(None, truth, {"seen": seen}) == (None, None)
 
 
 def test_gains_are_of_the_same_pairs():
