@@ -251,16 +251,16 @@ def _row(
 
 
 def depth_errors(
-    found: Tensor | None, truth: Disparity | None, regions: Mapping[str, Tensor]
+    found: Tensor | None, ground_truth: Disparity | None, regions: Mapping[str, Tensor]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """The end-point error, and the shares within a pixel: of all whose truth is known, and of those seen.
+    """The end-point error, and the shares within a pixel: of all whose ground truth is known, and of those seen.
 
     A pixel of unknown disparity is not within one pixel, and is left out of the end-point error.
     """
-    if found is None or truth is None:
+    if found is None or ground_truth is None:
         return None, None
-    error, of_all = disparity_errors(found, truth)
-    _, of_seen = disparity_errors(found, Disparity(truth.value, regions["seen"]))
+    error, of_all = disparity_errors(found, ground_truth)
+    _, of_seen = disparity_errors(found, Disparity(ground_truth.value, regions["seen"]))
     return error, None if of_all is None or of_seen is None else (of_all, of_seen)
 
 
