@@ -212,9 +212,8 @@ class _Fit(NamedTuple):
 def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
     """The most plausible of four explanations of alpha, and its misfit.
 
-    Luma as it is, another gain, other weights of sum 1, or both.
-
-    Several explain it where the scene has one hue. The least unlikely one is taken then, and of a gain little is asked.
+    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit, and what
+    each must gain to be taken decides.
     """
     rec601, usual = Response.rec601().weights, x.new_tensor(settings.usual)
     luma, grey, hues = rec601 @ x, usual @ x, CHANGES.T @ x
