@@ -21,7 +21,7 @@ from arraygeom.rig import Depths
 
 from .held_out import image_parts
 from .matches import Matches, match_cameras
-from .plausibility import least_surprise
+from .plausibility import DriftEvidence
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
@@ -210,15 +210,13 @@ def _clearly_better(
     before, after = (f.penalised_misfit for f in figures)
     if after > max(EXPLAINED[0], EXPLAINED[1] * before):
         return False
-    rigs, parts = (rig, remedy.repair(rig)), image_parts(rig, pairs)
-    for left_out in (None, *parts.unique().tolist()):
-        used = inliers if left_out is None else inliers & (parts != left_out)
-        given, repaired = (
-            least_surprise(r, pairs, used, noise, mirrored=f.handed < 0.5) for r, f in zip(rigs, figures)
-        )
-        if repaired + MARGIN >= given:
-            return False
-    return True
+    mirrored, still = (f.handed < 0.5 for f in figures)
+    if mirrored or still:
+        return mirrored and not still
+    given, repaired = (DriftEvidence.of(r, pairs, noise) for r in (rig, remedy.repair(rig)))
+    parts = image_parts(rig, pairs)
+    kept = (inliers if part is None else inliers & (parts != part) for part in (None, *parts.unique().tolist()))
+    return all(repaired.least_surprise(used) + MARGIN < given.least_surprise(used) for used in kept)
 
 
 def _thinned(matches: Matches) -> Matches:

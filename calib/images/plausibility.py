@@ -8,7 +8,8 @@ mistake that a drift explains as well is not a mistake that can be named.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -17,11 +18,11 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 
-from .least_squares import jacobian
+from .least_squares import JoinedResiduals, jacobian
 from .matches import Matches
-from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
+from .parameters import SIGMA, UNCERTAIN, FreeParameter, apply_change, free_parameters
 from .refinement import systematic_columns
-from .residuals import match_depths, sampson
+from .residuals import match_depths, sampson_of_pairs
 
 Pairs = Mapping[tuple[str, str], Matches]
 
@@ -31,38 +32,67 @@ RARE = 6.0
 """Larger drifts are rarer: -2 log probability of a scale s is this many times log(1 + s^2)."""
 STEPS = 4
 """Steps of Gauss and Newton to the most probable drift."""
+NO_BETTER = 0.1
+"""... which end once the evidence improves by less."""
 CLIPPED = 30.0
 """Residuals count as at most so many pixels."""
 
 
-def least_surprise(rig: Rig, pairs: Pairs, inliers: Bool[Tensor, " n"], noise: float, *, mirrored: bool) -> float:
-    """-2 log evidence of a rig with the drift that fits best; infinite if images are mirrored against the rig.
+@dataclass(frozen=True)
+class DriftEvidence:
+    """A rig that may have drifted, and the distances of matched points under it.
 
-    `noise`: standard deviation of the points' distances, pixels. Smaller is better; differences count.
+    noise: standard deviation of the points' distances, pixels. r, J, B: the distances in units of it, and their
+    derivatives by the parameters and by what lens models leave. wrong_side: the rotation, in prior deviations, that
+    brings half the points in front and into the depth range.
     """
-    if mirrored:
-        return math.inf
-    names = [name for name in rig.names if any(name in pair for pair in pairs)]
-    free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
-    parameters = free_parameters(rig, names, free=free)
-    count = sum(len(u.sigma) for u in parameters)
-    B = systematic_columns(rig, pairs)[inliers] / noise
 
-    def residuals(z: Tensor) -> Tensor:
-        return sampson(apply_change(rig, parameters, z), pairs)[inliers].nan_to_num() / noise
+    rig: Rig
+    pairs: Pairs
+    noise: float
+    parameters: tuple[FreeParameter, ...]
+    r: Tensor
+    J: Tensor
+    B: Tensor
+    wrong_side: float
 
-    r, J = jacobian(residuals, torch.zeros(count, dtype=torch.float64))
-    wrong_side = _rotation_to_plausible_depth(rig, pairs)
-    fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
-    best = min(SCALES, key=lambda scale: _Drift.of(r, J, B, scale).surprise + fixed[scale])
-    z, found = torch.zeros(count, dtype=torch.float64), []
-    for _ in range(STEPS):
-        clipped = _Drift.of(r.clamp(-CLIPPED / noise, CLIPPED / noise), J[:, :0], B, best)
-        volume = _Drift.of(r, J, B, best).volume
-        found.append(clipped.surprise - clipped.volume + volume + float((z / best).square().sum()))
-        z = _Drift.of(r - J @ z, J, B, best).z
-        r, J = jacobian(residuals, z)
-    return min(found) + fixed[best]
+    @classmethod
+    def of(cls, rig: Rig, pairs: Pairs, noise: float) -> DriftEvidence:
+        """The distances of all points under a rig, to first order in its drift."""
+        names = [name for name in rig.names if any(name in pair for pair in pairs)]
+        free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
+        parameters = tuple(free_parameters(rig, names, free=free))
+        z = torch.zeros(sum(len(u.sigma) for u in parameters), dtype=torch.float64)
+        r, J = _linear(rig, pairs, noise, parameters, z)
+        B = systematic_columns(rig, pairs) / noise
+        return cls(rig, pairs, noise, parameters, r, J, B, _rotation_to_plausible_depth(rig, pairs))
+
+    def least_surprise(self, used: Bool[Tensor, " n"]) -> float:
+        """-2 log evidence of the rig with the drift that fits these points best. Smaller is better."""
+        r, J, B = (part[used] for part in (self.r, self.J, self.B))
+        fixed = {scale: RARE * math.log1p(scale**2) + (self.wrong_side / scale) ** 2 for scale in SCALES}
+        best = min(SCALES, key=lambda scale: _Drift.of(r, J, B, scale).surprise + fixed[scale])
+        z, least = torch.zeros(J.shape[1], dtype=torch.float64), math.inf
+        for step in range(STEPS):
+            if step:
+                r, J = (part[used] for part in _linear(self.rig, self.pairs, self.noise, self.parameters, z))
+            clipped = _Drift.of(r.clamp(-CLIPPED / self.noise, CLIPPED / self.noise), J[:, :0], B, best)
+            volume = _Drift.of(r, J, B, best).volume
+            found = clipped.surprise - clipped.volume + volume + float((z / best).square().sum())
+            if found > least - NO_BETTER:
+                return min(least, found) + fixed[best]
+            least, z = found, _Drift.of(r - J @ z, J, B, best).z
+        return least + fixed[best]
+
+
+def _linear(
+    rig: Rig, pairs: Pairs, noise: float, parameters: Sequence[FreeParameter], z: Tensor
+) -> tuple[Tensor, Tensor]:
+    """All points' distances in units of their noise after a drift, and their derivatives by it."""
+    parts = JoinedResiduals(
+        lambda drift: [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, drift), pairs)]
+    )
+    return jacobian(parts, z)
 
 
 class _Drift(NamedTuple):
