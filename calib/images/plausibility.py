@@ -8,8 +8,8 @@ mistake that a drift explains as well is not a mistake that can be named.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -20,7 +20,7 @@ from arraygeom import Camera, Rig
 
 from .least_squares import JoinedResiduals, jacobian
 from .matches import Matches
-from .parameters import SIGMA, UNCERTAIN, FreeParameter, apply_change, free_parameters
+from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import systematic_columns
 from .residuals import match_depths, sampson_of_pairs
 
@@ -40,59 +40,57 @@ CLIPPED = 30.0
 
 @dataclass(frozen=True)
 class DriftEvidence:
-    """A rig that may have drifted, and the distances of matched points under it.
+    """A rig with the drift that fits matched points best.
 
-    noise: standard deviation of the points' distances, pixels. r, J, B: the distances in units of it, and their
-    derivatives by the parameters and by what lens models leave. wrong_side: the rotation, in prior deviations, that
-    brings half the points in front and into the depth range.
+    surprise: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
+    r, J, B: the distances of all points, in standard deviations of their noise, were there no drift, and their
+    derivatives by the drift and by what lens models leave; linear about the best drift. scale: of the drift. fixed:
+    the part of the surprise that does not depend on the distances. clipped: the largest distance that counts.
     """
 
-    rig: Rig
-    pairs: Pairs
-    noise: float
-    parameters: tuple[FreeParameter, ...]
+    surprise: float
     r: Tensor
     J: Tensor
     B: Tensor
-    wrong_side: float
+    scale: float
+    fixed: float
+    clipped: float
 
     @classmethod
-    def of(cls, rig: Rig, pairs: Pairs, noise: float) -> DriftEvidence:
-        """The distances of all points under a rig, to first order in its drift."""
+    def of(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
+        """By those of the points that are used; `noise`: standard deviation of their distances, pixels."""
         names = [name for name in rig.names if any(name in pair for pair in pairs)]
         free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
         parameters = tuple(free_parameters(rig, names, free=free))
+        distances = JoinedResiduals(
+            lambda z: [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)]
+        )
         z = torch.zeros(sum(len(u.sigma) for u in parameters), dtype=torch.float64)
-        r, J = _linear(rig, pairs, noise, parameters, z)
-        B = systematic_columns(rig, pairs) / noise
-        return cls(rig, pairs, noise, parameters, r, J, B, _rotation_to_plausible_depth(rig, pairs))
+        r, J = jacobian(distances, z)
+        B, clipped = systematic_columns(rig, pairs) / noise, CLIPPED / noise
+        wrong_side = _rotation_to_plausible_depth(rig, pairs)
+        fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
+        best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).surprise + fixed[scale])
+        found = cls(math.inf, r, J, B, best, fixed[best], clipped)
+        for _ in range(STEPS):
+            surprise = found._at(z, used)
+            if surprise > found.surprise - NO_BETTER:
+                return replace(found, surprise=min(surprise, found.surprise))
+            found = replace(found, surprise=surprise)
+            z = _Drift.of(found.r[used], found.J[used], B[used], best).z
+            r, J = jacobian(distances, z)
+            found = replace(found, r=r - J @ z, J=J)
+        return found
 
-    def least_surprise(self, used: Bool[Tensor, " n"]) -> float:
-        """-2 log evidence of the rig with the drift that fits these points best. Smaller is better."""
-        r, J, B = (part[used] for part in (self.r, self.J, self.B))
-        fixed = {scale: RARE * math.log1p(scale**2) + (self.wrong_side / scale) ** 2 for scale in SCALES}
-        best = min(SCALES, key=lambda scale: _Drift.of(r, J, B, scale).surprise + fixed[scale])
-        z, least = torch.zeros(J.shape[1], dtype=torch.float64), math.inf
-        for step in range(STEPS):
-            if step:
-                r, J = (part[used] for part in _linear(self.rig, self.pairs, self.noise, self.parameters, z))
-            clipped = _Drift.of(r.clamp(-CLIPPED / self.noise, CLIPPED / self.noise), J[:, :0], B, best)
-            volume = _Drift.of(r, J, B, best).volume
-            found = clipped.surprise - clipped.volume + volume + float((z / best).square().sum())
-            if found > least - NO_BETTER:
-                return min(least, found) + fixed[best]
-            least, z = found, _Drift.of(r - J @ z, J, B, best).z
-        return least + fixed[best]
+    def by(self, used: Bool[Tensor, " n"]) -> float:
+        """The surprise by other points, to first order about the best drift."""
+        return self._at(_Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z, used)
 
-
-def _linear(
-    rig: Rig, pairs: Pairs, noise: float, parameters: Sequence[FreeParameter], z: Tensor
-) -> tuple[Tensor, Tensor]:
-    """All points' distances in units of their noise after a drift, and their derivatives by it."""
-    parts = JoinedResiduals(
-        lambda drift: [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, drift), pairs)]
-    )
-    return jacobian(parts, z)
+    def _at(self, z: Tensor, used: Tensor) -> float:
+        r, J, B = ((self.r + self.J @ z)[used], self.J[used], self.B[used])
+        clipped = _Drift.of(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)
+        volume = _Drift.of(r, J, B, self.scale).volume
+        return clipped.surprise - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
 
 
 class _Drift(NamedTuple):
