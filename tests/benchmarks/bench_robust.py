@@ -84,6 +84,7 @@ def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
         cells = f"{worst.max():.1f}", len(beyond), f"{squares.mean():.2f}, {squares.max():.2f}", f"{rms.max():.3f}"
         yield markdown_row([f"{share:.0%}", len(draws), *cells, len(draws) - len(found)])
         notes += beyond
+        notes += [f"{share:.0%} draw {i}: RMS {d.rms:.2f} px" for i, d in found.items() if d.rms > 3 * NOISE]
     yield "\n".join(["", *notes])
 
 
