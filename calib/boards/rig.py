@@ -235,8 +235,8 @@ def _noted(factor: float) -> list[str]:
     if factor == 1.0:
         return []
     return [
-        f"frames disagree more than the points' noise explains: standard deviations are raised, by up to {factor:.1f}, to "
-        "those of a jackknife over frames (is the board flat and printed true to size, and were the images sharp?)"
+        "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
+        f"{factor:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were the images sharp?)"
     ]
 
 
