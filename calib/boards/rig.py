@@ -236,7 +236,8 @@ def _noted(factor: float) -> list[str]:
         return []
     return [
         "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
-        f"{factor:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were the images sharp?)"
+        f"{factor:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were the "
+        "images sharp?)"
     ]
 
 
