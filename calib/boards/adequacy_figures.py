@@ -49,7 +49,7 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
 def _map(axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str) -> None:
     drawn = axes.tripcolor(*x.T, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm())
     axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[])
-    axes.set_title(_escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9)
+    axes.set_title(_escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9, loc="left")
     figure.colorbar(drawn, ax=axes, shrink=0.8)
 
 

@@ -43,7 +43,7 @@ class Calibration:
     fit: result of the bundle adjustment; its blocks are `frames` in order.
     single: each camera's reprojection error (RMS, px) when it is calibrated by itself; none with a start.
     views: the detections used, numbered consistently in all cameras.
-    raised: the factor by which the covariance's standard deviations were raised to those of a jackknife over frames.
+    raised: the largest factor by which a standard deviation was raised to that of a jackknife over frames.
     """
 
     rig: Rig
@@ -208,10 +208,11 @@ def calibrate_single(
 
 
 def _scaled_covariance(together: _JointFit) -> tuple[_JointFit, float]:
-    """The fit with its covariance raised if frames disagree considerably; and the factor of its deviations (median).
+    """The fit with its covariance raised if frames disagree considerably; and the largest factor of its deviations.
 
     The raised covariance is the mean of the jackknife's, which few frames make noisy, and of that of the points' noise,
-    scaled to the jackknife's level.
+    scaled to the jackknife's level: the median over the parameters, as frames that disagree about a focal length say
+    nothing of the lens.
     """
     fit = together.fit
     if fit.covariance is None or not len(fit.covariance) or len(fit.problem.structure) < FEWEST_TO_JACKKNIFE:
@@ -220,9 +221,9 @@ def _scaled_covariance(together: _JointFit) -> tuple[_JointFit, float]:
     disagreement = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found.covariance)) / len(fit.covariance)))
     if disagreement < CONSIDERABLE:
         return together, 1.0
-    level = max(disagreement, float(np.median(_ratio(found.left_out, fit.covariance))))
+    level = max(1.0, float(np.median(_ratio(found.left_out, fit.covariance))))
     raised = (level**2 * fit.covariance + found.left_out) / 2
-    return together._replace(fit=fit._replace(covariance=raised)), float(np.median(_ratio(raised, fit.covariance)))
+    return together._replace(fit=fit._replace(covariance=raised)), float(_ratio(raised, fit.covariance).max())
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -234,8 +235,9 @@ def _noted(factor: float) -> list[str]:
     if factor == 1.0:
         return []
     return [
-        f"frames disagree more than the points' noise explains: standard deviations are raised by {factor:.1f}, to "
-        "those of a jackknife over frames (is the board flat and printed true to size, and were the images sharp?)"
+        "frames disagree more than the points' noise explains: standard deviations are raised, by up to "
+        f"{factor:.1f}, to those of a jackknife over frames (is the board flat and printed true to size, and were the "
+        "images sharp?)"
     ]
 
 

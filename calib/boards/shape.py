@@ -1,6 +1,6 @@
 """Boards that are neither flat nor printed true to size: their shape as unknowns of the bundle adjustment.
 
-A print may be longer along one axis, and a sheet may curved. To third order a bent sheet keeps the lengths on it: with
+A print may be longer along one axis, and a sheet be curved. To third order a bent sheet keeps the lengths on it: with
 the symmetric curvature C (1/m) about the board's middle, the point q moves to q - C q (q^T C q) / 6, and out of the
 plane by q^T C q / 2 - (q^T C q) (q^T C^2 q) / 24; exact to that order for cylinders of any axis.
 """

@@ -71,11 +71,13 @@ class Board(ABC):
 
     @cached_property
     def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """The renumberings of the points under rotations of the board, the identity first.
+        """The renumberings of the points under rotations of the board, the identity first; it alone with markers.
 
         A detector may number the points in any of these ways: colours do not disambiguate them, as they are inverted
         in some images (near infrared).
         """
+        if self.identified:
+            return (np.arange(len(self.points)),)
         points = self.points[:, :2] - (self.points[:, :2].max(0) + self.points[:, :2].min(0)) / 2
         found = []
         for quarter_turns in range(4):
@@ -135,11 +137,6 @@ class MarkedBoard(Board):
     dictionary: str
     first: int
     identified: ClassVar[bool] = True
-
-    @property
-    def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:  # type: ignore[override]
-        """The identity alone."""
-        return (np.arange(len(self.points)),)
 
     @property
     @abstractmethod
@@ -271,11 +268,6 @@ class Boards(Board):
     def extents(self) -> list[tuple[float, float]]:
         """`extent` of each board."""
         return [b.extent for b in self.boards]
-
-    @property
-    def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:  # type: ignore[override]
-        """The identity alone."""
-        return (np.arange(len(self.points)),)
 
     def __str__(self) -> str:
         return " and ".join(map(str, self.boards))

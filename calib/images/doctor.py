@@ -21,7 +21,7 @@ from arraygeom.rig import Depths
 
 from .held_out import image_parts
 from .matches import Matches, match_cameras
-from .plausibility import least_surprise
+from .plausibility import DriftEvidence
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
@@ -46,8 +46,9 @@ LARGEST_REMAINDER = 0.33
 rig somewhat."""
 MARGIN = 12.0
 """A mistake is named if -2 log evidence is smaller by this than that of a drift."""
-EXPLAINED = (0.9, 0.06)
-"""A mistake explains the points if no more than so many pixels, or that share of the misfit, are left."""
+EXPLAINED, ROUGHLY = (HEALTHY_MISFIT, 0.06), 0.9
+"""A mistake explains the points if no more than so many pixels, or that share of the misfit, are left; pixels of those
+whose remedy is approximate."""
 LEAST_NOISE = 0.05
 """Lower bound of the points' noise, pixels."""
 FEW = 10
@@ -208,17 +209,17 @@ def _clearly_better(
     Points of one object, or wrong ones in one place, do not decide: the mistake is better without each part in turn.
     """
     before, after = (f.penalised_misfit for f in figures)
-    if after > max(EXPLAINED[0], EXPLAINED[1] * before):
+    if after > max(ROUGHLY if remedy.approximate else EXPLAINED[0], EXPLAINED[1] * before):
         return False
-    rigs, parts = (rig, remedy.repair(rig)), image_parts(rig, pairs)
-    for left_out in (None, *parts.unique().tolist()):
-        used = inliers if left_out is None else inliers & (parts != left_out)
-        given, repaired = (
-            least_surprise(r, pairs, used, noise, mirrored=f.handed < 0.5) for r, f in zip(rigs, figures)
-        )
-        if repaired + MARGIN >= given:
-            return False
-    return True
+    mirrored, still = (f.handed < 0.5 for f in figures)
+    if mirrored or still:
+        return mirrored and not still
+    given, repaired = (DriftEvidence.of(r, pairs, inliers, noise) for r in (rig, remedy.repair(rig)))
+    parts = image_parts(rig, pairs)
+    rest = (inliers & (parts != part) for part in parts.unique().tolist())
+    return repaired.surprise + MARGIN < given.surprise and all(
+        repaired.by(used) + MARGIN < given.by(used) for used in rest
+    )
 
 
 def _thinned(matches: Matches) -> Matches:

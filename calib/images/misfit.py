@@ -23,8 +23,6 @@ MOST_CAMERAS = 4
 BADLY, OF_OWN = 1.5, 3.0
 """A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images (median), and
 than this many times their distance from the lines of an F fitted to them."""
-
-
 OUTSIDE = 0.5
 """And a rig is wrong that has more than this share of the points behind the cameras or outside its depth range..."""
 BEYOND = 1.5
@@ -34,30 +32,23 @@ FEW = 10
 
 
 class Misfit(NamedTuple):
-    """How badly a rig fits: its matched points and how far they lie from their lines (median, pixels), the share of
-    them behind the cameras or outside the depth range, and a sentence on both. `rig` and `pairs` are of the sizes that
-    the images were reduced to."""
+    """How badly a rig fits.
 
-    rig: Rig
-    pairs: Mapping[tuple[str, str], Matches]
+    off: distance of the matched points from their lines (median, pixels of the reduced images). outside: the share of
+    them behind the cameras or outside the depth range. mistaken: the doctor names a mistake, not a drift. text: a
+    sentence on all this, with the doctor's.
+    """
+
     off: float
     outside: float
+    mistaken: bool
     text: str
-
-    @property
-    def verdict(self) -> str:
-        """What the doctor says of it; empty if it names no mistake."""
-        sizes = {name: self.rig[name].hw for pair in self.pairs for name in pair}
-        found = diagnose_matches(self.rig, sizes, self.pairs)
-        return "" if found.named.kind == "nothing" else found.verdict
 
 
 def misfit_warning(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> str | None:
-    """The sentence of `find_misfit`, with what to do; else None."""
+    """The sentence of `find_misfit`, if any."""
     found = find_misfit(rig, images)
-    if found is None:
-        return None
-    return f"{found.text}; `pat rig doctor` finds usual mistakes, `pat rig refine` improves a rig that has drifted"
+    return None if found is None else found.text
 
 
 def find_misfit(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Misfit | None:
@@ -87,7 +78,9 @@ def find_misfit(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Misfi
     text = f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines (median{at})"
     if outside > OUTSIDE:
         text += f", {outside:.0%} of them behind the cameras or outside the depth range"
-    return Misfit(rig, pairs, off, outside, text)
+    found = diagnose_matches(rig, {name: rig[name].hw for name in some}, pairs)
+    verdict = "" if found.healthy else f"; `pat rig doctor` says: {found.verdict}"
+    return Misfit(off, outside, found.named.kind != "nothing", text + verdict)
 
 
 def share_outside(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -17,11 +18,11 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 
-from .least_squares import jacobian
+from .least_squares import JoinedResiduals, jacobian
 from .matches import Matches
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import systematic_columns
-from .residuals import match_depths, sampson
+from .residuals import match_depths, sampson_of_pairs
 
 Pairs = Mapping[tuple[str, str], Matches]
 
@@ -31,38 +32,65 @@ RARE = 6.0
 """Larger drifts are rarer: -2 log probability of a scale s is this many times log(1 + s^2)."""
 STEPS = 4
 """Steps of Gauss and Newton to the most probable drift."""
+NO_BETTER = 0.1
+"""... which end once the evidence improves by less."""
 CLIPPED = 30.0
 """Residuals count as at most so many pixels."""
 
 
-def least_surprise(rig: Rig, pairs: Pairs, inliers: Bool[Tensor, " n"], noise: float, *, mirrored: bool) -> float:
-    """-2 log evidence of a rig with the drift that fits best; infinite if images are mirrored against the rig.
+@dataclass(frozen=True)
+class DriftEvidence:
+    """A rig with the drift that fits matched points best.
 
-    `noise`: standard deviation of the points' distances, pixels. Smaller is better; differences count.
+    surprise: -2 log evidence of the rig and that drift by the points used. Smaller is better; differences count.
+    r, J, B: the distances of all points, in standard deviations of their noise, were there no drift, and their
+    derivatives by the drift and by what lens models leave; linear about the best drift. scale: of the drift. fixed:
+    the part of the surprise that does not depend on the distances. clipped: the largest distance that counts.
     """
-    if mirrored:
-        return math.inf
-    names = [name for name in rig.names if any(name in pair for pair in pairs)]
-    free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
-    parameters = free_parameters(rig, names, free=free)
-    count = sum(len(u.sigma) for u in parameters)
-    B = systematic_columns(rig, pairs)[inliers] / noise
 
-    def residuals(z: Tensor) -> Tensor:
-        return sampson(apply_change(rig, parameters, z), pairs)[inliers].nan_to_num() / noise
+    surprise: float
+    r: Tensor
+    J: Tensor
+    B: Tensor
+    scale: float
+    fixed: float
+    clipped: float
 
-    r, J = jacobian(residuals, torch.zeros(count, dtype=torch.float64))
-    wrong_side = _rotation_to_plausible_depth(rig, pairs)
-    fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
-    best = min(SCALES, key=lambda scale: _Drift.of(r, J, B, scale).surprise + fixed[scale])
-    z, found = torch.zeros(count, dtype=torch.float64), []
-    for _ in range(STEPS):
-        clipped = _Drift.of(r.clamp(-CLIPPED / noise, CLIPPED / noise), J[:, :0], B, best)
-        volume = _Drift.of(r, J, B, best).volume
-        found.append(clipped.surprise - clipped.volume + volume + float((z / best).square().sum()))
-        z = _Drift.of(r - J @ z, J, B, best).z
-        r, J = jacobian(residuals, z)
-    return min(found) + fixed[best]
+    @classmethod
+    def of(cls, rig: Rig, pairs: Pairs, used: Bool[Tensor, " n"], noise: float) -> DriftEvidence:
+        """By those of the points that are used; `noise`: standard deviation of their distances, pixels."""
+        names = [name for name in rig.names if any(name in pair for pair in pairs)]
+        free = list(UNCERTAIN) if any(isinstance(rig[name], Camera) for name in names) else []
+        parameters = tuple(free_parameters(rig, names, free=free))
+        distances = JoinedResiduals(
+            lambda z: [r.nan_to_num() / noise for r in sampson_of_pairs(apply_change(rig, parameters, z), pairs)]
+        )
+        z = torch.zeros(sum(len(u.sigma) for u in parameters), dtype=torch.float64)
+        r, J = jacobian(distances, z)
+        B, clipped = systematic_columns(rig, pairs) / noise, CLIPPED / noise
+        wrong_side = _rotation_to_plausible_depth(rig, pairs)
+        fixed = {scale: RARE * math.log1p(scale**2) + (wrong_side / scale) ** 2 for scale in SCALES}
+        best = min(SCALES, key=lambda scale: _Drift.of(r[used], J[used], B[used], scale).surprise + fixed[scale])
+        found = cls(math.inf, r, J, B, best, fixed[best], clipped)
+        for _ in range(STEPS):
+            surprise = found._at(z, used)
+            if surprise > found.surprise - NO_BETTER:
+                return replace(found, surprise=min(surprise, found.surprise))
+            found = replace(found, surprise=surprise)
+            z = _Drift.of(found.r[used], found.J[used], B[used], best).z
+            r, J = jacobian(distances, z)
+            found = replace(found, r=r - J @ z, J=J)
+        return found
+
+    def by(self, used: Bool[Tensor, " n"]) -> float:
+        """The surprise by other points, to first order about the best drift."""
+        return self._at(_Drift.of(self.r[used], self.J[used], self.B[used], self.scale).z, used)
+
+    def _at(self, z: Tensor, used: Tensor) -> float:
+        r, J, B = ((self.r + self.J @ z)[used], self.J[used], self.B[used])
+        clipped = _Drift.of(r.clamp(-self.clipped, self.clipped), J[:, :0], B, self.scale)
+        volume = _Drift.of(r, J, B, self.scale).volume
+        return clipped.surprise - clipped.volume + volume + float((z / self.scale).square().sum()) + self.fixed
 
 
 class _Drift(NamedTuple):

@@ -35,11 +35,15 @@ TRANSPOSE = torch.eye(3, dtype=torch.float64)[[1, 0, 2]]
 
 @dataclass(frozen=True)
 class Remedy:
-    """A possible mistake: its kind (one of `KINDS`), its description in words, and the change that undoes it."""
+    """A possible mistake: its kind (one of `KINDS`), its description in words, and the change that undoes it.
+
+    approximate: the change holds numbers that were estimated, and undoes it roughly.
+    """
 
     kind: str
     words: str
     repair: Callable[[Rig], Rig]
+    approximate: bool = False
 
 
 NOTHING = Remedy("nothing", "as given", lambda rig: rig)
@@ -80,7 +84,8 @@ def lens_remedy(rig: Rig, names: Iterable[str], k1: float) -> Remedy:
     bare = bare_cameras(rig, names)
     words = f"distortion ignored: about k1 = {k1:.3f} in {', '.join(map(repr, bare))}"
     lens = Distortion("brown-conrady", torch.tensor([k1, 1.5 * k1**2, 0, 0], dtype=torch.float64))
-    return Remedy("distortion", words, partial(on_cameras, names=bare, change=lambda c: c.replace(distortion=lens)))
+    repair = partial(on_cameras, names=bare, change=lambda c: c.replace(distortion=lens))
+    return Remedy("distortion", words, repair, approximate=True)
 
 
 def mirror_matrix(hw: HW, *, across: bool) -> Float[Tensor, "3 3"]:

@@ -53,13 +53,8 @@ def epipolar_residuals(pair: Pair, matches: Matches) -> EpipolarResiduals:
     return _residuals(pair, matches)[0]
 
 
-def sampson(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Float[Tensor, " n"]:
-    """Sampson distances of all points of all pairs, pixels; 0 where a pixel has no ray."""
-    return torch.cat(sampson_of_pairs(rig, pairs))
-
-
 def sampson_of_pairs(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> list[Float[Tensor, " n"]]:
-    """The same, pair by pair."""
+    """Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray."""
     parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]
     return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
 

@@ -430,11 +430,9 @@ def warn_of_wrong_rig(views: ViewFiles) -> None:
             found = find_misfit(views.developed, dict(views))
         except (ValueError, OSError):  # of a file or an image: the fusion says so
             return
-        verdict = found.verdict if found else ""
     if found is not None:
-        wrong = bool(verdict) or found.outside > OUTSIDE
-        advice = f"`pat rig doctor` says: {verdict}" if verdict else "see `pat rig doctor`"
-        warnings.warn(f"{found.text}; {advice}", LowConfidenceWarning if wrong else UserWarning, stacklevel=2)
+        wrong = found.mistaken or found.outside > OUTSIDE
+        warnings.warn(found.text, LowConfidenceWarning if wrong else UserWarning, stacklevel=2)
 
 
 def fuse_with_progress(

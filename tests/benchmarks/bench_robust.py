@@ -68,13 +68,13 @@ def judged(share: float, draw: int) -> Draw:
     return Draw(worst, float(error @ np.linalg.solve(covariance, error)) / len(error), found.rms)
 
 
-def rows(draws: int, shares: Sequence[float]) -> Iterator[str]:
+def rows(draws: range, shares: Sequence[float]) -> Iterator[str]:
     columns = ("wrong corners", "draws", "worst error, sigma", "beyond 5 sigma", "chi-square", "RMS px", "refused")
     yield markdown_header(columns)
     notes = []
     for share in shares:
         found: dict[int, Draw] = {}
-        for draw in tqdm(range(draws), desc=f"{share:.0%}"):
+        for draw in tqdm(draws, desc=f"{share:.0%}"):
             try:
                 found[draw] = judged(share, draw)
             except ValueError as error:
@@ -82,20 +82,23 @@ def rows(draws: int, shares: Sequence[float]) -> Iterator[str]:
         beyond = [f"{share:.0%} draw {i}: {d.worst:.1f} sigma" for i, d in found.items() if d.worst > 5]
         worst, squares, rms = (np.array(column) for column in zip(*found.values()))
         cells = f"{worst.max():.1f}", len(beyond), f"{squares.mean():.2f}, {squares.max():.2f}", f"{rms.max():.3f}"
-        yield markdown_row([f"{share:.0%}", draws, *cells, draws - len(found)])
+        yield markdown_row([f"{share:.0%}", len(draws), *cells, len(draws) - len(found)])
         notes += beyond
+        notes += [f"{share:.0%} draw {i}: RMS {d.rms:.2f} px" for i, d in found.items() if d.rms > 3 * NOISE]
     yield "\n".join(["", *notes])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--first", type=int, default=0, help="number of the first draw")
     parser.add_argument("--shares", type=float, nargs="*", default=[0.0, 0.05, 0.2])
     parser.add_argument("--out", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
-    print_tables("Board calibration with wrong corners", [rows(options.draws, options.shares)], options.out)
+    draws = range(options.first, options.first + options.draws)
+    print_tables("Board calibration with wrong corners", [rows(draws, options.shares)], options.out)
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python -m tests.benchmarks.bench_sigma --out tests/benchmarks/RESULTS_sigma.md
 
 *stated / jackknife*: of all free parameters, the median, and the share within 30 %. A jackknife over a dozen frames is
-itself good to some 20 %. *raised*: the factor by which `calibrate` raised what the corners' noise alone would give.
+itself good to some 20 %. *raised*: the largest factor by which `calibrate` raised what the corners' noise alone gives.
 """
 
 from __future__ import annotations

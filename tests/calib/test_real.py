@@ -11,7 +11,7 @@ from calib.boards.collect import collect_folder
 from calib.boards.rig import calibrate
 from calib.boards.target import parse_board
 from calib.images.doctor import diagnose, diagnose_matches
-from calib.images.matches import match_cameras
+from calib.images.matches import match_cameras, seen_depths
 from calib.images.refinement import refine_matches
 from tests.benchmarks.bench_doctor import MISTAKES
 from tests.benchmarks.bench_refine import worse
@@ -36,6 +36,18 @@ def test_the_rig_of_another_experiment_is_found_out(shared_data):
     found = diagnose(pair.rig, pair.images)
     assert found.named.kind == "pose inverted"
     assert found.after.misfit < 0.05 * found.before.misfit
+
+
+@pytest.mark.slow
+def test_a_published_rig_that_does_not_fit_is_given_no_name(shared_data):
+    """A shift by a pixel brings SYNTIM's SmRub nearer to its images, but does not explain them to their noise."""
+    (pair,) = syntim(shared_data, ("SmRub",))
+    rig, matches = Rig({name: pair.rig[name] for name in pair.images}), match_cameras(pair.images)
+    rig = rig.replace(depth=seen_depths(rig.pair(*rig.names), matches[rig.names]))
+    found = diagnose_matches(rig, {name: camera.hw for name, camera in rig.cameras.items()}, matches)
+    assert not found.healthy
+    assert found.named.kind == "nothing", found.verdict
+    assert "one-pixel shift" in [remedy.kind for remedy in found.equal]
 
 
 @pytest.mark.slow

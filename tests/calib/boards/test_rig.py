@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from arraygeom import Pose, Rig
+from calib.boards.bundle import normal_equations
+from calib.boards.camera_parameters import parameter_names
 from calib.boards.covariance import RigCovariance, beta_covariance
 from calib.boards.coverage import coverage
 from calib.boards.detect import Detection
 from calib.boards.intrinsics import BoardViews
+from calib.boards.jackknife import jackknife
 from calib.boards.poses import symmetry_poses
 from calib.boards.report import report_html, rig_covariance
 from calib.boards.rig import calibrate, calibrate_single
@@ -269,3 +272,23 @@ def test_a_board_that_bends_raises_the_deviations():
     bent = calibrate(views, BOARD)
     assert bent.raised > 1.3
     assert any("is the board flat" in note for note in bent.notes)
+
+
+def test_frames_that_disagree_about_the_focal_lengths_raise_those_alone(pair, found, monkeypatch):
+    """By the jackknife their deviations are five times as large, the others' the same."""
+
+    def disagreeing(problem, free, sigma):
+        given = jackknife(problem, free, sigma)
+        plain = np.linalg.inv(normal_equations(problem, free, sigma).information())
+        names = [f"{n}.{e}" for n, c in problem.cameras.items() for e in np.array(parameter_names(c))[free[n]]]
+        factor = np.array([5.0 if "focal" in name else 1.0 for name in names])
+        raised = plain * factor[:, None] * factor
+        return given._replace(covariance=raised, left_out=raised)
+
+    plain = found.deviations()
+    assert found.raised == 1.0
+    monkeypatch.setattr("calib.boards.rig.jackknife", disagreeing)
+    raised = calibrate(pair[2], BOARD).deviations()
+    for name in plain:
+        expected = np.sqrt((1 + 25) / 2) if "focal" in name else 1.0
+        assert raised[name] == pytest.approx(expected * plain[name], rel=0.02)

@@ -20,7 +20,7 @@ def test_a_drifted_rig_is_named():
     found = misfit_warning(bad, rectified_images())
     assert found is not None
     assert 5.5 < float(re.search(r"lie ([\d.]+) px", found)[1]) < 6.6
-    assert "pat rig doctor" in found
+    assert "`pat rig doctor` says: none of the usual mistakes, but the rig is 6." in found
 
 
 def test_points_behind_the_cameras_and_wrong_units_are_named():
@@ -34,6 +34,8 @@ def test_points_behind_the_cameras_and_wrong_units_are_named():
         assert found is not None
         assert found.outside > 0.9
         assert "behind the cameras or outside the depth range" in found.text
+        assert found.mistaken
+        assert "`pat rig doctor` says: likely mistake: " in found.text
 
 
 def test_nothing_is_said_where_nothing_can_be():
@@ -50,4 +52,5 @@ def test_show_warns(tmp_path, capsys):
     bad.save(tmp_path / "rig.yaml")
     files = [f"--image={name}={tmp_path / name}.png" for name in images]
     main(["show", str(tmp_path / "rig.yaml"), *files, "--out", str(tmp_path)])
-    assert "fits these images badly" in " ".join(capsys.readouterr().err.split())
+    assert "badly: 1" in (said := " ".join(capsys.readouterr().err.split()))
+    assert "`pat rig doctor` says: none of the usual mistakes" in said
