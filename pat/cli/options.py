@@ -148,6 +148,19 @@ def writable(out: Path, *, folder: bool = False) -> Path:
     return out
 
 
+def device_of(name: str) -> str:
+    """ "cpu" or "cuda". Raises ValueError for a GPU that is not there."""
+    if name == "cpu":
+        return name
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if name == "cuda":
+        raise ValueError("--device cuda: no CUDA device is available: leave it out, or install torch for CUDA")
+    return "cpu"
+
+
 def field_named(name: str) -> ReceptiveField | None:
     """The receptive field of that name; None for "auto"."""
     from arraygeom.fields.default import FIELDS
