@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Camera, Pose, Rig
 from pat import fuse, load_weights
+from pat.cli.authors import with_found_rig
 from pat.cli.from_images import camera_names
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
@@ -57,6 +58,15 @@ def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
+
+
+def test_the_evaluation_without_a_rig_is_that_of_the_command(halved, folder):
+    _, images, ground_truth = halved
+    found = with_found_rig(load_weights("mono-colour"))(images["mono"], images["colour"], 0.0)
+    written = score(read_image(folder / "out" / "fused.png"), ground_truth).psnr
+    assert score(found.clamp(0, 1), ground_truth).psnr == pytest.approx(written, abs=0.3)
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--folder", str(folder), "--without-rig", "--protocol", "table2"])
 
 
 def test_the_rig_that_was_found_serves_the_next_command(folder):

@@ -99,7 +99,9 @@ def test_slider_and_overlays_work_in_a_browser(page):
 def test_the_classical_layer_is_at_alphas_own_pixels(lens):
     sample, rig = load_sample(), load_sample().rig
     if lens is not None:
-        rig = rig.with_camera("mono", rig["mono"].replace(distortion=Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64))))
+        rig = rig.with_camera(
+            "mono", rig["mono"].replace(distortion=Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64)))
+        )
     found = classical_view(rig, sample.images, "mono", longest=320)
     small = reduced(sample.ground_truth, 320)
     assert found.shape == small.shape
