@@ -132,6 +132,8 @@ class Fuse:
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
         options.response_of(self.response)
+        options.noise_of(self.noise)
+        options.device_of(self.device)
         if self.classical and not self.report:
             raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
@@ -178,6 +180,9 @@ class Fuse:
         if named := [option for option, value in only_with_rig.items() if value]:
             raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
         cameras = camera_names(self.given)
+        noise = options.noise_of(self.noise)
+        if isinstance(noise, dict) and (unknown := noise.keys() - cameras.keys()):
+            raise ValueError(f"--noise: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}")
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
         if videos and len(videos) < len(cameras):
             others = [path for path in cameras.values() if path not in videos]

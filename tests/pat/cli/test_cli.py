@@ -332,20 +332,8 @@ def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys
 
 
 def test_images_stand_anywhere_among_the_options_of_fuse():
-    given = [
-        "rig.yaml",
-        "--alpha",
-        "mono",
-        "a.png",
-        "--depth",
-        "1",
-        "9",
-        "b.tif",
-        "--image",
-        "c=c.png",
-        "-o",
-        "out.png",
-    ]
+    given = ["rig.yaml", "--alpha", "mono", "a.png", "--depth", "1", "9", "b.tif", "--image", "c=c.png"]
+    given += ["-o", "out.png"]
     others = ["--alpha", "mono", "--depth", "1", "9", "--image", "c=c.png", "-o", "out.png"]
     assert respelled(given, Fuse) == ["rig.yaml", "a.png", "b.tif", *others]
     assert respelled(given[3:], Fuse) == ["a.png", "b.tif", *others[2:]]

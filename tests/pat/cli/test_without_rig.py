@@ -49,7 +49,9 @@ def fails(arguments, capsys) -> str:
     with pytest.raises(SystemExit) as stop:
         main(["fuse", *map(str, arguments)])
     assert stop.value.code == 2
-    return capsys.readouterr().err.splitlines()[-1]
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) <= 3, error
+    return error[-1]
 
 
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
@@ -117,6 +119,9 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
         assert message in fails([mono, *(tmp_path / name for name in names), *out], capsys)
         assert not (tmp_path / "out").exists()
     assert "no camera 'tele'; the images' names are mono, colour" in fails([mono, colour, "--alpha", "tele"], capsys)
+    for noise, said in {"mono=-5": "must be more than 0, got -5", "tele=100": "--noise: no camera 'tele'"}.items():
+        assert said in fails([mono, colour, "--noise", noise, *out], capsys)
+    assert not (tmp_path / "out").exists()
     assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
 
 
