@@ -341,6 +341,9 @@ class Fuse:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
+        if named := [option for option, given in single.items() if given]:
+            raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")
         batch = Batch(
             rig,
             files,

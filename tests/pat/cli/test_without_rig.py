@@ -125,6 +125,18 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
     assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
 
 
+def test_options_of_a_single_frame_are_refused_for_many(folder, tmp_path, capsys):
+    images = []
+    for name in ("mono", "colour"):
+        (tmp_path / name).mkdir()
+        for i in range(2):
+            shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
+        images += ["--image", f"{name}={tmp_path / name}"]
+    given = [folder / "out" / "rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
+    assert "--points, --classical: of a single frame alone" in fails([*given, "--points", "--classical"], capsys)
+    assert not (tmp_path / "out").exists()
+
+
 def test_names_of_cameras_are_those_of_files_or_folders(tmp_path):
     names = [tmp_path / "a" / "1.png", tmp_path / "b" / "1.png"]
     assert list(camera_names(names)) == ["a", "b"]
