@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
     from ..evaluation.protocols import StereoMethod
     from ..networks.protocol import FusionNetwork
+    from ..networks.weights import Network
 
 RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
 
@@ -113,7 +114,7 @@ class Evaluate:
 RIG_FOUND = "fusion, rig found"
 
 
-def with_found_rig(network: FusionNetwork) -> StereoMethod:
+def with_found_rig(network: Network) -> StereoMethod:
     """The fusion of two images with the rig found from them."""
     from ..fusion.fuse import fuse
     from .from_images import found_rig
