@@ -152,8 +152,7 @@ class Fuse:
             return True
         if self.image or len(self.given) < 2:
             raise ValueError(
-                "give two images or more, such as `pat fuse mono.png colour.png`; or a rig with "
-                "`--alpha NAME --image NAME=FILE --image NAME=FILE`"
+                "give two images or more, as `pat fuse mono.png colour.png`; or a rig, --alpha and each --image"
             )
         return False
 
@@ -165,6 +164,8 @@ class Fuse:
         if self.alpha is None:
             raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
         files = options.files_by_name(self.image)
+        if unknown := [path for path in self.given[1:] if path.stem not in rig.names]:
+            raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
         if not self.sequence:
@@ -176,8 +177,8 @@ class Fuse:
     def _without_rig(self) -> None:
         from .from_images import camera_names, files_of, frames_of_videos
 
-        only_with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
-        if named := [option for option, value in only_with_rig.items() if value]:
+        with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
+        if named := [option for option, value in with_rig.items() if value]:
             raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
         cameras = camera_names(self.given)
         noise = options.noise_of(self.noise)

@@ -125,7 +125,7 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
     assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
 
 
-def test_options_of_a_single_frame_are_refused_for_many(folder, tmp_path, capsys):
+def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_path, capsys):
     images = []
     for name in ("mono", "colour"):
         (tmp_path / name).mkdir()
@@ -133,6 +133,9 @@ def test_options_of_a_single_frame_are_refused_for_many(folder, tmp_path, capsys
             shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
         images += ["--image", f"{name}={tmp_path / name}"]
     given = [folder / "out" / "rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
+    rig = folder / "out" / "rig.yaml"
+    stray = [rig, "--alpha", "mono", tmp_path / "mono" / "0.png", folder / "colour.png", "-o", tmp_path / "out"]
+    assert "0.png: no camera of the rig has its name: give --image NAME=" in fails(stray, capsys)
     assert "--points, --classical: of a single frame alone" in fails([*given, "--points", "--classical"], capsys)
     assert not (tmp_path / "out").exists()
 
