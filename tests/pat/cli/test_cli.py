@@ -230,8 +230,8 @@ def run(*words: str, then: str = "") -> subprocess.CompletedProcess:
 def test_help_and_completion_import_no_torch(words):
     code = f"""
 import sys
-from pat.cli.fusing import Fuse
-from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named, respelled
+from pat.cli.main import Pat, command_paths, main
+from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 try: main({list(words)})
 except SystemExit as stop: assert not stop.code
 assert not {{"torch", "numpy", "scipy", "numba", "arraygeom", "rich"}} & set(sys.modules), sys.modules
