@@ -34,18 +34,10 @@ from torch import Tensor
 
 from .batching import Batched
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
-from .lenses.central import (
-    DOUBLE_SPHERE,
-    EXTENDED_UNIFIED,
-    FOV,
-    SCARAMUZZA,
-    THIN_PRISM_FISHEYE,
-    UNIFIED,
-    central_project,
-    central_unproject,
-)
-from .lenses.common import WIDEST, finite_points, homogeneous, unit
+from .lenses.central import FOV, MODELS, central_project, central_unproject
+from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
+from .pixels import to_homogeneous
 from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
@@ -53,12 +45,7 @@ KANNALA_BRANDT = "kannala-brandt"
 COEFFICIENT_COUNTS = {
     BROWN_CONRADY: (4, 5, 8, 12, 14),
     KANNALA_BRANDT: (4,),
-    THIN_PRISM_FISHEYE: (8,),
-    DOUBLE_SPHERE: (2,),
-    EXTENDED_UNIFIED: (2,),
-    UNIFIED: (5,),
-    FOV: (1,),
-    SCARAMUZZA: (3,),
+    **{name: (len(model.harmless),) for name, model in MODELS.items()},
 }
 
 
@@ -101,7 +88,7 @@ class Distortion(Batched):
         if self.model == BROWN_CONRADY:
             xy_d, valid = brown_distort(self._lifted(xy), xy)
         else:
-            xy_d, valid = self._project(homogeneous(xy))
+            xy_d, valid = self._project(to_homogeneous(xy))
         return xy_d, valid & finite
 
     def undistort(self, xy_d: Real[Tensor, "*n 2"]) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
@@ -139,7 +126,7 @@ class Distortion(Batched):
             ray, valid = self._unproject(xy_d)
             return ray, valid & finite
         xy, valid = self.undistort(xy_d)
-        return unit(homogeneous(xy)), valid
+        return unit(to_homogeneous(xy)), valid
 
     def _project(self, X: Tensor) -> tuple[Tensor, Tensor]:
         c = self._lifted(X)

@@ -82,6 +82,7 @@ class _SafeLoader(_Base):  # type: ignore[misc]
     """YAML in which a repeated key is an error, not silently the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The parent's, once no key is there twice."""
         lines: dict[Any, int] = {}
         for key_node, _ in node.value:
             if key_node.tag == "tag:yaml.org,2002:merge":

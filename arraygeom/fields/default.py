@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from typing import Any
 
 from ..rig import Pair
 from .curved import Curved, ThroughLenses
@@ -10,7 +10,7 @@ from .explicit import Dense, Local, NearestVoxels
 from .protocol import ReceptiveField
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified
 
-FIELDS: dict[str, Callable[..., ReceptiveField]] = {
+FIELDS: dict[str, type[Any]] = {
     "epipolar": Epipolar,
     "line": EpipolarLine,
     "homography": HomographyDisplacement,

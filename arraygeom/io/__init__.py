@@ -40,8 +40,7 @@ from . import (
     strecha,
     syntim,
 )
-from .errors import RigFileError
-from .source import RigFileWarning, RigSource, unit_warning
+from .source import RigFileError, RigFileWarning, RigSource, unit_warning
 
 # In the order in which they are asked whether they recognise a file.
 READERS: dict[str, Any] = {
@@ -92,7 +91,7 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
         raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")
     reader = READERS[format]
     try:
-        rig = reader.read(path) if reader is native else reader.read(RigSource(path, hw=hw))
+        rig = reader.read(RigSource(path, hw=hw))
     except (RigFileError, FileNotFoundError):
         raise
     except (ArithmeticError, AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:

@@ -37,13 +37,12 @@ def _name(key: str, fields: dict[str, Any]) -> str:
 
 
 def _camera(source: RigSource, key: str, fields: dict[str, Any]) -> Camera:
-    width, height = source.numbers(source.get(fields, "size", key), (2,), f"{key}.size").tolist()
     c, entry = fields.get("distortions"), f"{key}.distortions"
     fisheye = bool(fields.get("fisheye", False))
     rotation, translation = (source.get(fields, k, key) for k in ("rotation", "translation"))
     return Camera(
         K=source.intrinsics(source.get(fields, "matrix", key), f"{key}.matrix"),
         cam_from_world=source.pose(rotation, translation, key),
-        hw=source.size(width, height, f"{key}.size"),
+        hw=source.size_of(source.get(fields, "size", key), f"{key}.size"),
         distortion=source.kannala_brandt(c, entry) if fisheye else source.brown_conrady(c, entry),
     )

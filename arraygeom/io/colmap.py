@@ -18,7 +18,8 @@ from typing import Any, NamedTuple
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import BROWN_CONRADY, FOV, KANNALA_BRANDT, THIN_PRISM_FISHEYE, Distortion
+from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
+from ..lenses.central import FOV, THIN_PRISM_FISHEYE
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -50,6 +51,10 @@ MODELS = {
     "RADIAL_FISHEYE": _Model(9, 1, KANNALA_BRANDT, 2),
     "THIN_PRISM_FISHEYE": _Model(10, 2, THIN_PRISM_FISHEYE, 8),
 }
+
+
+AT_ORIGIN = [1.0] + 6 * [0.0]
+"""QW QX QY QZ TX TY TZ."""
 
 
 class _Intrinsics(NamedTuple):
@@ -166,6 +171,7 @@ class _Text:
 
     @staticmethod
     def cameras(source: RigSource) -> dict[int, _Intrinsics]:
+        """The intrinsics of every line, CAMERA_ID MODEL WIDTH HEIGHT PARAMS, by id."""
         found: dict[int, _Intrinsics] = {}
         for number, line in _lines(source):
             fields, entry = line.split(), f"line {number}"
@@ -174,9 +180,8 @@ class _Text:
             i = _id(source, fields[0], entry)
             if i in found:
                 raise source.fail(entry, f"camera {i} occurs twice; keep one")
-            found[i] = _intrinsics(
-                source, entry, fields[1], (_float(fields[2]), _float(fields[3])), _floats(fields[4:])
-            )
+            width, height, *parameters = source.numbers_in(" ".join(fields[2:]), None, entry).tolist()
+            found[i] = _intrinsics(source, entry, fields[1], (width, height), parameters)
         _check_count(source, "cameras", len(found))
         return found
 
@@ -195,7 +200,7 @@ class _Text:
         fields, entry = line.split(maxsplit=9), f"line {number}"
         if len(fields) != 10:
             raise source.fail(entry, "wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
-        pose = _pose(source, entry, _floats(fields[1:8]))
+        pose = _pose(source, entry, source.numbers_in(" ".join(fields[1:8]), (7,), entry).tolist())
         return _Image(fields[9].strip(), _id(source, fields[8], entry), pose)
 
     @staticmethod
@@ -215,7 +220,8 @@ class _Text:
             for k in range(count):
                 kind, i = next(tokens), _id(source, next(tokens), entry)
                 posed = k == 0 or next(tokens) == "1"
-                numbers = _floats([next(tokens) for _ in range(7)]) if k and posed else [1.0] + 6 * [0.0]
+                words = " ".join(next(tokens) for _ in range(7)) if k and posed else ""
+                numbers = source.numbers_in(words, (7,), entry).tolist() if words else AT_ORIGIN
                 if kind == "CAMERA":
                     yield _sensor(source, entry, i, numbers if posed else None)
         except (StopIteration, ValueError, RuntimeError) as error:
@@ -231,6 +237,7 @@ class _Binary:
 
     @staticmethod
     def cameras(source: RigSource) -> dict[int, _Intrinsics]:
+        """The intrinsics of every camera by id."""
         names = {model.id: name for name, model in MODELS.items()}
         data, found = _Bytes(source), dict[int, _Intrinsics]()
         for _ in range(data.count()):
@@ -257,6 +264,7 @@ class _Binary:
 
     @staticmethod
     def rigs(source: RigSource) -> list[list[_Sensor]]:
+        """The cameras of each rig; other sensors are passed over."""
         data, rigs = _Bytes(source), []
         for _ in range(data.count()):
             rig, count = data.take("<II")
@@ -264,7 +272,7 @@ class _Binary:
             for k in range(count):
                 kind, i = data.take("<iI")
                 posed = k == 0 or bool(data.take("<B")[0])
-                numbers = list(data.take("<7d")) if k and posed else [1.0] + 6 * [0.0]
+                numbers = list(data.take("<7d")) if k and posed else AT_ORIGIN
                 if kind == 0:
                     sensors.append(_sensor(source, f"rig {rig}", i, numbers if posed else None))
             rigs.append(sensors)
@@ -334,17 +342,6 @@ def _id(source: RigSource, text: str, entry: str) -> int:
     if not text.isdigit():
         raise source.fail(entry, f"wanted a number as id, got '{text[:40]}'")
     return int(text)
-
-
-def _float(text: str) -> float | str:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
-def _floats(texts: list[str]) -> list[Any]:
-    return [_float(text) for text in texts]
 
 
 def _parameters(name: str, camera: Camera) -> tuple[str, list[float]]:

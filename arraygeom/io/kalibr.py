@@ -16,7 +16,8 @@ import torch
 import yaml
 
 from ..camera import Camera
-from ..distortion import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, KANNALA_BRANDT, UNIFIED, Distortion
+from ..distortion import KANNALA_BRANDT, Distortion
+from ..lenses.central import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, UNIFIED
 from ..pose import Pose
 from ..rig import Rig
 from ..sensor import Sensor
@@ -91,7 +92,6 @@ def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) ->
     model = source.get(fields, "camera_model", name)
     if model not in CAMERA_MODELS:
         raise source.fail(f"{name}.camera_model", f"is '{model}'; supported: {', '.join(CAMERA_MODELS)}: {AGAIN}")
-    width, height = source.numbers(source.get(fields, "resolution", name), (2,), f"{name}.resolution").tolist()
     first = len(CAMERA_MODELS[model])
     numbers = source.numbers(source.get(fields, "intrinsics", name), (first + 4,), f"{name}.intrinsics")
     K = source.focal_and_centre(numbers[first:], f"{name}.intrinsics")
@@ -99,7 +99,7 @@ def _camera(source: RigSource, name: str, fields: dict[str, Any], pose: Pose) ->
     return Camera(
         K=K,
         cam_from_world=pose,
-        hw=source.size(width, height, f"{name}.resolution"),
+        hw=source.size_of(source.get(fields, "resolution", name), f"{name}.resolution"),
         distortion=_lens(source, name, model, numbers[:first].tolist(), fields),
         sensor=Sensor(time_offset=offset),
     )

@@ -39,13 +39,8 @@ def _rectified(source: RigSource, entries: dict[str, Tensor], name: str) -> Came
     K = source.intrinsics(P[:, :3], name)
     pose = Pose(torch.eye(3, dtype=torch.float64), torch.linalg.solve(K, P[:, 3]))
     size = entries.get(name.replace("P_", "S_")) if "_" in name else None
-    hw = source.size_unstated(K) if size is None else _size(source, size, name)
+    hw = source.size_unstated(K) if size is None else source.size_of(size, f"size of {name}")
     return Camera(K=K, cam_from_world=pose, hw=hw)
-
-
-def _size(source: RigSource, numbers: Tensor, entry: str) -> tuple[int, int]:
-    width, height = source.numbers(numbers, (2,), f"size of {entry}").tolist()
-    return source.size(width, height, f"size of {entry}")
 
 
 def _entries(source: RigSource) -> dict[str, Tensor]:
@@ -57,11 +52,7 @@ def _entries(source: RigSource) -> dict[str, Tensor]:
             continue
         if name in entries:
             raise source.fail(name, "occurs twice; keep one")
-        try:
-            numbers = [float(value) for value in values.split()]
-        except ValueError:
-            raise source.fail(name, "holds something other than numbers") from None
-        entries[name] = source.numbers(numbers, None, name)
+        entries[name] = source.numbers_in(values, None, name)
     return entries
 
 
@@ -89,6 +80,6 @@ class Raw:
         return Camera(
             K=source.intrinsics(K, f"K_{n}"),
             cam_from_world=source.pose(R, T, f"R_{n}, T_{n}:"),
-            hw=_size(source, S, f"S_{n}"),
+            hw=source.size_of(S, f"S_{n}"),
             distortion=source.brown_conrady(D, f"D_{n}"),
         )

@@ -20,8 +20,9 @@ import torch
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import SCARAMUZZA, Distortion
+from ..distortion import Distortion
 from ..epipolar import epipolar_lines, shift_origin
+from ..lenses.central import SCARAMUZZA
 from ..pixels import HW, pixel_grid, to_homogeneous
 from ..pose import Pose
 from ..rig import Rig

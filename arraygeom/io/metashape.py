@@ -16,7 +16,8 @@ from typing import NamedTuple
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import THIN_PRISM_FISHEYE, Distortion
+from ..distortion import Distortion
+from ..lenses.central import THIN_PRISM_FISHEYE
 from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
@@ -58,7 +59,8 @@ def read(source: RigSource) -> Rig:
         if sensor not in made:
             made[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
         K, hw, lens = made[sensor]
-        pose = source.pose_matrix(_floats(source, transform, (16,), f"{name}.transform"), f"{name}.transform").inverse()
+        entry = f"{name}.transform"
+        pose = source.pose_matrix(source.numbers_in(transform, (16,), entry), entry).inverse()
         own = scales.get(camera.get("component_id"))
         metres = own if own is not None else scale if scale is not None else 1.0
         cameras.append((name, Camera(K=K, cam_from_world=Pose(pose.R, pose.t * metres), hw=hw, distortion=lens)))
@@ -105,7 +107,7 @@ def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> _Sensor:
     resolution = sensor.find("resolution") if resolution is None else resolution
     if resolution is None:
         raise source.fail(entry, "has no resolution")
-    width, height = (_floats(source, resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height"))
+    width, height = (source.numbers_in(resolution.get(n) or "", (1,), f"{entry} {n}") for n in ("width", "height"))
     h, w = source.size(width, height, f"{entry} resolution")
     f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
     K = source.intrinsics([[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5)
@@ -127,7 +129,7 @@ def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion 
 def _scale(source: RigSource, part: ET.Element) -> float | None:
     """Metres a unit of a chunk or a component, if that is known."""
     text = part.findtext("transform/scale")
-    return None if text is None else float(_floats(source, text, (1,), "scale"))
+    return None if text is None else float(source.numbers_in(text, (1,), "scale"))
 
 
 def _number(source: RigSource, calibration: ET.Element, name: str, entry: str) -> float:
@@ -135,13 +137,4 @@ def _number(source: RigSource, calibration: ET.Element, name: str, entry: str) -
     text = calibration.findtext(name)
     if text is None and name == "f":
         raise source.fail(entry, "has no f, the focal length")
-    return 0.0 if text is None else float(_floats(source, text, (1,), f"{entry} {name}"))
-
-
-def _floats(source: RigSource, text: str, shape: tuple[int, ...], entry: str) -> Tensor:
-    try:
-        return source.numbers([float(word) for word in text.split()], shape, entry)
-    except ValueError as error:
-        if hasattr(error, "entry"):
-            raise
-        raise source.fail(entry, f"holds something other than numbers: {text[:60]!r}") from None
+    return 0.0 if text is None else float(source.numbers_in(text, (1,), f"{entry} {name}"))

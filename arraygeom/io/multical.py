@@ -59,11 +59,10 @@ def _poses(source: RigSource, entries: dict[str, Any], cameras: dict[str, Any]) 
 def _camera(source: RigSource, name: str, fields: Any, pose: Pose) -> Camera:
     entry = f"cameras.{name}"
     fields = source.mapping(fields, entry)
-    width, height = source.numbers(source.get(fields, "image_size", entry), (2,), f"{entry}.image_size").tolist()
     return Camera(
         K=source.intrinsics(source.get(fields, "K", entry), f"{entry}.K"),
         cam_from_world=pose,
-        hw=source.size(width, height, f"{entry}.image_size"),
+        hw=source.size_of(source.get(fields, "image_size", entry), f"{entry}.image_size"),
         distortion=_lens(source, fields, f"{entry}.dist"),
     )
 

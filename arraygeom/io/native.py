@@ -39,8 +39,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -54,9 +53,7 @@ from ..epipolar import shift_origin
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
-from ..safe_yaml import load_yaml, yaml_problem
 from ..sensor import PATTERNS, Band, Curve, Sensor
-from .errors import RigFileError
 from .source import RigSource
 
 FORMAT = "arraygeom-rig 1"
@@ -74,24 +71,15 @@ def recognises(path: Path, head: str) -> bool:
     return "arraygeom-rig" in head or (path.suffix in {".yaml", ".yml"} and "\ncameras:" in "\n" + head)
 
 
-def read(path: Path) -> Rig:
+def read(source: RigSource) -> Rig:
     """The rig of a native file. Raises RigFileError naming the file, the entry and what to do."""
-    try:
-        text = path.read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise RigFileError(path, None, f"not valid YAML: {yaml_problem(error)[1]}") from None
-    return read_text(text, path)
+    return _Document(source.path).read(source.yaml())
 
 
 def read_text(text: str, path: str | Path) -> Rig:
     """The rig of a native file's text; `path` names it in errors."""
-    try:
-        document = load_yaml(text)
-    except yaml.YAMLError as error:
-        line, problem = yaml_problem(error)
-        at = f" at line {line}" if line else ""
-        raise RigFileError(Path(path), None, f"not valid YAML{at}: {problem}") from None
-    return _Reader(Path(path)).rig(document)
+    source = _Document(Path(path))
+    return source.read(source.yaml(text))
 
 
 def write(rig: Rig) -> str:
@@ -112,16 +100,13 @@ def write(rig: Rig) -> str:
     return yaml.dump(document, Dumper=_Dumper, sort_keys=False, width=120, allow_unicode=True)
 
 
-class _Reader:
-    """Reads one document; knows the file's name, units and pixel origin for the messages and the conversions."""
+class _Document(RigSource):
+    """A native file being read; knows its units and pixel origin for the conversions."""
 
-    def __init__(self, path: Path) -> None:
-        self.path, self.metre, self.origin = path, 1.0, 0.0
+    metre, origin = 1.0, 0.0
 
-    def fail(self, entry: str | None, message: str) -> RigFileError:
-        return RigFileError(self.path, entry, message)
-
-    def rig(self, document: Any) -> Rig:
+    def read(self, document: Any) -> Rig:
+        """The rig of the whole document."""
         self.keys(document, TOP, None)
         if not str(document.get("format", FORMAT)).startswith("arraygeom-rig"):
             raise self.fail("format", f"is '{document['format']}', wanted '{FORMAT}'")
@@ -152,9 +137,10 @@ class _Reader:
         return links
 
     def camera(self, entry: str, fields: Any) -> View:
+        """A calibrated camera, a view with a lens alone, or one of which only the size is known."""
         self.keys(fields, CAMERA, entry)
         width, height = (self.whole(n, f"{entry}.size") for n in self.pair(fields.get("size"), f"{entry}.size"))
-        height, width = RigSource(self.path).bounded((height, width), f"{entry}.size")
+        height, width = self.bounded((height, width), f"{entry}.size")
         sensor = self.sensor(entry, fields)
         if not any(key in fields for key in CALIBRATION):
             return View(hw=(height, width), sensor=sensor)
@@ -163,7 +149,7 @@ class _Reader:
         lens = self.distortion(f"{entry}.distortion", fields.get("distortion"))
         return Camera(
             K=self.K(entry, fields, (height, width)),
-            cam_from_world=self.pose(entry, fields),
+            cam_from_world=self.stated_pose(entry, fields),
             hw=(height, width),
             distortion=None if lens is not None and lens.is_identity else lens,
             sensor=sensor,
@@ -182,6 +168,7 @@ class _Reader:
         return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
 
     def K(self, entry: str, fields: Mapping[str, Any], hw: tuple[int, int], scale: str = "focal") -> Tensor:
+        """The intrinsic matrix as stated, or from `scale` (focal lengths, for a calibrated camera) and centre."""
         if "K" in fields:
             K = self.numbers(fields["K"], (3, 3), f"{entry}.K")
             if K[2].tolist() != [0, 0, 1] or K[:2, :2].det().abs() < 1e-9:
@@ -199,27 +186,29 @@ class _Reader:
             K[:2, 2] = self.numbers(fields["centre"], (2,), f"{entry}.centre") - self.origin
         return K
 
-    def pose(self, entry: str, fields: Mapping[str, Any]) -> Pose:
-        R = self.rotation(f"{entry}.rotation", fields.get("rotation", [0, 0, 0]))
+    def stated_pose(self, entry: str, fields: Mapping[str, Any]) -> Pose:
+        R = self.stated_rotation(f"{entry}.rotation", fields.get("rotation", [0, 0, 0]))
         if "translation" in fields and "position" in fields:
             raise self.fail(entry, "has both 'translation' (t) and 'position' (-R^T t): keep one")
         if "position" in fields:
             return Pose.from_centre(R, self.numbers(fields["position"], (3,), f"{entry}.position") * self.metre)
         return Pose(R, self.numbers(fields.get("translation", [0, 0, 0]), (3,), f"{entry}.translation") * self.metre)
 
-    def rotation(self, entry: str, value: Any) -> Tensor:
-        if not (isinstance(value, list) and value and isinstance(value[0], list)):
-            return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
-        return RigSource(self.path).rotation(self.numbers(value, (3, 3), entry), entry)
+    def stated_rotation(self, entry: str, value: Any) -> Tensor:
+        """From a matrix, or a rotation vector in degrees."""
+        if isinstance(value, list) and value and isinstance(value[0], list):
+            return self.rotation(self.numbers(value, (3, 3), entry), entry)
+        return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
 
     def distortion(self, entry: str, value: Any) -> Distortion | None:
         if value is None:
             return None
         self.keys(value, ("model", "coefficients"), entry)
-        with self.naming(entry):
-            return Distortion(
-                str(value.get("model")), self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
-            )
+        coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
+        try:
+            return Distortion(str(value.get("model")), coefficients)
+        except ValueError as error:
+            raise self.fail(entry, str(error)) from None
 
     def sensor(self, entry: str, fields: Mapping[str, Any]) -> Sensor:
         response = fields.get("response")
@@ -302,7 +291,7 @@ class _Reader:
         lengths = " x ".join(map(str, shape or ()))
         wanted = "a list of numbers" if shape is None else f"{lengths} numbers" if shape else "a number"
         try:
-            tensor = torch.tensor(value, dtype=torch.float64)
+            tensor = torch.as_tensor(value, dtype=torch.float64)
         except (TypeError, ValueError, RuntimeError):
             raise self.fail(entry, f"is {value!r}; wanted {wanted}") from None
         if shape is not None and tensor.shape != shape:
@@ -327,16 +316,6 @@ class _Reader:
         if isinstance(value, str | int | float) and value in choices:
             return choices[value]
         raise self.fail(entry, f"is {value!r}; wanted one of {', '.join(map(str, choices))}")
-
-    @contextmanager
-    def naming(self, entry: str) -> Iterator[None]:
-        """Says which entry of the file an error is about."""
-        try:
-            yield
-        except (TypeError, ValueError) as error:
-            if isinstance(error, RigFileError):
-                raise
-            raise self.fail(entry, str(error)) from None
 
 
 def _camera_entry(camera: View) -> dict[str, Any]:

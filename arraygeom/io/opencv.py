@@ -97,8 +97,7 @@ def _size(source: RigSource, nodes: dict[str, Any], i: str, K: Tensor) -> HW:
             return source.size(nodes[f"image_width{suffix}"], nodes[f"image_height{suffix}"], "image_width")
         for name in ("image_size", "imageSize", "size"):
             if f"{name}{suffix}" in nodes:
-                width, height = source.numbers(nodes[f"{name}{suffix}"], (2,), name).tolist()
-                return source.size(width, height, name)
+                return source.size_of(nodes[f"{name}{suffix}"], name)
     return source.size_unstated(K)
 
 

@@ -19,7 +19,6 @@ from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
 from ..safe_yaml import load_yaml, yaml_problem
-from .errors import RigFileError
 
 # A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array.
 SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
@@ -29,6 +28,14 @@ LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
 ROUNDED = 1e-3
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
+
+
+class RigFileError(ValueError):
+    """A rig file that cannot be read: which file, which entry of it, and what to do, in one line."""
+
+    def __init__(self, path: str | Path, entry: str | None, message: str) -> None:
+        super().__init__(f"{path}: {entry}: {message}" if entry else f"{path}: {message}")
+        self.path, self.entry = Path(path), entry
 
 
 class RigFileWarning(UserWarning):
@@ -80,11 +87,10 @@ class RigSource:
         except tomllib.TOMLDecodeError as error:
             raise self.fail(None, f"is not TOML ({error}); is the file whole?") from None
 
-    def yaml(self) -> dict[str, Any]:
-        """The file as a YAML mapping without repeated keys."""
-        text = self.text()
+    def yaml(self, text: str | None = None) -> dict[str, Any]:
+        """The file, or a text instead of it, as a YAML mapping without repeated keys."""
         try:
-            return self.mapping(load_yaml(text), None)
+            return self.mapping(load_yaml(self.text() if text is None else text), None)
         except yaml.YAMLError as error:
             line, problem = yaml_problem(error)
             raise self.fail(f"line {line}" if line else None, f"is not YAML ({problem}); is the file whole?") from None
@@ -116,6 +122,14 @@ class RigSource:
             raise self.fail(entry, "holds NaN or infinity; did the calibration fail?")
         return tensor.reshape(shape or (-1,))
 
+    def numbers_in(self, text: str, shape: tuple[int, ...] | None, entry: str) -> Tensor:
+        """The `numbers` that a text consists of."""
+        try:
+            values = [float(word) for word in text.split()]
+        except ValueError:
+            raise self.fail(entry, f"holds something other than numbers: {text[:60]!r}") from None
+        return self.numbers(values, shape, entry)
+
     def number(self, value: Any, entry: str) -> float:
         """One finite number."""
         return float(self.numbers(value, (1,), entry))
@@ -126,6 +140,11 @@ class RigSource:
         if min(w, h) < 1 or w != int(w) or h != int(h):
             raise self.fail(entry, f"is {w:g} x {h:g}, wanted an image's width x height in whole pixels")
         return self.bounded((int(h), int(w)), entry)
+
+    def size_of(self, wh: Any, entry: str) -> HW:
+        """(height, width) from a list of width and height."""
+        width, height = self.numbers(wh, (2,), entry).tolist()
+        return self.size(width, height, entry)
 
     def bounded(self, hw: HW, entry: str) -> HW:
         """A size, once it is one that images have."""

@@ -34,22 +34,12 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _camera(source: RigSource) -> Camera:
-    rows = [line.split() for line in source.text().splitlines() if line.strip()]
-    numbers = source.numbers([_number(source, word) for row in rows for word in row], (26,), "the file")
-    K, skipped, R, centre, wh = numbers.split([9, 3, 9, 3, 2])
+    K, skipped, R, centre, wh = source.numbers_in(source.text(), (26,), "the file").split([9, 3, 9, 3, 2])
     if skipped.any():
         raise source.fail("line 4", f"is {skipped.tolist()}: a lens, which is not read: undistort the images first")
     world_from_cam = source.rotation(R, "lines 5 to 7")
-    width, height = wh.tolist()
     return Camera(
         K=source.intrinsics(K, "lines 1 to 3"),
         cam_from_world=Pose.from_centre(world_from_cam.mT, centre),
-        hw=source.size(width, height, "line 9"),
+        hw=source.size_of(wh, "line 9"),
     )
-
-
-def _number(source: RigSource, word: str) -> float:
-    try:
-        return float(word)
-    except ValueError:
-        raise source.fail(None, f"holds '{word[:40]}', which is no number") from None

@@ -37,8 +37,8 @@ def _camera(source: RigSource) -> Camera:
     values = {k: _value(source, text, k) for k in ("u0", "v0", "au", "av", "dimx", "dimy")}
     K = source.focal_and_centre([values[k] for k in ("au", "av", "u0", "v0")], "au, av, u0, v0")
     rotation, _, translation = text.partition("Rotation:")[2].partition("Translation:")
-    R = source.numbers(_numbers(rotation), (3, 3), "Rotation")
-    t = source.numbers(_numbers(translation), (3,), "Translation")
+    rotation, translation = (" ".join(re.findall(NUMBER, part, re.IGNORECASE)) for part in (rotation, translation))
+    R, t = source.numbers_in(rotation, (3, 3), "Rotation"), source.numbers_in(translation, (3,), "Translation")
     world_from_cam = source.pose(R, t, "Rotation, Translation:", metres=1e-3)
     return Camera(
         K=K,
@@ -51,15 +51,4 @@ def _value(source: RigSource, text: str, name: str) -> float:
     found = re.search(rf"\b{name}\s*=\s*{NUMBER}", text, re.IGNORECASE)
     if not found:
         raise source.fail(name, "is missing; is the file whole?")
-    return source.number(_float(found[1]), name)
-
-
-def _numbers(text: str) -> list[float]:
-    return [_float(number) for number in re.findall(NUMBER, text, re.IGNORECASE)]
-
-
-def _float(text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        return float("nan")
+    return float(source.numbers_in(found[1], (1,), name))

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..pixels import product
+from ..pixels import product, to_homogeneous
 from ..roots import first_root, invert_increasing
 from ..tracing import traced
-from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, homogeneous, norm, polynomial_product
+from .common import BEYOND, MARGIN, POLE, SOLVED, TINY, WIDEST, norm, polynomial_product
 
 
 @dataclass(frozen=True)
@@ -215,6 +215,6 @@ def _apply(H: Tensor | None, xy: Tensor) -> tuple[Tensor, Tensor]:
     """The homography H of points, and which lie on this side of the line it sends to infinity."""
     if H is None:
         return xy, torch.ones_like(xy[..., 0], dtype=torch.bool)
-    p = product(H.to(xy), homogeneous(xy)[..., None])[..., 0]
+    p = product(H.to(xy), to_homogeneous(xy)[..., None])[..., 0]
     ahead = p[..., 2] > 1 / WIDEST
     return p[..., :2] / torch.where(ahead, p[..., 2], 1.0)[..., None], ahead

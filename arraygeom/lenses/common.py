@@ -51,11 +51,6 @@ def polynomial_product(a: tuple[Tensor, ...], b: tuple[Tensor, ...]) -> list[Ten
     return terms
 
 
-def homogeneous(xy: Tensor) -> Tensor:
-    """Points (*n, 2) with a 1 behind."""
-    return torch.cat([xy, torch.ones_like(xy[..., :1])], -1)
-
-
 def unit(ray: Tensor) -> Tensor:
     """Vectors at length 1."""
     return ray / norm(ray)[..., None]

@@ -41,7 +41,7 @@ FORMS = (
     "aprilgrid:6x6:88mm:0.3 (tags)"
 )
 LARGEST = 100
-APRIL_TAGS, APRIL_BITS = "apriltag_36h11", 6
+APRIL_TAGS = "apriltag_36h11"
 
 
 @dataclass(frozen=True)

@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from arraygeom.segments import sample_fractions
+from arraygeom.threads import in_parallel
 from pat.attention import kernels
 from pat.attention.reference import EDGE_SLACK, SamplePositions
-from pat.support.threads import in_parallel
 
 PIECE_SAMPLES = 2**15
 """Samples that a thread takes at a time: a fraction of a millisecond."""

@@ -58,6 +58,7 @@ class Evaluate:
     weights: Weights = "mono-colour"
 
     def run(self) -> None:
+        """Write and print the scores. Raises ValueError for no images, rates below 1, and a condition that is none."""
         from arraygeom.atomic import write_text
 
         from ..evaluation import protocols, stereo
@@ -150,6 +151,7 @@ class Ablate:
     """Folder for ablation.md, ablation.csv and ablation.png."""
 
     def run(self) -> None:
+        """Write and print the table. Raises ValueError for less than one scene."""
         from ..evaluation.ablation import ablate, layered_cases, rendered_cases
         from ..networks.weights import load_weights
 
@@ -218,6 +220,7 @@ class SystemsRun:
     """Memory limit of fusing, such as 4GiB; a single frame is then fused in a process of its own, measured."""
 
     def run(self) -> None:
+        """Print the scores, and the expected ones where they are of the same settings."""
         from ..systems import load_system, run_system
         from ..systems.fast_slow.recorded import run_recorded
 
@@ -260,6 +263,7 @@ class DataShow:
     """Of the choice of patches, and of noise."""
 
     def run(self) -> None:
+        """Draw patches chosen by the seed. Raises ValueError for less than one."""
         import torch
 
         from ..data import ScenePatches
@@ -317,6 +321,7 @@ class Render:
     """Address of a Dask scheduler (tcp://...), or "local"."""
 
     def run(self) -> None:
+        """Render what is missing; exit status 1 if the job is not complete then."""
         from ..farm.folders import Shard
         from ..farm.job import RenderConfig
         from ..farm.run import render

@@ -53,6 +53,7 @@ class Calibrate:
     """While images are taken: a page (.watch.html) with what was detected and which view would help most."""
 
     def run(self) -> None:
+        """Detect, calibrate and write. Raises ValueError without a board."""
         from calib.boards.run import calibrate_photos
 
         if not self.board:

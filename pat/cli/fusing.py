@@ -390,6 +390,7 @@ class Demo:
     weights: Weights = "mono-colour"
 
     def run(self) -> None:
+        """Write the images, and print the scores of alpha alone, the baseline and the fusion."""
         from arraygeom.atomic import write_text
 
         from ..data.sample_array import ALPHA, BETA, load_sample
@@ -420,6 +421,7 @@ class WarmUp:
     """Compile the kernels that `pat fuse` uses, once for this machine, so that no later command waits for it."""
 
     def run(self) -> None:
+        """Compile the kernels by fusing the sample array once."""
         from arraygeom.compiled import cache_folder
 
         from ..attention.kernels import forward

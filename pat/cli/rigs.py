@@ -35,6 +35,7 @@ class Show:
     images, matches.png (patches around points matched in the images, and how far they lie from their lines)."""
 
     def run(self) -> None:
+        """Write the drawings, and warn of a rig that does not fit the images."""
         from arraygeom import Camera
         from arraygeom.viz import draw_fields, draw_matches, draw_rig
 
@@ -133,6 +134,7 @@ class Info:
     """Print JSON instead of tables."""
 
     def run(self) -> None:
+        """Print the tables, or JSON."""
         from rich.console import Console
         from rich.table import Table
 
@@ -208,6 +210,7 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
+        """Print the diagnosis, and write the repaired rig if a mistake is found."""
         from arraygeom.atomic import write_text
         from calib.images.doctor import diagnose
 
@@ -258,6 +261,7 @@ class Refine:
     """Write the refined rig in spite of objections."""
 
     def run(self) -> None:
+        """Print what was found, and write the refined rig if it is accepted."""
         from arraygeom.atomic import write_text
         from arraygeom.io.native import write
         from calib.images.refinement import refine

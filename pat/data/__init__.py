@@ -1,13 +1,7 @@
 """Pairs and arrays on disk."""
 
 from pat.data.indices import agreement, index_files, read_indices, write_indices
-from pat.data.pairs import (
-    PAPER_DISPARITY,
-    Disparity,
-    StereoPair,
-    folder_pairs,
-    middlebury_pairs,
-)
+from pat.data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from pat.data.patches import PatchGrid
 from pat.data.scenes import Patch, ScenePatches, SceneShuffle, collate, default_chains
 from pat.data.windows import scene_folders

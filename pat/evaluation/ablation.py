@@ -165,7 +165,7 @@ def layered_cases(
     for number in range(count):
         made = scenes.sample(1, g)
         ground_truth, seen = (image[0] for image in made.images)
-        cameras = {name: _single(camera) for name, camera in zip((ALPHA, BETA), made.cameras)}
+        cameras = {name: camera[0].to(torch.float64) for name, camera in zip((ALPHA, BETA), made.cameras)}
         yield _recorded(f"scene {number}", Rig(cameras), ground_truth, seen, made.depth[0][0], g)
 
 
@@ -372,9 +372,3 @@ def _decentred(pixels: float) -> Callable[[Rig, Generator], Rig]:
 
 def _camera(rig: Rig) -> Camera:
     return rig.pair(ALPHA, BETA).cameras[1]
-
-
-def _single(camera: Camera) -> Camera:
-    """The only camera of a batch of one."""
-    pose = Pose(camera.R[0].double(), camera.t[0].double())
-    return camera.replace(K=camera.K[0].double(), cam_from_world=pose)

@@ -129,6 +129,20 @@ def classical_calibrated(
     return (alpha + torch.from_numpy(_warped(difference, to_alpha, wh))[None].to(alpha)).clamp(0, 1)
 
 
+def non_local_means(image: Float[Tensor, "c h w"], deviation: float) -> Float[Tensor, "c h w"]:
+    """scikit-image's non-local means for noise of a known standard deviation (Buades et al. 2005; Darbon et al. 2008).
+
+    Patches of 5 x 5 pixels within 6 pixels, h = 0.8 deviations, as its documentation advises.
+    """
+    from skimage.restoration import denoise_nl_means
+
+    given = image.movedim(0, -1).numpy()
+    found = denoise_nl_means(
+        given, patch_size=5, patch_distance=6, h=0.8 * deviation, sigma=deviation, fast_mode=True, channel_axis=-1
+    )
+    return torch.from_numpy(np.ascontiguousarray(found.reshape(given.shape))).movedim(-1, 0).to(image)
+
+
 def sgbm_disparity(
     alpha: Float[Tensor, "1 h w"], beta: Float[Tensor, "1 h w"], max_disparity: float
 ) -> Float[Tensor, "h w"]:

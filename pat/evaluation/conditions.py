@@ -27,19 +27,20 @@ from ..media.colour import from_luma_chroma, luminance, to_luma_chroma
 from ..media.figures import save_curves
 from ..networks.protocol import FusionNetwork
 from ..sensors.noise_level import NoiseLevel
-from .baseline import classical_fusion, sgbm_disparity
-from .low_light import non_local_means
-from .metrics import bootstrap_interval, disparity_score, score
+from .baseline import classical_fusion, non_local_means, sgbm_disparity
+from .metrics import bootstrap_interval, score
 from .protocols import (
     MonoColourTask,
     StereoMethod,
     StereoResult,
+    hw_of,
     mono_colour_task,
     rectified_field,
     rectified_fusion,
     rectified_rig,
 )
-from .tables import markdown_table
+from .stereo import disparity_errors
+from .tables import distinct, markdown_table
 
 LEFT_CROP = 64
 """Columns at the left that stereo super-resolution leaves out of its scores."""
@@ -178,7 +179,7 @@ def _non_local(image: Tensor, level: NoiseLevel) -> Tensor:
 
 def corrected_classical(network: FusionNetwork, alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
     """The classical baseline with alpha's response as the fusion finds it."""
-    rig = rectified_rig(_hw(alpha), {"beta": _hw(beta)}, max_disparity)
+    rig = rectified_rig(hw_of(alpha), {"beta": hw_of(beta)}, max_disparity)
     images, field = {"alpha": alpha, "beta": beta}, rectified_field(max_disparity)
     response = corrections_of(network, rig, images, alpha="alpha", field=field, align=False).response
     image = classical_fusion(response.of_alpha(alpha), response.of_beta(beta), max_disparity)
@@ -228,7 +229,7 @@ def evaluate_conditions(
     for pair in progress(pairs, len(pairs)):
         for name, condition in chosen.items():
             recording = condition.recorded(pair)
-            truth, regions = recording.task.ground_truth, regions_of(pair, _hw(recording.task.ground_truth))
+            truth, regions = recording.task.ground_truth, regions_of(pair, hw_of(recording.task.ground_truth))
             if condition == CONDITIONS["ideal"]:
                 bound = StereoResult(chroma_bound(recording.task, condition.rate))
                 rows.append(_row(pair, name, "bound of beta's resolution", bound, truth, regions))
@@ -245,27 +246,22 @@ def _row(
     image = result.image.clamp(0, 1)
     error = (image - truth).square().mean(0)
     psnr = {n: -10 * math.log10(max(float(error[at].mean()), 1e-12)) if at.any() else None for n, at in regions.items()}
-    depth = _depth_errors(result.disparity, pair.disparity, regions)
+    depth = depth_errors(result.disparity, pair.disparity, regions)
     return ConditionRow(pair.name, condition, method, score(image, truth).ssim, psnr, *depth)
 
 
-def _depth_errors(
-    found: Tensor | None, truth: Disparity | None, regions: Mapping[str, Tensor]
+def depth_errors(
+    found: Tensor | None, ground_truth: Disparity | None, regions: Mapping[str, Tensor]
 ) -> tuple[float | None, tuple[float, float] | None]:
-    """A pixel of unknown disparity is not within one pixel, and is left out of the end-point error."""
-    if found is None or truth is None:
+    """The end-point error, and the shares within a pixel: of all whose ground truth is known, and of those seen.
+
+    A pixel of unknown disparity is not within one pixel, and is left out of the end-point error.
+    """
+    if found is None or ground_truth is None:
         return None, None
-    h, w = found.shape
-    value, valid = (t[:h, :w] for t in truth)
-    known = valid & found.isfinite()
-    right = known & ((found.nan_to_num(0) - value).abs() <= 1)
-    seen = regions["seen"]
-    shares = tuple(float((right & at).sum() / at.sum().clamp(min=1)) for at in (valid, seen))
-    return disparity_score(found.nan_to_num(0), value, known).end_point_error, (shares[0], shares[1])
-
-
-def _hw(image: Tensor) -> tuple[int, int]:
-    return image.shape[-2], image.shape[-1]
+    error, of_all = disparity_errors(found, ground_truth)
+    _, of_seen = disparity_errors(found, Disparity(ground_truth.value, regions["seen"]))
+    return error, None if of_all is None or of_seen is None else (of_all, of_seen)
 
 
 def conditions_markdown(rows: Sequence[ConditionRow]) -> str:
@@ -276,9 +272,9 @@ def conditions_markdown(rows: Sequence[ConditionRow]) -> str:
 
 
 def _by_condition(rows: Sequence[ConditionRow]) -> str:
-    methods = [m for m in _unique(r.method for r in rows) if m != "bound of beta's resolution"]
+    methods = [m for m in distinct(r.method for r in rows) if m != "bound of beta's resolution"]
     lines = []
-    for name in _unique(r.condition for r in rows):
+    for name in distinct(r.condition for r in rows):
         cells = [_mean_cell([r for r in rows if (r.condition, r.method) == (name, m)]) for m in methods]
         gains = _gains(rows, name)
         low, high = bootstrap_interval(gains)
@@ -300,7 +296,7 @@ def _mean_cell(rows: Sequence[ConditionRow]) -> str:
 def _by_region(rows: Sequence[ConditionRow]) -> str:
     ideal = [r for r in rows if r.condition == "ideal"]
     lines = []
-    for method in _unique(r.method for r in ideal):
+    for method in distinct(r.method for r in ideal):
         found = [r for r in ideal if r.method == method]
         values = [[v for r in found if (v := r.psnr.get(region)) is not None] for region in REGIONS]
         lines.append([method, *(f"{np.mean(v):.2f}" if v else "" for v in values)])
@@ -310,7 +306,7 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
 
 def _depth(rows: Sequence[ConditionRow]) -> str:
     lines = []
-    for method in _unique(r.method for r in rows):
+    for method in distinct(r.method for r in rows):
         found = [r for r in rows if (r.condition, r.method) == ("ideal", method) and r.within_one is not None]
         if found:
             shares = [100 * float(np.mean([r.within_one[i] for r in found if r.within_one])) for i in range(2)]
@@ -318,10 +314,6 @@ def _depth(rows: Sequence[ConditionRow]) -> str:
             name = "OpenCV's SGBM" if method == "classical" else method
             lines.append([name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
     return markdown_table(["", "end-point error", "within 1 px, of all", "of those that beta sees"], lines)
-
-
-def _unique(names: Iterable[str]) -> list[str]:
-    return list(dict.fromkeys(names))
 
 
 def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
@@ -339,7 +331,7 @@ def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
 def _curve(rows: Sequence[ConditionRow], points: Mapping[int, str]) -> dict[str, list[tuple[float, float]]]:
     found: dict[str, list[tuple[float, float]]] = {}
     for x, name in points.items():
-        for method in _unique(r.method for r in rows if r.condition == name):
+        for method in distinct(r.method for r in rows if r.condition == name):
             if method != "bound of beta's resolution":
                 values = [r.psnr["whole"] or 0.0 for r in rows if (r.condition, r.method) == (name, method)]
                 found.setdefault(method, []).append((x, float(np.mean(values))))

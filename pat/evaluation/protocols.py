@@ -79,6 +79,11 @@ def _cut_to_multiple(image: Float[Tensor, "c h w"], rate: int) -> Float[Tensor, 
     return image[:, :height, :width]
 
 
+def hw_of(image: Float[Tensor, "c h w"]) -> HW:
+    """Height and width."""
+    return image.shape[-2], image.shape[-1]
+
+
 class StereoResult(NamedTuple):
     """A colour image (3, H, W), 0..1, and the disparity (H, W) of its match, pixels of alpha; NaN unknown."""
 
@@ -121,7 +126,7 @@ def rectified_fusion(
     def fused(alpha: Tensor, given: Tensor, max_disparity: float) -> StereoResult:
         image = beta(given)
         betas = dict(zip("rgb", image.split(1))) if bands else {"beta": image}
-        rig = rectified_rig(_hw(alpha), {name: _hw(band) for name, band in betas.items()}, max_disparity)
+        rig = rectified_rig(hw_of(alpha), {name: hw_of(band) for name, band in betas.items()}, max_disparity)
         field = rectified_field(max_disparity)
         field = ShuffledField(field) if shuffled else field
         frame = fuse(network, rig, {"alpha": alpha, **betas}, alpha="alpha", field=field, **options)
@@ -167,14 +172,10 @@ def controls(network: FusionNetwork, *, bands: bool = False) -> dict[str, Stereo
     other = read_image(SAMPLE / f"{BETA}.png")[None]
 
     def foreign(beta: Tensor) -> Tensor:
-        return interpolate(other, _hw(beta), mode="bicubic", align_corners=False, antialias=True)[0].clamp(0, 1)
+        return interpolate(other, hw_of(beta), mode="bicubic", align_corners=False, antialias=True)[0].clamp(0, 1)
 
     return {
         "no beta": rectified_fusion(network, bands=bands, beta=torch.zeros_like),
         "another scene's beta": rectified_fusion(network, bands=bands, beta=foreign),
         "shuffled fields": rectified_fusion(network, bands=bands, shuffled=True),
     }
-
-
-def _hw(image: Tensor) -> HW:
-    return image.shape[-2], image.shape[-1]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,20 +13,12 @@ from jaxtyping import Float
 from rich.progress import track
 from torch import Tensor
 
-from ..data.pairs import (
-    PAPER_DISPARITY,
-    Disparity,
-    StereoPair,
-    folder_pairs,
-    middlebury_pairs,
-)
+from ..data.pairs import PAPER_DISPARITY, Disparity, StereoPair, folder_pairs, middlebury_pairs
 from ..media.images import write_image
 from .halves import Half, of_half
 from .metrics import bootstrap_interval, disparity_score, score
 from .protocols import PRINTED, MonoColourTask, StereoMethod, StereoResult, beta_alone, mono_colour_task
-from .tables import markdown_table
-
-T = TypeVar("T")
+from .tables import distinct, markdown_table
 
 DATA_SETS: dict[str, Callable[[Path], Iterable[StereoPair]]] = {
     "kitti": folder_pairs,
@@ -138,18 +130,18 @@ def markdown(rows: Sequence[StereoRow], *, printed: PrintedScores = {}) -> str: 
 
     `printed` figures of the paper get a column with a mean only.
     """
-    rates = _unique(row.rate for row in rows)
+    rates = distinct(row.rate for row in rows)
     return "\n".join(_table([row for row in rows if row.rate == rate], printed.get(rate)) for rate in rates)
 
 
 def _table(rows: Sequence[StereoRow], printed: tuple[float, float] | None = None) -> str:
     """The table of one rate."""
-    methods = _unique(row.method for row in rows)
+    methods = distinct(row.method for row in rows)
     scores = {(row.pair, row.method): f"{row.psnr:.2f} / {row.ssim:.4f}" for row in rows}
     means = {summary.method: _mean_cell(summary) for summary in summarise(rows)}
     columns = [f"beta reduced {rows[0].rate}x" if rows[0].rate > 1 else "beta as it is", *methods]
     lines = [
-        [pair, *(scores.get((pair, method), "") for method in methods)] for pair in _unique(row.pair for row in rows)
+        [pair, *(scores.get((pair, method), "") for method in methods)] for pair in distinct(row.pair for row in rows)
     ]
     lines.append(["**mean**", *(means[method] for method in methods)])
     if printed:
@@ -170,11 +162,11 @@ def depth_markdown(rows: Sequence[StereoRow]) -> str:
     known = [row for row in rows if row.end_point_error is not None]
     if not known:
         return ""
-    columns = [(m, r) for m in _unique(row.method for row in known) for r in _unique(row.rate for row in known)]
+    columns = [(m, r) for m in distinct(row.method for row in known) for r in distinct(row.rate for row in known)]
     groups = {key: [row for row in known if (row.method, row.rate) == key] for key in columns}
     lines = [
         [pair, *(_depth_cell([row for row in groups[key] if row.pair == pair]) for key in columns)]
-        for pair in _unique(row.pair for row in known)
+        for pair in distinct(row.pair for row in known)
     ]
     lines.append(["**mean**", *(_depth_cell(groups[key]) for key in columns)])
     return markdown_table(["depth", *(f"{method}, {rate}x" for method, rate in columns)], lines)
@@ -251,7 +243,3 @@ def _summary(rate: int, method: str, rows: Sequence[StereoRow]) -> StereoSummary
     psnrs = [row.psnr for row in rows]
     ssim = float(np.mean([row.ssim for row in rows]))
     return StereoSummary(rate, method, len(rows), float(np.mean(psnrs)), bootstrap_interval(psnrs), ssim)
-
-
-def _unique(items: Iterable[T]) -> list[T]:
-    return list(dict.fromkeys(items))

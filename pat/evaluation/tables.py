@@ -6,8 +6,16 @@ import csv
 import io
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from arraygeom.atomic import write_text
+
+T = TypeVar("T")
+
+
+def distinct(items: Iterable[T]) -> list[T]:
+    """Each once, in the order in which they first appear."""
+    return list(dict.fromkeys(items))
 
 
 def markdown_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, align: str = "lr") -> str:

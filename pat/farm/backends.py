@@ -13,9 +13,9 @@ from typing import Any, Literal, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW
-from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from pat.media.colour import linear_from_srgb
 from pat.support.schema import from_document
@@ -158,12 +158,8 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     far = min(far, FARTHEST * near)
     cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
     world_from_alpha = cameras[0].cam_from_world.inverse()
-    seen = [_batched(c, c.cam_from_world @ world_from_alpha) for c in cameras]
+    seen = [stack([c.replace(cam_from_world=c.cam_from_world @ world_from_alpha)]) for c in cameras]
     return RigBatch(seen, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64))
-
-
-def _batched(camera: Camera, pose: Pose) -> Camera:
-    return camera.replace(K=camera.K[None], cam_from_world=Pose(pose.R[None], pose.t[None]))
 
 
 def _bank(settings: LayeredSettings) -> PhotoBank:

@@ -13,7 +13,7 @@ import hashlib
 import json
 import re
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -24,21 +24,9 @@ from rich.console import Console
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from arraygeom import (
-    Curved,
-    Dense,
-    Epipolar,
-    EpipolarLine,
-    HomographyDisplacement,
-    Local,
-    NearestVoxels,
-    ReceptiveField,
-    Rectified,
-    Rig,
-    ThroughLenses,
-    Widened,
-)
+from arraygeom import ReceptiveField, Rig, ThroughLenses, Widened
 from arraygeom.atomic import sweep, write_text
+from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
 
@@ -66,13 +54,7 @@ INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 
 PLAN_FORMAT = "pat-batch 1"
-FIELD_CLASSES: dict[str, Callable[..., ReceptiveField]] = {
-    kind.__name__: kind
-    for kind in (
-        *(Curved, Dense, Epipolar, EpipolarLine, HomographyDisplacement),
-        *(Local, NearestVoxels, Rectified, ThroughLenses, Widened),
-    )
-}
+FIELD_CLASSES = {kind.__name__: kind for kind in (*FIELDS.values(), ThroughLenses, Widened)}
 
 
 @dataclass(frozen=True)
@@ -252,21 +234,19 @@ class Batch:
     def fusion(self) -> SequenceFusion:
         """The sequence, with the images that its frames have in common."""
         frames = {n: ImageFiles(files, self.rig, n, alpha=self.alpha) for n, files in self.files.items()}
-        options = {"max_memory": self.max_memory, "luminance": self.luminance}
+        rig, network = developed_rig(self.rig, self.files), _network(self.weights, self.precision)
         return SequenceFusion(
-            _network(self.weights, self.precision),
-            developed_rig(self.rig, self.files),
-            frames,
-            self.alpha,
-            self.speed,
-            self.field,
-            self.match_levels,
-            self.response,
-            self.align,
-            self.noise,
-            self.keep_alpha,
-            options,
+            network, rig, frames, self.alpha, self.speed, **self._of_both(), options=self._of_frames()
         )
+
+    def _of_both(self) -> dict[str, Any]:
+        """Options of `fuse` that are those of `SequenceFusion`, too."""
+        names = ("field", "match_levels", "response", "align", "noise", "keep_alpha")
+        return {name: getattr(self, name) for name in names}
+
+    def _of_frames(self) -> dict[str, Any]:
+        """Options of `fuse` that are the same in every frame of a sequence."""
+        return {"max_memory": self.max_memory, "luminance": self.luminance}
 
     def _key_file(self, key: KeyFrame) -> Path:
         return self.out / KEYS / f"{key.alpha:08d}.safetensors"
@@ -294,20 +274,9 @@ class Batch:
     def _frame(self, i: int) -> Frame:
         if not self.sequence:
             images = ViewFiles(self.rig, {n: files[i] for n, files in self.files.items()}, alpha=self.alpha)
-            return fuse(
-                _network(self.weights, self.precision),
-                images.developed,
-                images,
-                alpha=self.alpha,
-                field=self.field,
-                max_memory=self.max_memory,
-                match_levels=self.match_levels,
-                response=self.response,
-                align=self.align,
-                noise=self.noise,
-                keep_alpha=self.keep_alpha,
-                luminance=self.luminance,
-            )
+            network = _network(self.weights, self.precision)
+            options = self._of_both() | self._of_frames()
+            return fuse(network, images.developed, images, alpha=self.alpha, **options)
         fusion = self.fusion
         return fusion.alone(i) if self.alone else fusion.frame(i, fusion.timeline.key_frames(), self._fetch)
 

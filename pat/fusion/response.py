@@ -34,6 +34,7 @@ class ResponseSettings(NamedTuple):
         independent observations, in standard deviations) to be taken. In a scene of one hue several explain alpha.
     negative: standard deviation of negative weights.
     least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
+    equal: the error over the least one up to which a gamma explains alpha as well.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
     shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
@@ -48,6 +49,7 @@ class ResponseSettings(NamedTuple):
     unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
     negative: float = 0.05
     least_change: float = 0.01
+    equal: float = 1.1
     better: float = 0.8
     shading: tuple[float, float] = (0.08, 0.7)
     explained: float = 0.5
@@ -155,14 +157,17 @@ def fit(
             x, gamma, found, shading = even, other_gamma, other, tuple(slopes.tolist())
     if found.explained < settings.explained:
         return Response.rec601()
-    return _decided(x**gamma, y, gamma, found, settings)._replace(shading=shading)
+    return _decided(x**gamma, y, gamma, found, settings)[1]._replace(shading=shading)
 
 
 def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
-    """1, or the gamma that explains alpha clearly better."""
+    """1, or the gamma that explains alpha clearly better; of several the one with the most plausible response."""
     trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in GAMMAS}
-    gamma = min(trials, key=lambda g: trials[g].error)
-    gamma = gamma if trials[gamma].error <= settings.better * trials[1.0].error else 1.0
+    least = min(trial.error for trial in trials.values())
+    if least > settings.better * trials[1.0].error:
+        return 1.0, trials[1.0]
+    equal = [gamma for gamma, trial in trials.items() if trial.error <= settings.equal * least]
+    gamma = min(equal, key=lambda g: _decided(x**g, y, g, trials[g], settings)[0])
     return gamma, trials[gamma]
 
 
@@ -204,10 +209,11 @@ class _Fit(NamedTuple):
     explained: float
 
 
-def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> Response:
-    """The most plausible explanation of alpha: luma as it is, another gain, other weights of sum 1, or both.
+def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
+    """The most plausible of four explanations of alpha, and its misfit.
 
-    Several explain it where the scene has one hue. The least unlikely one is taken then, and of a gain little is asked.
+    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit, and what
+    each must gain to be taken decides.
     """
     rec601, usual = Response.rec601().weights, x.new_tensor(settings.usual)
     luma, grey, hues = rec601 @ x, usual @ x, CHANGES.T @ x
@@ -234,10 +240,10 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     if gamma == 1:
         trials.append((only_weights + settings.unlikely[1] + negative(weights), weights, 1.0))
         trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
-    _, chosen, exposure = min(trials, key=lambda trial: trial[0])
+    misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
     if exposure == 1 and float(((chosen - rec601) @ x).square().mean().sqrt()) < settings.least_change:
         chosen = rec601
-    return Response(chosen, exposure, gamma, found.explained)
+    return misfit, Response(chosen, exposure, gamma, found.explained)
 
 
 CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)

@@ -286,11 +286,6 @@ def brightness(beta: Tensor) -> Tensor:
     return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
 
 
-def hw_of(image: Tensor) -> tuple[int, int]:
-    """Height and width."""
-    return image.shape[-2], image.shape[-1]
-
-
 class ConfidenceHead(nn.Sequential):
     """The logits of confidence, choices and the better match at full size, computed at half of it."""
 

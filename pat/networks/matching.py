@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
+from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
-from ..support.threads import in_parallel
 from . import band_kernels as kernels
 from .semi_global import (
     CONSISTENT,

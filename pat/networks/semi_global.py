@@ -23,9 +23,9 @@ from torch.nn.functional import avg_pool2d, interpolate
 from arraygeom import Segments
 from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image, sample
+from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
-from ..support.threads import in_parallel
 from . import semi_global_kernels as kernels
 
 FINE = 2

@@ -5,8 +5,9 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Union
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -16,7 +17,7 @@ from ..support.schema import from_document
 from ..support.tensor_files import undamaged, write_tensors
 from .bandwise import BandwisePAT
 from .blocks import in_bfloat16
-from .configs import CONFIGS
+from .configs import CONFIGS, MODULES
 from .denoiser import DenoiserConfig, LowLightNetwork
 from .guided import GuidedPAT
 from .paper import PAT, AttentionEngine
@@ -25,7 +26,7 @@ SHIPPED = Path(__file__).parent / "shipped"
 DENOISER = Path(__file__).parent / "denoisers" / "low-light.safetensors"
 FORMAT = "pat-weights 1"
 NETWORKS: Mapping[str, tuple[Any, Any]] = {
-    made.__name__: (made, CONFIGS[made.__name__]) for made in (PAT, GuidedPAT, BandwisePAT)
+    name: (getattr(import_module(f"pat.networks.{MODULES[name]}"), name), kind) for name, kind in CONFIGS.items()
 }
 DENOISERS = {"LowLightNetwork": (LowLightNetwork, DenoiserConfig)}
 
@@ -33,7 +34,10 @@ LARGEST, MOST_ENTRIES = 1024, 16
 """Of the numbers in a configuration, and of a list of them. The largest shipped are 48 and 4."""
 MAY_BE_ZERO = ("head_dim",)
 
-Network = PAT | GuidedPAT | BandwisePAT
+if TYPE_CHECKING:
+    Network = PAT | GuidedPAT | BandwisePAT
+else:
+    Network = Union[tuple(network for network, _ in NETWORKS.values())]  # noqa: UP007
 Precision = Literal["float32", "bfloat16"]
 
 

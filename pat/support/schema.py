@@ -39,19 +39,24 @@ def from_document(kind: type[T], document: Any, entry: str = "") -> T:
 
 def read_yaml(path: str | Path) -> Any:
     """The content of a YAML file. Raises FileNotFoundError, and ValueError for a file that is not YAML."""
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    return parse_yaml(path.read_bytes(), str(path))
+
+
+def parse_yaml(text: str | bytes, name: str) -> Any:
+    """The content of a YAML text, UTF-8. Raises ValueError naming `name` and the line for one that is not YAML."""
     import yaml
 
     from arraygeom.safe_yaml import load_yaml, yaml_problem
 
-    path = Path(path)
-    if not path.is_file():
-        raise FileNotFoundError(f"{path}: no such file")
     try:
-        return load_yaml(path.read_text(encoding="utf-8"))
+        return load_yaml(text if isinstance(text, str) else text.decode("utf-8"))
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         line, problem = yaml_problem(error)
         at = f" at line {line}" if line else ""
-        raise ValueError(f"{path}: not valid YAML{at}: {problem}") from None
+        raise ValueError(f"{name}: not valid YAML{at}: {problem}") from None
 
 
 def near(name: object, known: Iterable[object]) -> str:

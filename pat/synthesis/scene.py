@@ -20,9 +20,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from arraygeom.atomic import write_text
-from arraygeom.safe_yaml import load_yaml
 
-from ..support.schema import from_document, to_document
+from ..support.schema import from_document, parse_yaml, to_document
 
 Vec3 = tuple[float, float, float]
 Shape = Literal["plane", "cube", "sphere", "cylinder", "cone", "torus", "lathe", "room"]
@@ -235,9 +234,9 @@ class Scene:
     def from_yaml(cls, text: str, source: str = "scene") -> Scene:
         """The scene of a file's text (YAML or JSON). Raises ValueError naming `source` and the entry."""
         try:
-            document = json.loads(text) if text.lstrip().startswith("{") else load_yaml(text)
-        except (yaml.YAMLError, json.JSONDecodeError, RecursionError) as error:
-            raise ValueError(f"{source}: not valid YAML: {str(error).splitlines()[0]}") from None
+            document = json.loads(text) if text.lstrip().startswith("{") else parse_yaml(text, source)
+        except (json.JSONDecodeError, RecursionError) as error:
+            raise ValueError(f"{source}: not valid JSON: {error}") from None
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise ValueError(f"{source}: not a scene file: its first line must be 'format: {FORMAT}'")
         try:

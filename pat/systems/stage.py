@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float
 from torch import Generator, Tensor
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Camera, Pose, Rig, stack
 from arraygeom.pose import matvec
 from pat.evaluation.ablation import sample_photographs
 from pat.synthesis.layered import LayeredScenes
@@ -58,7 +58,7 @@ class SystemScene(LayeredScenes):
         if not (isinstance(camera, Camera) and isinstance(alpha, Camera)):
             raise ValueError(f"'{name}' is not calibrated: a scene is rendered for calibrated cameras")
         pose = camera.cam_from_world @ alpha.cam_from_world.inverse()
-        return camera.replace(K=camera.K[None], cam_from_world=Pose(pose.R[None], pose.t[None]), distortion=None)
+        return stack([camera.replace(cam_from_world=pose, distortion=None)])
 
     @torch.no_grad()
     def seen(self, name: str, layers: Layers | None = None) -> RenderedView:

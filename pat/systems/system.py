@@ -142,17 +142,21 @@ def run_system(
     recording, files = recorded(system, rig, out / "inputs", scene=scene, photos=photos, say=say)
     say("fusing")
     run = _sequence if len(recording.ground_truth) > 1 else _still
-    how = FusionOptions(weights, max_memory, say)
-    lines, panels = run(how, system, rig, files, recording, out)
+    lines, panels = run(SystemRun(system, rig, files, recording, out, weights, max_memory, say))
     save_panels(panels, out / "figure.png", columns=4)
     table = "\n".join(lines) + "\n"
     write_text(out / "scores.md", table)
     return SystemResult(table, sorted(p for p in out.iterdir() if p.is_file()))
 
 
-class FusionOptions(NamedTuple):
-    """Weights, memory limit, progress callback."""
+class SystemRun(NamedTuple):
+    """A recorded system, and how it is fused: folder, weights, memory limit, progress callback."""
 
+    system: ArraySystem
+    rig: Rig
+    files: Mapping[str, list[Path]]
+    recording: SystemRecording
+    out: Path
     weights: str
     max_memory: str | None
     say: Callable[[str], None]
@@ -218,27 +222,19 @@ def write_recording(recording: SystemRecording, rig: Rig, out: Path) -> None:
 
 
 Panels = dict[str, Tensor]
-ImagePaths = Mapping[str, list[Path]]
 
 
-def _still(
-    how: FusionOptions,
-    system: ArraySystem,
-    rig: Rig,
-    files: Mapping[str, list[Path]],
-    recording: SystemRecording,
-    out: Path,
-) -> tuple[list[str], Panels]:
-    alpha, ground_truth = system.alpha, recording.ground_truth[0]
-    first = {name: paths[0] for name, paths in files.items()}
+def _still(job: SystemRun) -> tuple[list[str], Panels]:
+    rig, recording, out = job.rig, job.recording, job.out
+    alpha, ground_truth = job.system.alpha, recording.ground_truth[0]
+    first = {name: paths[0] for name, paths in job.files.items()}
     memory: list[str] = []
-    if how.max_memory is None:
-        read, images = read_views(rig, first, alpha=alpha)
-        frame = fuse(load_weights(how.weights), read, images, alpha=alpha)
+    if job.max_memory is not None:
+        frame, memory = fused_apart(job, first)
+    read, images = read_views(rig, first, alpha=alpha)
+    if job.max_memory is None:
+        frame = fuse(load_weights(job.weights), read, images, alpha=alpha)
         save_frame(frame, out, bits=16, view=view_of(read, alpha, bits=16))
-    else:
-        frame, memory = fused_apart(how, out / "inputs" / "rig.yaml", first, alpha, out)
-        read, images = read_views(rig, first, alpha=alpha)
     baseline = classical_baseline(read, images, alpha)
     if len(images) == 2:
         baseline = as_bright(baseline, images[alpha], read[alpha].sensor)
@@ -249,7 +245,7 @@ def _still(
         rows["fusion, exposures merged"] = merged_frame.image
         extra = [
             *_ranges(rig, recording, images, frame, merged_frame, alpha),
-            *_permuted(load_weights(how.weights), read, images, alpha, frame),
+            *_permuted(load_weights(job.weights), read, images, alpha, frame),
         ]
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
     white = 1.0 if not recording.light else float(ground_truth.max())
@@ -264,51 +260,43 @@ def _still(
     return [*_table(rows, ground_truth, white), *_confidence_line(frame, ground_truth), *extra, *memory], panels
 
 
-def fused_apart(
-    how: FusionOptions, rig: Path, files: Mapping[str, Path], alpha: str, out: Path
-) -> tuple[Frame, list[str]]:
+def fused_apart(job: SystemRun, files: Mapping[str, Path]) -> tuple[Frame, list[str]]:
     """A frame fused by `pat fuse` in a process of its own, and its memory and time, as lines of text."""
     images = [text for name, path in files.items() for text in ("--image", f"{name}={path}")]
-    command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", alpha, *images, "--out", str(out)]
-    command += ["--bits", "16", "--weights", how.weights, "--max-memory", str(how.max_memory)]
+    out, rig = job.out, job.out / "inputs" / "rig.yaml"
+    command = [sys.executable, "-m", "pat", "fuse", "--rig", str(rig), "--alpha", job.system.alpha, *images]
+    command += ["--out", str(out), "--bits", "16", "--weights", job.weights, "--max-memory", str(job.max_memory)]
     begin, planned = time.monotonic(), ""
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     most = watch_peak(process.pid)
     for line in process.stderr or ():
         planned = line.strip() if line.startswith("plan:") else planned
         if line.strip():
-            how.say(line.rstrip())
+            job.say(line.rstrip())
     _, status, used = os.wait4(process.pid, 0)
     if status:
         raise ValueError(f"fusing in a process of its own failed (wait status {status})")
     took = f"{time.monotonic() - begin:.0f} s, {used.ru_utime + used.ru_stime:.0f} s of a core"
-    peak = f"allowed {how.max_memory}, at most {most() / 2**30:.2f} GiB resident"
+    peak = f"allowed {job.max_memory}, at most {most() / 2**30:.2f} GiB resident"
     depth = torch.from_numpy(imread(out / "depth.tif")) if (out / "depth.tif").is_file() else None
     image, confidence = read_image(out / "fused.png"), read_image(out / "confidence.png")[0]
     depth = torch.full_like(confidence, torch.nan) if depth is None else depth
     return Frame(image, depth, confidence), ["", f"{planned}. Memory: {peak}. Time: {took}."]
 
 
-def _sequence(
-    how: FusionOptions,
-    system: ArraySystem,
-    rig: Rig,
-    files: Mapping[str, list[Path]],
-    recording: SystemRecording,
-    out: Path,
-) -> tuple[list[str], Panels]:
-    alpha, network = system.alpha, load_weights(how.weights)
-    frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in files.items()}
-    job = SequenceFusion(network, rig, frames, alpha, options={"max_memory": how.max_memory})
-    keys = job.timeline.key_frames()
-    colours = {key.alpha: job.colour(key) for key in keys}
-    fused = [job.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(recording.ground_truth))]
-    alone = [job.alone(i) for i in range(len(fused))]
+def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
+    alpha, rig, out, ground_truth = job.system.alpha, job.rig, job.out, job.recording.ground_truth
+    frames = {name: ImageFiles(paths, rig, name, alpha=alpha) for name, paths in job.files.items()}
+    fusion = SequenceFusion(load_weights(job.weights), rig, frames, alpha, options={"max_memory": job.max_memory})
+    keys = fusion.timeline.key_frames()
+    colours = {key.alpha: fusion.colour(key) for key in keys}
+    fused = [fusion.frame(i, keys, lambda key: colours[key.alpha]) for i in range(len(ground_truth))]
+    alone = [fusion.alone(i) for i in range(len(fused))]
     for i, frame in enumerate(fused):
         save_frame(frame, out / "frames", name=f"{i:03d}", view=view_of(rig, alpha, bits=8))
     write_video(out / "fused.mp4", [f.image for f in fused], rate=10)
-    greys = [job.grey(i) for i in range(len(fused))]
-    base = [classical_baseline(rig, _images(job, i), alpha) for i in range(len(fused))]
+    greys = [fusion.grey(i) for i in range(len(fused))]
+    base = [classical_baseline(rig, _images(fusion, i), alpha) for i in range(len(fused))]
     methods = {
         "alpha alone": [g.expand(3, -1, -1) for g in greys],
         "classical": base,
@@ -316,23 +304,23 @@ def _sequence(
         "fusion": [f.image for f in fused],
     }
     lines = [
-        *_sequence_table(methods, recording.ground_truth, greys),
-        *_confidence_line(fused[2], recording.ground_truth[2]),
+        *_sequence_table(methods, ground_truth, greys),
+        *_confidence_line(fused[2], ground_truth[2]),
     ]
     i = next(i for i in range(len(fused)) if i not in colours)
     first = next(name for name in rig.betas(alpha))
     panels = {
         f"alpha, frame {i}": greys[i],
         f"beta {first}": frames[first][0],
-        "ground truth": recording.ground_truth[i],
+        "ground truth": ground_truth[i],
     }
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
     panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
     return lines, panels
 
 
-def _images(job: SequenceFusion, i: int) -> dict[str, Tensor]:
-    return {job.alpha: job.grey(i), **{n: job.frames[n][j] for n, j in job.timeline.at(i).items()}}
+def _images(fusion: SequenceFusion, i: int) -> dict[str, Tensor]:
+    return {fusion.alpha: fusion.grey(i), **{n: fusion.frames[n][j] for n, j in fusion.timeline.at(i).items()}}
 
 
 def _table(rows: Mapping[str, Tensor], ground_truth: Tensor, white: float) -> list[str]:

@@ -6,19 +6,22 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, Union
 
 import tyro
 import yaml
 
 from pat.networks.configs import CONFIGS, BandwisePATConfig, GuidedPATConfig, PATConfig
-from pat.support.schema import from_document, near, to_document
+from pat.support.schema import from_document, near, parse_yaml, to_document
 from pat.synthesis.rig_distribution import RigDistribution
 
 RECIPES = Path(__file__).parent / "recipes"
 RECTIFIED = RigDistribution(mode="rectified", parallax=(6.0, 110.0))
 GENERAL = RigDistribution(mode="general", parallax=(6.0, 90.0), focal_ratio=(0.8, 1.25))
-NetworkConfig = GuidedPATConfig | PATConfig | BandwisePATConfig
+if TYPE_CHECKING:
+    NetworkConfig = GuidedPATConfig | PATConfig | BandwisePATConfig
+else:
+    NetworkConfig = Union[tuple(CONFIGS.values())]  # noqa: UP007
 FieldName = Literal["epipolar", "line", "homography", "rectified", "nearest", "local", "dense"]
 UNSEEN = ("out", "device", "save", "tensorboard", "cache")
 """Entries that may differ between a run and its continuation: samples and steps do not depend on them."""
@@ -163,12 +166,7 @@ def load_config(name: str | Path) -> TrainConfig:
 
 def parse_config(text: str, name: str = "config") -> TrainConfig:
     """A recipe from YAML text. Raises ValueError naming the entry."""
-    from arraygeom.safe_yaml import load_yaml
-
-    try:
-        values = load_yaml(text) or {}
-    except yaml.YAMLError as error:
-        raise ValueError(f"{name}: not YAML: {' '.join(str(error).split())}") from None
+    values = parse_yaml(text, name) or {}
     try:
         return _config(values)
     except ValueError as error:

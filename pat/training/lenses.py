@@ -11,7 +11,6 @@ from torch import Generator, Tensor
 from arraygeom.camera import Camera
 from arraygeom.distortion import BROWN_CONRADY, Distortion
 from arraygeom.pixels import pixel_grid
-from arraygeom.pose import Pose
 from arraygeom.sampling import Sampled
 from arraygeom.undistortion import resampled
 
@@ -35,7 +34,7 @@ def through_lenses(
 
     Where the lens saw nothing, up to the share `lost` on each side, an image repeats its edge and is not valid.
     """
-    pinholes = [one_camera(cameras, i) for i in range(len(images))]
+    pinholes = [cameras[i].to("cpu", torch.float64) for i in range(len(images))]
     lenses = [lens_over(pinhole, g, lost) for pinhole in pinholes]
     distorted = [
         resampled(p, pinhole, lens, extended=True).values for p, pinhole, lens in zip(images.cpu(), pinholes, lenses)
@@ -73,9 +72,3 @@ def filling(low: Float[Tensor, "2"], high: Float[Tensor, "2"], hw: tuple[int, in
     A[0, 0], A[1, 1] = scale
     A[:2, 2] = -scale * low - 0.5
     return A
-
-
-def one_camera(cameras: Camera, i: int) -> Camera:
-    """One of a batch, on the CPU, in float64."""
-    one = cameras.replace(K=cameras.K[i], cam_from_world=Pose(cameras.R[i], cameras.t[i]))
-    return one.to("cpu", torch.float64)

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Generator, Tensor, nn
-from torch.nn.functional import interpolate
 
 from arraygeom import Epipolar, sample
 from arraygeom.fields.grid import FieldOnGrid
@@ -22,7 +21,7 @@ from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
 
 from .config import GENERAL, RECTIFIED
-from .samples import pair_of
+from .samples import enlarged, pair_of
 
 HW = (128, 256)
 """Height and width of alpha in the scenes."""
@@ -100,7 +99,7 @@ class NoisyScenes:
         level = noise_levels(TOGETHER, g)
         second = level if int(torch.randint(2, (), generator=g)) else noise_levels(TOGETHER, g)
         alpha = _view(self.denoiser.band, luminance(ideal), level, g)
-        beta = NoisyView(*(_enlarged(part) for part in _view(self.denoiser.colour, other, second, g)))
+        beta = NoisyView(*(enlarged(part, HW) for part in _view(self.denoiser.colour, other, second, g)))
         field = FieldOnGrid.of(Epipolar(), pair_of(scene, 1, g))
         found = self.fusion(Inputs.of(alpha.denoised, [beta.denoised], [field]))
         where = found.position[0].movedim(1, -1).float()
@@ -126,9 +125,3 @@ def windows_of(groups: Sequence[Tensor], batch: int, side: int, g: Generator) ->
 def _view(denoiser: nn.Module, ideal: Tensor, level: NoiseLevel, g: Generator) -> NoisyView:
     recorded, deviation = noisy(ideal, level, g)
     return NoisyView(recorded, over_flips(denoiser, recorded, deviation), deviation)
-
-
-def _enlarged(image: Tensor) -> Tensor:
-    if image.shape[-2:] == HW:
-        return image
-    return interpolate(image, size=HW, mode="bicubic", align_corners=False).clamp(0, 1)

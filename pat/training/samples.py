@@ -16,21 +16,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Generator, Tensor
 from torch.nn.functional import interpolate
 
-from arraygeom import (
-    Camera,
-    Epipolar,
-    Pair,
-    Pose,
-    ReceptiveField,
-    pixel_grid,
-    rotation_from_vector,
-    sample,
-)
+from arraygeom import Camera, Epipolar, Pair, Pose, ReceptiveField, pixel_grid, rotation_from_vector, sample
 from arraygeom.fields import FIELDS, pinhole_track
 from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
 from pat.networks.protocol import Inputs
@@ -222,7 +215,7 @@ def degraded(
     for i, image in enumerate(images[1:], 1):
         band = image if alone else image[:, i - 1 : i]
         seen = recorded(band, cameras[i], g, recording, lost=LOST)
-        betas.append(_enlarged(seen.values, scene.cameras[0].hw))
+        betas.append(enlarged(seen.values, scene.cameras[0].hw))
         if alone and _chance(recording.paper, g):
             alpha, betas[0], _ = augment(alpha, betas[0], paper_cases(), g)
         pair = pair_of(scene, i, g)
@@ -315,7 +308,8 @@ def alone(given: Sample, i: int) -> Sample:
     return Sample(alpha, one(given.betas), on_grid, ground_truth, one(given.position), one(given.visible))
 
 
-def _enlarged(image: Tensor, hw: tuple[int, int]) -> Tensor:
+def enlarged(image: Float[Tensor, "b c hb wb"], hw: HW) -> Float[Tensor, "b c h w"]:
+    """An image enlarged to another one's size (bicubic)."""
     if image.shape[-2:] == hw:
         return image
     return interpolate(image, size=hw, mode="bicubic", align_corners=False).clamp(0, 1)

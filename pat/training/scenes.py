@@ -19,15 +19,7 @@ from arraygeom.batching import stack
 from arraygeom.camera import Camera
 from arraygeom.pixels import HW, pixel_grid
 from arraygeom.rig import Rig
-from pat.data.windows import (
-    RenderedView,
-    pinhole_of,
-    read_view,
-    scene_folders,
-    scene_rig,
-    undistorted,
-    window,
-)
+from pat.data.windows import RenderedView, pinhole_of, read_view, scene_folders, scene_rig, undistorted, window
 from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch

@@ -51,6 +51,6 @@ def two_cameras(R: Tensor | None = None, centre: tuple[float, float, float] = (0
     return Rig(cameras, depth=rig.get("depth", (1.0, 10.0)))
 
 
-def half_turn() -> Tensor:
+def half_rotation() -> Tensor:
     """Looking back: half a turn about y."""
     return rotation_from_vector(torch.tensor([0.0, math.pi, 0.0], dtype=torch.float64))

@@ -110,6 +110,6 @@ def test_the_approximation_is_differentiable_in_the_rig():
     assert torch.autograd.gradcheck(fitted, inputs, atol=1e-3, rtol=1e-2)
 
 
-def test_nothing_in_common_is_told():
+def test_nothing_in_common_is_said():
     with pytest.raises(ValueError, match="next to nothing"):
         approximated(two_cameras(centre=(0, 0, 30.0)).pair("alpha", "beta"))

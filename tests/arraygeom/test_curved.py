@@ -26,7 +26,7 @@ from arraygeom import (
 )
 from arraygeom.pixels import pixel_grid
 from tests.arraygeom import explicit
-from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
+from tests.arraygeom.rigs import half_rotation, random_rig, two_cameras, uniform
 
 FISHEYE = Distortion("kannala-brandt", torch.tensor([0.1, -0.05, 0.02, -0.004], dtype=torch.float64))
 BARREL = Distortion("brown-conrady", torch.tensor([-0.28, 0.07, 1e-3, -5e-4], dtype=torch.float64))
@@ -143,7 +143,7 @@ def test_gradients_in_every_parameter_lenses_included():
 @pytest.mark.parametrize("centre", [(0, 0, 0), (0, 0, 0.5), (0, 0, 5.0), (0.3, 0, 0)])
 @pytest.mark.parametrize("turned", [False, True])
 def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
-    rig = two_cameras(half_turn() if turned else None, centre=centre, depth=(1.0, float("inf")))
+    rig = two_cameras(half_rotation() if turned else None, centre=centre, depth=(1.0, float("inf")))
     rig = with_lenses(rig, lens, lens)
     changes = rig.parameters(free=["*.rotation", "*.translation", "*.focal", "*.centre", "depth.near"])
     for dtype in (torch.float32, torch.float64):
@@ -155,7 +155,7 @@ def test_degenerate_rigs_give_finite_values_and_gradients(lens, centre, turned):
         assert all(s is None or s.isfinite().all() for s in slopes)
 
 
-def test_identical_cameras_look_at_the_same_pixel():
+def test_identical_cameras_sample_the_same_pixel():
     rig = with_lenses(two_cameras(), FISHEYE, FISHEYE)
     x = pixel_grid((48, 64))
     p = sampling_locations(Curved(8), rig.pair("alpha", "beta"))

@@ -29,7 +29,7 @@ from arraygeom import (
 from arraygeom.fields import covering_displacement
 from arraygeom.homography import apply_homography
 from arraygeom.pixels import pixel_grid
-from tests.arraygeom.rigs import half_turn, random_rig, two_cameras, uniform
+from tests.arraygeom.rigs import half_rotation, random_rig, two_cameras, uniform
 
 STRAIGHT = [Epipolar(), EpipolarLine(), HomographyDisplacement(8.0), HomographyDisplacement()]
 ALL = [*STRAIGHT, Rectified(20.0), NearestVoxels(24, 12), Local(3), Dense(4)]
@@ -156,7 +156,7 @@ def test_epipolar_is_rectified_on_a_rectified_pair():
     torch.testing.assert_close(a.end, b.end, atol=1e-4, rtol=0)
 
 
-def test_local_and_dense_look_where_they_say():
+def test_local_and_dense_sample_where_they_say():
     pair = by_link(pair_of(random_rig(1)))
     x = torch.tensor([[30.0, 20.0]], dtype=torch.float64)
     local = Local(3)(pair, x)
@@ -335,11 +335,11 @@ DEGENERATE = {
     "epipole inside": two_cameras(centre=(0, 0, 0.5)),
     "epipole on a pixel": two_cameras(centre=(0.5 / 32, 0.5 / 32, 1.0)),
     "beta behind": two_cameras(centre=(0, 0, -2.0), depth=(0.5, INFINITE)),
-    "opposing": two_cameras(half_turn(), centre=(0.1, 0, 5.0)),
-    "opposing on the axis": two_cameras(half_turn(), centre=(0, 0, 5.0)),
+    "opposing": two_cameras(half_rotation(), centre=(0.1, 0, 5.0)),
+    "opposing on the axis": two_cameras(half_rotation(), centre=(0, 0, 5.0)),
     "beta beyond the scene": two_cameras(centre=(0, 0, 20.0)),
     "beta among the scene": two_cameras(centre=(0.2, 0, 3.0), depth=(0.5, INFINITE)),
-    "looking away": two_cameras(half_turn()),
+    "looking away": two_cameras(half_rotation()),
     "sideways": two_cameras(rotation_from_vector(torch.tensor([0.0, 1.4, 0], dtype=torch.float64)), centre=(1.0, 0, 1)),
     "far is infinite": two_cameras(centre=(0.3, 0.1, 0), depth=(0.5, INFINITE)),
 }
@@ -365,14 +365,14 @@ def segments_of(case: str) -> Segments:
     return sampling_locations(Epipolar(), pair_of(DEGENERATE[case]))
 
 
-def test_identical_cameras_look_at_the_same_pixel():
+def test_identical_cameras_sample_the_same_pixel():
     s = segments_of("identical cameras to infinity")
     assert s.valid.all()
     torch.testing.assert_close(s.start, pixel_grid((48, 64)), atol=1e-4, rtol=0)
     assert s.length.max() < 1e-4
 
 
-def test_pure_rotation_looks_at_a_point():
+def test_pure_rotation_samples_a_point():
     rig = DEGENERATE["pure rotation"]
     s = segments_of("pure rotation")
     assert s.length.max() < 1e-4
@@ -382,7 +382,7 @@ def test_pure_rotation_looks_at_a_point():
     torch.testing.assert_close(s.start[inside], seen.x[inside].float(), atol=1e-3, rtol=0)
 
 
-def test_near_is_far_looks_at_a_point_of_that_plane():
+def test_near_is_far_samples_a_point_of_that_plane():
     rig = DEGENERATE["near is far"]
     s = segments_of("near is far")
     plane = torch.full((48, 64), 2.0, dtype=torch.float64)
@@ -392,12 +392,12 @@ def test_near_is_far_looks_at_a_point_of_that_plane():
     assert s.length.max() < 1e-4
 
 
-def test_nothing_behind_beta_is_looked_at():
+def test_nothing_behind_beta_is_sampled():
     assert not segments_of("beta beyond the scene").valid.any()
     assert not segments_of("looking away").valid.any()
 
 
-def test_forward_motion_looks_outward_from_the_epipole():
+def test_forward_motion_has_segments_outward_from_the_epipole():
     s = segments_of("epipole inside")
     epipole = torch.tensor([31.5, 23.5])
     near, far = ((e - epipole).norm(dim=-1) for e in (s.start, s.end))
@@ -424,7 +424,7 @@ def disturbed(rig: Rig, case: int, g: torch.Generator) -> Rig:
     """One of the degenerate kinds, on a random rig."""
     a, b = rig["alpha"], rig["beta"]
     same_place = Pose.from_centre(b.R, a.centre)
-    facing = Pose.from_centre(half_turn() @ a.R, a.centre + a.R[2] * float(uniform(g, 1, 6)))
+    facing = Pose.from_centre(half_rotation() @ a.R, a.centre + a.R[2] * float(uniform(g, 1, 6)))
     ahead = Pose.from_centre(a.R, a.centre + a.R[2] * float(uniform(g, -3, 3)))
     near = float(uniform(g, 0.3, 3))
     return [
@@ -446,7 +446,7 @@ def larger(rig: Rig, margin: float) -> Pair:
     return pair_of(rig.transformed("beta", torch.tensor(A, dtype=torch.float64), (h, w)))
 
 
-def sure_of(exact: Segments, hw: tuple[int, int]) -> torch.Tensor:
+def not_grazing(exact: Segments, hw: tuple[int, int]) -> torch.Tensor:
     """Segments that no edge cuts while running along it, where rounding moves ends far."""
     limits = exact.start.new_tensor([[-0.5, hw[1] - 0.5], [-0.5, hw[0] - 0.5]])
     on_edge = [((e[..., None] - limits).abs() < 1e-6).any(-1) for e in (exact.start, exact.end)]
@@ -467,13 +467,13 @@ def test_float32_agrees_with_float64_on_a_thousand_rigs(seed, turn):
     assert quick.end.isfinite().all()
     assert roomy[quick.valid].all()
     assert quick.valid[tight].all()
-    compared = exact.valid & quick.valid & sure_of(exact, rig["beta"].hw)
+    compared = exact.valid & quick.valid & not_grazing(exact, rig["beta"].hw)
     for a, b in ((exact.start, quick.start), (exact.end, quick.end)):
         assert (a - b)[compared].abs().max() < 0.02
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_epipole_itself_looks_at_one_point(dtype):
+def test_the_epipole_itself_samples_one_point(dtype):
     """The ray through beta's centre: 0/0 there, and the same pixel on the way to it."""
     s = Epipolar()(pair_of(DEGENERATE["opposing"]), torch.tensor([[31.5 + 0.1 / 5 * 32, 23.5]], dtype=dtype))
     assert s.valid.tolist() == [True]

@@ -273,7 +273,7 @@ def test_kalibr_keeps_time_offsets_and_a_world_at_camera_0(tmp_path):
     assert_same(rig["b"], again["cam1"])
 
 
-def test_quaternions_of_half_turns(tmp_path):
+def test_quaternions_of_rotations_by_180_degrees(tmp_path):
     """Rotations by 180 degrees, where the scalar is 0 and any of the others may be the largest."""
     axes = torch.eye(3, dtype=torch.float64)
     turns = [camera(i).replace(cam_from_world=Pose(2 * a[:, None] * a - axes, a)) for i, a in enumerate(axes)]
@@ -580,13 +580,19 @@ def test_wrong_facts_of_a_sensor_are_named(tmp_path, entry, message):
         Rig.load(tmp_path / "rig.yaml")
 
 
+def test_rotation_vectors_are_in_degrees(tmp_path):
+    (tmp_path / "rig.yaml").write_text("cameras:\n  a: {size: [6, 4], focal: 5, rotation: [0, 0, 90]}\n")
+    expected = torch.tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+    torch.testing.assert_close(Rig.load(tmp_path / "rig.yaml")["a"].R, expected)
+
+
 def test_a_size_that_is_missing_is_called_missing(tmp_path):
     (tmp_path / "rig.yaml").write_text("format: arraygeom-rig 1\ncameras: {mono: {focal: 800}}\n")
     with pytest.raises(RigFileError, match=r"cameras\.mono\.size: is missing"):
         Rig.load(tmp_path / "rig.yaml")
 
 
-def test_a_image_turned_upside_down_survives_the_native_file(tmp_path):
+def test_an_image_upside_down_survives_the_native_file(tmp_path):
     """Its K has negative focal lengths, which `focal` cannot state."""
     K = intrinsics(300.0, (240, 320))
     rig = Rig({"a": Camera(K=K, cam_from_world=Pose.identity(), hw=(240, 320))}).rot90("a", 2)

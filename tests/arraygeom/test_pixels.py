@@ -21,7 +21,7 @@ def moved(A: torch.Tensor, x: float, y: float) -> torch.Tensor:
 
 
 @pytest.mark.parametrize("k", range(-1, 5))
-def test_turning_follows_the_actual_pixels(k):
+def test_rotating_follows_the_actual_pixels(k):
     image = blob((40, 60), 21.3, 14.7)
     turned = torch.rot90(image, k, (-2, -1))
     torch.testing.assert_close(centroid(turned), moved(rot90_matrix((40, 60), k), 21.3, 14.7), atol=1e-6, rtol=0)

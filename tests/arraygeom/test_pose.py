@@ -85,7 +85,7 @@ def test_gradients():
     assert torch.autograd.gradgradcheck(rotation_from_vector, w)
 
 
-def test_rotation_error_tells_reflections_and_scales():
+def test_rotation_error_shows_reflections_and_scales():
     R = random_pose(5).R
     assert rotation_error(R) < 1e-12
     assert rotation_error(1.01 * R) == pytest.approx(0.0201, abs=1e-6)

@@ -99,6 +99,6 @@ def test_rotations_there_and_back():
     torch.testing.assert_close(rotation_to(a, b) @ a, b)
 
 
-def test_what_cannot_be_rectified_is_told():
+def test_what_cannot_be_rectified_is_refused():
     with pytest.raises(ValueError, match="no baseline"):
         rectify(two_cameras().pair("alpha", "beta"))

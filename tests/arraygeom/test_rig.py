@@ -61,7 +61,7 @@ def test_what_is_not_free_stays_bit_identical():
 
 
 @pytest.mark.parametrize("turns", range(4))
-def test_focal_lengths_of_turned_images(turns):
+def test_focal_lengths_of_rotated_images(turns):
     """Changing the focal length and turning commute."""
     rig = random_rig(0)
     change = {"beta.focal": torch.tensor([1.0, 2.0], dtype=torch.float64)}
@@ -94,7 +94,7 @@ def test_patterns_choose_parameters():
     assert all(v.requires_grad and not v.any() for v in rig.parameters(free=["*"]).values())
 
 
-def test_wrong_names_are_told():
+def test_wrong_names_are_refused():
     rig = random_rig(0)
     with pytest.raises(ValueError, match="did you mean 'beta'"):
         rig["bta"]

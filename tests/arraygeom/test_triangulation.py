@@ -62,7 +62,7 @@ def test_with_noise_it_is_nearly_the_least_reprojection_error():
         assert np.linalg.norm(found.X[i].numpy() - best) < 0.6 * sigma
 
 
-def test_the_covariance_is_the_spread():
+def test_the_covariance_is_that_of_the_points():
     cameras = array_of(4)
     _, x = seen_points(cameras, 3)
     g = torch.Generator().manual_seed(2)
@@ -109,7 +109,7 @@ def test_gradients():
     assert torch.autograd.gradcheck(points, [x.requires_grad_(), cameras[0].t.clone().requires_grad_()], atol=1e-5)
 
 
-def test_wrong_numbers_of_views_are_told():
+def test_wrong_numbers_of_views_are_refused():
     with pytest.raises(ValueError, match=">= 2 cameras"):
         triangulate(array_of(1), torch.zeros(1, 2, 2))
 

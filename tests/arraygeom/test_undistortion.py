@@ -67,7 +67,7 @@ def test_all_is_kept_up_to_the_widest_angle_and_the_middle_keeps_its_size():
     assert view.hw[1] < 2 * 55 * math.tan(math.radians(60)) + 3
 
 
-def test_a_turned_camera_in_the_same_place_sees_what_is_turned():
+def test_a_rotated_co_located_camera_sees_a_rotated_image():
     c = camera("brown-conrady")
     turned = c.replace(K=c.K, cam_from_world=Pose(torch.eye(3).double(), c.t), distortion=None)
     X = c.cam_from_world.inverse().apply(torch.tensor([[0.1, -0.2, 3.0]]).double())

@@ -48,7 +48,7 @@ def test_pixels_beyond_the_lens_are_moved_inside():
     assert np.isfinite(border).all()
 
 
-def test_fields_are_drawn_where_they_look():
+def test_fields_are_drawn_at_their_sampling_locations():
     rig = random_rig(1)
     figure = viz.draw_fields(rig, "alpha", X, images={"alpha": torch.rand(3, 48, 64), "beta": np.zeros((40, 60))})
     assert len(png(figure)) > 1000

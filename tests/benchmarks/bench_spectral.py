@@ -17,7 +17,7 @@ import torch
 import tyro
 from torch import Generator, Tensor
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Rig
 from pat.evaluation.baseline import classical, classical_baseline
 from pat.evaluation.metrics import score
 from pat.evaluation.tables import markdown_header, markdown_row
@@ -65,7 +65,7 @@ def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str,
         made = scenes.sample(1, g)
         spectra = Spectra.drawn(1, random, g) if random else None
         seen = [spectra.of(image) if spectra else image for image in made.images]
-        cameras = [_single(camera) for camera in made.cameras]
+        cameras = [camera[0].to(torch.float64) for camera in made.cameras]
         count = random or 3
         at = {f"band {i}": 1 + i % places for i in range(count)}
         images = {"alpha": luminance(made.images[0])} | {
@@ -75,12 +75,6 @@ def cases(args: Args, places: int, random: int) -> Iterator[tuple[Rig, dict[str,
         rig = Rig({"alpha": cameras[0]} | {name: cameras[place] for name, place in at.items()}, depth=(near, far))
         steps = [Noise(8000, 3), Clip(), Quantise(8)]
         yield rig, {name: record(p, steps, g).image[0] for name, p in images.items()}, seen[0][0]
-
-
-def _single(camera: Camera) -> Camera:
-    """The only camera of a batch of one."""
-    pose = Pose(camera.R[0].double(), camera.t[0].double())
-    return camera.replace(K=camera.K[0].double(), cam_from_world=pose)
 
 
 def baseline(rig: Rig, images: dict[str, Tensor], places: int, random: int) -> Tensor:

@@ -134,6 +134,7 @@ def instruction(result):
     the arguments. Arguments annotated `index` are 64-bit; those annotated `literal` are numbers at compile time."""
 
     def decorate(emit):
+        """numba's intrinsic of the function's name, typed by its annotations."""
         _, *parameters = inspect.signature(inspect.unwrap(emit)).parameters.values()
         notes = [str(parameter.annotation) for parameter in parameters]
 

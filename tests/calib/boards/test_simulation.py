@@ -58,7 +58,7 @@ def test_boards_are_tilted_and_at_several_depths(rig):
     assert torch.equal(boards.t, again.t)
 
 
-def test_cameras_that_look_apart_are_told(rig):
+def test_cameras_with_no_common_view_are_named(rig):
     apart = Rig({"a": rig["a"], "b": camera(260.0, (220, 300), (5.0, 0, 0), (0, 170, 0))})
     with pytest.raises(ValueError, match=r"the cameras see the board charuco:7x5:60mm.* together almost nowhere"):
         board_poses(apart, BOARD, 3)

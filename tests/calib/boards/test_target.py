@@ -72,7 +72,7 @@ def test_wrong_names_are_explained(text, message):
         ("acircles:4x11:20mm", 1),
     ],
 )
-def test_symmetries_are_turns_of_the_points(text, count):
+def test_symmetries_are_rotations_of_the_points(text, count):
     board = parse_board(text)
     assert len(board.symmetries) == count
     assert (board.symmetries[0] == np.arange(len(board.points))).all()

@@ -136,7 +136,7 @@ def test_drift_is_no_mistake():
     assert found.before.misfit > 0.5
 
 
-def test_what_cannot_be_told_apart_is_said():
+def test_what_cannot_be_distinguished_is_said():
     """Equal cameras side by side: an inverted pose is the same as images swapped."""
     rig = rectified_pair()
     found = diagnose_matches(each(posed(Pose.inverse))(rig), sizes(rig), seen_points(rig))
@@ -168,7 +168,7 @@ def test_images_of_another_size(hw, kind):
     assert found.after.misfit < 0.1
 
 
-def test_images_tell_a_mirrored_one():
+def test_a_mirrored_image_is_found():
     rig, images = rectified_pair(), rectified_images()
     assert diagnose(rig, images).healthy
     found = diagnose(rig, images | {"right": images["right"].flip(-2)})

@@ -71,7 +71,7 @@ def median(rig: Rig, points: dict[tuple[str, str], Matches]) -> float:
     return float(line_distances(rig, points).abs().median())
 
 
-def test_lines_that_bend_are_followed(tmp_path):
+def test_distorted_lines_are_followed(tmp_path):
     exact = matches(pair(-0.25), noise=0.0, wrong=False)
     _, rig, found = found_by_points()
     assert found.accepted

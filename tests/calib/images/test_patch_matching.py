@@ -55,7 +55,7 @@ def test_matches_are_better_for_it():
     assert np.median(off) < 0.08
 
 
-def test_deviations_tell_good_points_from_bad_ones():
+def test_deviations_distinguish_good_points_from_bad_ones():
     """Points without texture have large ones, those that nothing fits infinite ones; others are as off as they say."""
     alpha, beta = warped()
     flat = [np.where(np.arange(320) < 160, p, (p * 0.04 + 120).astype(np.uint8)) for p in (alpha, beta)]

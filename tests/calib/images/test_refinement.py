@@ -128,7 +128,7 @@ def test_several_frames_hold_a_whole_one_out():
     assert found.accepted
 
 
-def test_what_images_cannot_tell_is_unobservable_and_named():
+def test_what_images_do_not_determine_is_unobservable_and_named():
     """Side by side and alike, a shift of both principal points along the rows moves no line."""
     rig = rectified_pair()
     bad = rig.perturbed({"right.rotation": vector(0.003, 0, 0.004)})

@@ -45,7 +45,7 @@ def test_refuses_what_does_not_fit(change, error, text):
         ((0, 0), 4, TypeError, "Segments"),
     ],
 )
-def test_refuses_a_look_that_does_not_fit(look, samples, error, text):
+def test_refuses_sampling_locations_that_do_not_fit(look, samples, error, text):
     with pytest.raises(error, match=text):
         operator._form(look, Q, samples)
 

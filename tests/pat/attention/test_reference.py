@@ -68,9 +68,9 @@ def test_a_row_of_samples_is_textbook_parallax_attention(backend):
 def test_border_pixels_reach_half_a_pixel_out():
     key = value = torch.arange(3.0).view(1, 1, 1, 3) + 1
     x = torch.tensor([-0.502, -0.4995, 2.4995, 2.502])
-    look = Positions(torch.stack([x, 0 * x], -1)[None, :, None], torch.ones(1, 4, 1, dtype=torch.bool))
+    field = Positions(torch.stack([x, 0 * x], -1)[None, :, None], torch.ones(1, 4, 1, dtype=torch.bool))
     for interpolation in ("bilinear", "nearest"):
-        out = attend(torch.ones(1, 1, 1, 4), key, value, look, interpolation=interpolation, backend="reference")
+        out = attend(torch.ones(1, 1, 1, 4), key, value, field, interpolation=interpolation, backend="reference")
         assert out.flatten().tolist() == [0, 1, 3, 0]
 
 
@@ -110,7 +110,7 @@ def test_a_function_asked_in_chunks_equals_the_whole(monkeypatch, backend, expli
     scale = torch.tensor(0.8, dtype=torch.float64, requires_grad=True)
     bias = torch.randn(6, 1, 4, dtype=torch.float64)
 
-    def look(x_alpha):
+    def field(x_alpha):
         segments = Segments(x_alpha * scale, x_alpha * scale + 1.7, x_alpha[:, 0] > 0)
         return segments.positions(4) if explicit else segments
 
@@ -119,7 +119,7 @@ def test_a_function_asked_in_chunks_equals_the_whole(monkeypatch, backend, expli
     expected = attend(q, key, value, at_once, samples=4, bias=bias, backend="reference")
     monkeypatch.setattr(importlib.import_module("pat.attention.attend"), "CHUNK_SAMPLES", 60)
     monkeypatch.setattr(importlib.import_module("pat.attention.attend"), "CHUNK_PIXELS", 20)
-    out = attend(q, key, value, look, samples=4, bias=bias, backend=backend)
+    out = attend(q, key, value, field, samples=4, bias=bias, backend=backend)
     torch.testing.assert_close(out, expected)
     inputs = (q, key, value, scale)
     for a, b in zip(

@@ -154,7 +154,7 @@ def test_show_draws_the_rig_and_its_fields(small):
     assert (small / "again" / "fields.png").is_file()
 
 
-def test_rig_info_tells_the_numbers(small, capsys):
+def test_rig_info_prints_the_numbers(small, capsys):
     main(["rig", "info", str(small / "rig.yaml"), "--depth", "2", "8"])
     text = " ".join(capsys.readouterr().out.split())
     assert "128x96" in text

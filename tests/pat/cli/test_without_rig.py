@@ -41,7 +41,9 @@ def folder(halved, tmp_path_factory):
     folder = tmp_path_factory.mktemp("without_rig")
     for name, image in halved[1].items():
         write_image(folder / f"{name}.png", image)
-    main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("pat.cli.from_images.MATCHED", 300)  # the images are larger, as photographs are than 1600
+        main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
     return folder
 
 

@@ -7,7 +7,14 @@ import torch
 
 from pat.data.pairs import Disparity, StereoPair
 from pat.evaluation import conditions
-from pat.evaluation.conditions import CONDITIONS, ConditionRow, conditions_markdown, evaluate_conditions, regions_of
+from pat.evaluation.conditions import (
+    CONDITIONS,
+    ConditionRow,
+    conditions_markdown,
+    depth_errors,
+    evaluate_conditions,
+    regions_of,
+)
 from pat.evaluation.halves import of_half
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
@@ -23,7 +30,7 @@ def pair(name="pair", hw=(64, 96), disparity=8):
     return StereoPair(name, left, right, 16.0, truth)
 
 
-def test_halves_are_told_apart_by_whole_parts_of_names():
+def test_halves_are_distinguished_by_whole_parts_of_names():
     names = ["2006_third/Wood1", "2006_third/Wood2", "2005_half/Bowling1x", "train/0001", "x/2006_third/Cloth1"]
     pairs = [pair(name) for name in names]
     assert [p.name for p in of_half(pairs, "tune")] == ["2006_third/Wood1", "train/0001", "x/2006_third/Cloth1"]
@@ -36,7 +43,7 @@ def test_rows_are_moved_down():
     torch.testing.assert_close(moved[:, 10:60], pair().right[:, 7:57], atol=1e-5, rtol=0)
 
 
-def test_alpha_weighs_the_truth_and_the_truth_is_as_it_was():
+def test_alpha_weighs_the_ground_truth_which_stays_as_it_was():
     p = pair()
     task, noise = CONDITIONS["alpha = .2/.4/.4"].recorded(p)
     torch.testing.assert_close(task.alpha, luminance(p.left, (0.2, 0.4, 0.4)))
@@ -82,6 +89,16 @@ def test_every_method_is_scored_under_every_condition(tmp_path):
     assert "OpenCV's SGBM" in text
     conditions.save_condition_curves(rows, tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_shares_within_a_pixel_are_of_all_and_of_what_beta_sees():
+    truth = Disparity(torch.full((4, 10), 3.0), (torch.arange(10) > 0).expand(4, 10))
+    found = torch.where(torch.arange(10) < 5, truth.value, 9.0)
+    found[:, 1] = torch.nan
+    seen = truth.valid & (torch.arange(10) < 5)
+    error, shares = depth_errors(found, truth, {"seen": seen})
+    assert (error, *shares) == pytest.approx((30 / 8, 12 / 36, 12 / 16))
+    assert depth_errors(None, truth, {"seen": seen}) == (None, None)
 
 
 def test_gains_are_of_the_same_pairs():

@@ -24,7 +24,7 @@ def test_reducing_keeps_the_centre_convention(rate, x):
     assert edge_position(reduce_by(edge(24, x), rate)) == pytest.approx((x + 0.5) / rate - 0.5)
 
 
-def test_a_task_is_grey_alpha_small_colour_beta_and_colour_truth():
+def test_a_task_is_grey_alpha_small_colour_beta_and_colour_ground_truth():
     pair = StereoPair("a", torch.rand(3, 13, 22), torch.rand(3, 13, 22))
     alpha, beta, ground_truth = mono_colour_task(pair, 4)
     torch.testing.assert_close(ground_truth, pair.left[:, :12, :20])

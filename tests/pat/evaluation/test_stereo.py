@@ -41,12 +41,12 @@ def test_rows_are_the_scores_of_what_the_method_returns():
 
 
 def test_a_method_gets_the_protocols_inputs():
-    def look(alpha, beta, max_disparity):
+    def noted(alpha, beta, max_disparity):
         seen.append((tuple(alpha.shape), tuple(beta.shape), max_disparity))
         return alpha.expand(3, -1, -1)
 
     seen = []
-    evaluate_pairs(pairs(1), {"look": look}, [2, 4])
+    evaluate_pairs(pairs(1), {"noted": noted}, [2, 4])
     assert seen == [((1, 16, 24), (3, 8, 12), 120), ((1, 16, 24), (3, 4, 6), 120)]
 
 
@@ -223,7 +223,7 @@ class Onlooker:
         return FusionOutput(alpha.expand(-1, 3, -1, -1), [torch.stack([none, none], 1)], [none], [none])
 
 
-def test_fusion_looks_along_the_row_in_alphas_pixels():
+def test_fusion_samples_along_the_row_in_alphas_pixels():
     network, (pair,) = Onlooker(), pairs(1)
     rows = evaluate_pairs(
         [pair], {"fusion": rectified_fusion(network), "alpha": BASELINES["alpha"]}, [2], max_disparity=9

@@ -288,7 +288,7 @@ def test_a_click_takes_less_than_a_tenth_of_a_second(page):
     assert min(times) < bound(100, slower)
 
 
-def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_told(page, tmp_path):
+def test_the_rig_is_drawn_in_space_and_what_was_chosen_is_shown(page, tmp_path):
     click(page, 320, 210)
     facts = page.execute_script(SCRIPT + "return [...doc._all_models.values()].map(m => m.text || '').join(' ')")
     assert "pixel (320, 2" in facts.replace("&lt;", "<")

@@ -101,7 +101,7 @@ def test_near_far_and_displacement_are_the_fields(scene, sample):
         torch.testing.assert_close(ends, torch.cat([found.start, found.end]))
 
 
-def test_a_turned_camera_moves_the_segment_as_the_rig_says(scene, sample):
+def test_a_rotated_camera_moves_the_segment_as_the_rig_says(scene, sample):
     step = (0.0, math.radians(0.3), 0.0)
     report = inspect_pixel(scene, state(changes={"colour.rotation": step}))
     turned = sample.rig.perturbed({"colour.rotation": torch.tensor(step, dtype=torch.float64)})
@@ -136,7 +136,7 @@ def test_cameras_known_by_F_or_by_size_alone(sample):
     assert "calibrat" in problem
 
 
-def test_what_cannot_be_is_told(scene, sample):
+def test_what_cannot_be_is_said(scene, sample):
     with pytest.raises(ValueError, match="near"):
         inspect_pixel(scene, state(near=30.0))
     with pytest.raises(ValueError, match="64x40, the rig says 640x400"):

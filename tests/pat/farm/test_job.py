@@ -179,7 +179,7 @@ def test_a_disk_that_fills_stops_the_job_cleanly(config, tmp_path, monkeypatch):
     assert (tmp_path / "data" / "scenes.jsonl").read_text() == ""
 
 
-def test_a_worker_reads_its_job_and_tells_what_goes_wrong(config, tmp_path, monkeypatch):
+def test_a_worker_reads_its_job_and_reports_what_goes_wrong(config, tmp_path, monkeypatch):
     write(config, check={"texture": 1.1})
     job = Job(config=RenderConfig.load(config), root=tmp_path / "data", tag="1of1")
     job.root.mkdir()

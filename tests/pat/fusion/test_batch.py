@@ -18,6 +18,7 @@ from arraygeom.io.native import write as rig_text
 from pat.cli.main import main
 from pat.fusion.batch import KEYS, PLAN, Batch, find_images, fuse_one
 from pat.fusion.checks import LowConfidenceWarning
+from pat.fusion.results import Frame
 from pat.media.images import read_image, write_image
 from pat.media.raw import LIGHT
 from pat.networks.configs import GuidedPATConfig
@@ -262,7 +263,7 @@ def test_a_plan_comes_back_exactly(material, tmp_path, field):
     assert replace(again, rig=job.rig) == job
 
 
-@pytest.mark.parametrize("noise", ["estimate", {"fast": NoiseLevel.of_electrons(200.0, 2.0)}])
+@pytest.mark.parametrize("noise", ["estimate", {"fast": NoiseLevel.of_electrons(200.0, 2.0, "values")}])
 def test_noise_and_luminance_are_planned_and_among_the_settings(material, tmp_path, noise):
     job = batch(material, tmp_path, noise=noise, keep_alpha=True)
     again = Batch.from_json(job.to_json())
@@ -273,6 +274,25 @@ def test_noise_and_luminance_are_planned_and_among_the_settings(material, tmp_pa
         batch(material, tmp_path, luminance="mix"),
     )
     assert len({job.settings, *(b.settings for b in other)}) == 4
+
+
+def test_options_reach_the_fusion_of_frames_and_of_sequences(material, tmp_path, monkeypatch):
+    options = {
+        **{"field": Epipolar(), "match_levels": True, "response": "rec601", "align": False, "noise": "estimate"},
+        **{"keep_alpha": True, "luminance": "mix", "max_memory": "2GiB"},
+    }
+    given = {}
+
+    def fuse(*_, **further):
+        given.update(further)
+        return Frame(torch.zeros(3, 1, 1), torch.zeros(1, 1), torch.zeros(1, 1))
+
+    monkeypatch.setattr("pat.fusion.batch.fuse", fuse)
+    batch(material, tmp_path, **options)._frame(0)
+    assert given == options | {"alpha": "fast"}
+    fusion = batch(material, tmp_path, sequence=True, **options).fusion
+    own = {name: getattr(fusion, name) for name in options.keys() - fusion.options.keys()}
+    assert own | fusion.options == options
 
 
 def test_a_field_that_is_a_function_is_refused_before_anything_is_fused(material, tmp_path):

@@ -191,15 +191,15 @@ def test_tiles_are_those_with_the_least_work():
     assert all(working_memory(network, frame.inputs, t) <= limit for t in ours)
 
 
-def test_the_plan_is_told_before_the_work():
-    told, rig = [], rig_of((50, 70), (40, 60))
+def test_the_plan_is_announced_before_the_work():
+    plans, rig = [], rig_of((50, 70), (40, 60))
     images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
-    fuse(network_of("PAT"), rig, images, alpha="mono", announce=told.append)
-    assert str(told[0]).startswith("1 piece, 0.5")
-    assert told[0].seconds is None
+    fuse(network_of("PAT"), rig, images, alpha="mono", announce=plans.append)
+    assert str(plans[0]).startswith("1 piece, 0.5")
+    assert plans[0].seconds is None
 
 
-def test_a_wide_beta_is_enlarged_only_where_alpha_looks():
+def test_a_wide_beta_is_enlarged_only_where_alpha_sees():
     """Beta sees ten times alpha's field: what fusing gives is the same, and what is worked on is small."""
     hw, wide = (64, 96), (300, 440)
     rig, network = rig_of(hw, wide, focal=300.0, beta_focal=100.0), network_of("GuidedPAT")
@@ -239,7 +239,7 @@ def test_a_stopped_frame_goes_on_with_its_tiles(tmp_path, monkeypatch):
         fuse(network, rig, images | {"mono": images["mono"] * 0.9}, alpha="mono", store=tmp_path)
 
 
-def test_pitch_is_the_ratio_of_pixels():
+def test_resolution_ratio_is_that_of_pixels_an_angle():
     rig = rig_of((60, 80), (60, 80), focal=100.0, beta_focal=50.0)
     assert abs(resolution_ratio(rig.pair("mono", "colour")) - 0.5) < 0.01
     assert abs(resolution_ratio(rig.pair("colour", "mono")) - 2.0) < 0.04
@@ -411,7 +411,7 @@ def test_lenses_of_cameras_known_by_f_are_seen_through():
     assert (luminance(frame.image) - taken["mono"]).abs().max() < 1e-5
 
 
-def test_a_turned_beta_is_turned_upright():
+def test_a_rotated_beta_is_brought_upright():
     rig = rig_of((60, 80), (60, 80))
     for turns in range(4):
         assert quarter_turns(rig.rot90("colour", turns).pair("mono", "colour")) == -turns % 4

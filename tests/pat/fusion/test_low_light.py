@@ -3,16 +3,18 @@
 import pytest
 import torch
 
+from arraygeom import Pair, Rectified, View
 from arraygeom.distortion import Distortion
-from pat.evaluation.baseline import classical
-from pat.evaluation.low_light import non_local_means
+from arraygeom.fields.grid import FieldOnGrid
+from pat.evaluation.baseline import classical, non_local_means
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.low_light import Found, denoised, denoised_views, warped
+from pat.fusion.low_light import Found, WithPositions, denoised, denoised_views, warped
 from pat.fusion.views import Views
 from pat.media.colour import luminance
 from pat.networks import denoiser
 from pat.networks.denoiser import NoisyView
+from pat.networks.protocol import Beta, FusionOutput, Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
 from tests.pat.layered_array import ALPHA, BETA, load_sample
@@ -119,6 +121,16 @@ def test_betas_are_mixed_by_confidence():
     torch.testing.assert_close(mixed.recorded[0, 0, :, 2:], torch.full((4, 3), 0.2), atol=1e-4, rtol=0)
     torch.testing.assert_close(mixed.recorded[0, 0, :, :2], torch.full((4, 2), 0.8), atol=1e-4, rtol=0)
     assert float(confidence.min()) == pytest.approx(0.9)
+
+
+def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
+    ones = torch.ones(1, 2, 4, 5)
+    output = FusionOutput(torch.zeros(1, 3, 4, 5), [ones], [ones[:, 0]], [0.5 * ones[:, 0]])
+    monkeypatch.setattr(network, "forward", lambda inputs, state=None: output)
+    field = FieldOnGrid.of(Rectified(3.0), Pair(View(hw=(4, 5)), View(hw=(4, 5))))
+    part = Beta(torch.zeros(1, 3, 4, 5), field, offset=(7, 2))
+    found = WithPositions(network)(Inputs(torch.zeros(1, 1, 4, 5), (part,)))
+    assert found.image[0, 3:, 1, 1].tolist() == [8.0, 3.0, 0.5]
 
 
 def test_positions_are_those_of_the_matched_colours(network):

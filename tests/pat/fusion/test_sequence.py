@@ -31,6 +31,7 @@ def test_key_frames_are_alphas_nearest_to_betas():
     slow_alpha = clocks(10.0, 30.0, 0.0, 4, 12)
     assert [(k.alpha, k.betas["b"]) for k in slow_alpha.key_frames()] == [(0, 0), (1, 3), (2, 6), (3, 9)]
     assert slow_alpha.interval == pytest.approx(0.1)
+    assert [k.alpha for k in clocks(10.0, 10.0, 0.24, 3, 1).key_frames()] == [2]
 
 
 @pytest.mark.parametrize(
@@ -38,6 +39,7 @@ def test_key_frames_are_alphas_nearest_to_betas():
     [
         (lambda: clocks(None, 30.0, 0.0, 5, 5), "frame rate of 'a' is not known"),
         (lambda: clocks(30.0, 30.0, 5.0, 5, 5).key_frames(), "near one of alpha in time"),
+        (lambda: clocks(10.0, 10.0, 0.26, 3, 1).key_frames(), "near one of alpha in time"),
         (lambda: clocks(30.0, 30.0, 0.0, 5), "at least one beta"),
         (lambda: clocks(30.0, 30.0, 0.0, 5, 0), "no frames of 'b'"),
     ],
@@ -47,7 +49,7 @@ def test_clocks_that_do_not_fit_are_named(line, message):
         line()
 
 
-def test_moved_looks_where_points_will_be():
+def test_moved_samples_where_points_will_be():
     pair = moving.rig().pair("fast", "slow")
     x = pixel_grid(moving.HW)[10:20, 30:40].reshape(-1, 2)
     step = torch.stack([torch.full(moving.HW, 7.0), torch.full(moving.HW, -3.0)])
@@ -59,7 +61,7 @@ def test_moved_looks_where_points_will_be():
     assert torch.allclose(wide.length[wide.valid], wanted.length[wide.valid] + 8.0, atol=1e-4)
 
 
-def test_flow_finds_a_shift_and_its_trust_the_border():
+def test_flow_finds_a_shift_and_its_weight_the_border():
     a = moving.WALL[1:2, :96, 20:180]
     b = moving.WALL[1:2, 2:98, 25:185]
     flow = flow_between(a, b * 0.97)
@@ -70,7 +72,7 @@ def test_flow_finds_a_shift_and_its_trust_the_border():
     assert (warped(b, flow.step) - a)[:, 10:-10, 10:-10].abs().mean() < 0.01
 
 
-def test_colours_mix_by_confidence_and_disagreement_is_doubt():
+def test_colours_mix_by_confidence_which_disagreement_lowers():
     own = torch.full((1, 1, 2), 0.5)
     red, blue = (torch.tensor(c)[:, None, None].expand(3, 1, 2) for c in ((0.2, 0.0, 0.0), (0.0, 0.0, 0.2)))
     sure = torch.tensor([[0.9, 0.9]])
@@ -162,19 +164,22 @@ def test_a_noisy_sequence_is_denoised(fused):
     recorded, network, rig = noisy(frames, level), load_weights("mono-colour-small"), moving.rig(0.003)
     fusion = partial(fuse_sequence, network, rig, recorded, alpha="fast")
     plain = psnr(fusion(), ground_truth)
-    assert psnr(fusion(noise=dict.fromkeys(recorded, level)), ground_truth) > plain + 2.0
+    stated = dict.fromkeys(recorded, level)
+    assert psnr(fusion(noise=stated), ground_truth) > plain + 2.0
+    alone = [SequenceFusion(network, rig, recorded, "fast", noise=noise).alone(3) for noise in (None, stated)]
+    assert psnr(alone[1:], ground_truth[3:4]) > psnr(alone[:1], ground_truth[3:4]) + 2.0
     estimated = SequenceFusion(network, rig, recorded, "fast", noise="estimate")._noise
     assert estimated is not None
     assert set(estimated) == {"fast", "slow"}
     assert estimated["fast"].deviation(recorded["fast"][0][None]).mean() == pytest.approx(
         float(level.deviation(recorded["fast"][0][None]).mean()), rel=0.3
     )
-    kept = list(fusion(noise=dict.fromkeys(recorded, level), keep_alpha=True))
+    kept = list(fusion(noise=stated, keep_alpha=True))
     for frame, grey in zip(kept, recorded["fast"]):
         torch.testing.assert_close(luminance(frame.image), grey, atol=1e-4, rtol=0)
 
 
-def test_motion_that_is_unknown_for_one_beta_is_doubt(fused, monkeypatch):
+def test_of_several_betas_the_lowest_weight_of_motion_counts(fused, monkeypatch):
     """Of several betas each has its own time: the least certain motion counts."""
     frames, _, _, _ = fused
     rig = moving.rig()

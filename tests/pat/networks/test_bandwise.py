@@ -69,7 +69,7 @@ def rig_of(names, places):
     return Rig({"alpha": alpha, **betas}, depth=(1.0, 8.0))
 
 
-def test_cameras_at_one_place_are_one_with_several_bands(network):
+def test_co_located_cameras_are_one_with_several_bands(network):
     bands, alpha = texture(3, (64, 96))[0], texture(3, (64, 96))[0, :1]
     apart = fuse(
         network,

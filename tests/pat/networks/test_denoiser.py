@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from pat.evaluation.low_light import non_local_means
+from pat.evaluation.baseline import non_local_means
 from pat.media.colour import luminance
-from pat.networks.denoiser import DenoiserConfig, LowLightNetwork, NoisyView
+from pat.networks.denoiser import DenoiserConfig, LowLightNetwork, NoisyView, over_flips
 from pat.networks.weights import DENOISER, SHIPPED, load_denoiser, load_weights, save_weights
 from pat.sensors import NoiseLevel, generator_for
 from tests.pat.layered_array import load_sample
@@ -48,6 +48,14 @@ def denoised(part, electrons):
     level = NoiseLevel.of_electrons(electrons, 2)
     recorded = level.recorded(ideal, generator_for(0, part, electrons))
     return ideal, recorded, getattr(load_denoiser(), part)(level.unbiased(recorded), level.deviation(recorded))
+
+
+def test_results_over_flips_are_flipped_as_the_images_are():
+    torch.manual_seed(0)
+    network, image = torch.nn.Conv2d(1, 1, 3, padding=1), torch.rand(1, 1, 6, 7)
+    for axes in ((-1,), (-2,)):
+        assert not torch.allclose(network(image.flip(axes)), network(image).flip(axes), atol=1e-2)
+        torch.testing.assert_close(over_flips(network, image.flip(axes)), over_flips(network, image).flip(axes))
 
 
 def test_a_fused_image_takes_the_betas_brightness_as_its_own():

@@ -22,7 +22,14 @@ from arraygeom import (
 from pat.media.colour import luminance
 from pat.networks import semi_global_kernels as kernels
 from pat.networks.matching import semi_global_matching
-from pat.networks.semi_global import Normalisation, SemiGlobalMatches, equalising_blurs, matches
+from pat.networks.semi_global import (
+    LIKENESS,
+    Normalisation,
+    SemiGlobalMatches,
+    equalising_blurs,
+    match_weight,
+    matches,
+)
 
 HW = (64, 96)
 
@@ -80,7 +87,7 @@ def pair_of(turn: float) -> Pair:
     return Pair(camera, beta, (torch.tensor(1.0).double(), torch.tensor(10.0).double()))
 
 
-def looked_at(pair: Pair, step: int) -> Segments:
+def sampled_at(pair: Pair, step: int) -> Segments:
     hw = HW[0] // step, HW[1] // step
     x = (pixel_grid(hw, dtype=torch.float64) + 0.5) * step - 0.5
     found = lazily(Epipolar(), pair)(x.reshape(-1, 2))
@@ -114,8 +121,8 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     pair = pair_of(turn)
     alpha, beta, where = plane_seen(pair, 2.0)
     colours = beta * torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1).double()
-    segments = looked_at(pair, 1)
-    found = semi_global_matching(alpha, beta, colours, segments, looked_at(pair, 2))
+    segments = sampled_at(pair, 1)
+    found = semi_global_matching(alpha, beta, colours, segments, sampled_at(pair, 2))
     position = matches(segments, found.disparity)[0]
     inner = torch.zeros(HW, dtype=torch.bool)
     inner[8:-8, 8:-8] = True
@@ -132,7 +139,7 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
 def test_threads_and_blocks_change_nothing(monkeypatch):
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    call = alpha, beta, beta, looked_at(pair, 1), looked_at(pair, 2)
+    call = alpha, beta, beta, sampled_at(pair, 1), sampled_at(pair, 2)
     whole = semi_global_matching(*call)
     threads = torch.get_num_threads()
     try:
@@ -150,7 +157,7 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
 def test_a_batch_is_its_images_one_by_one():
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
-    fine, coarse = looked_at(pair, 1), looked_at(pair, 2)
+    fine, coarse = sampled_at(pair, 1), sampled_at(pair, 2)
     one = semi_global_matching(alpha, beta, beta, fine, coarse)
     other = semi_global_matching(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
     both = semi_global_matching(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
@@ -158,7 +165,7 @@ def test_a_batch_is_its_images_one_by_one():
         assert torch.equal(torch.cat([a, b]), c)
 
 
-def test_nowhere_to_look_is_nothing_found():
+def test_no_segment_is_nothing_found():
     x = torch.zeros(1, 32, 48, 2)
     nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
     found = semi_global_matching(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
@@ -275,7 +282,7 @@ def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
     return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
 
 
-def test_what_lies_beyond_the_edge_of_beta_is_not_looked_for_within_it():
+def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
     """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
@@ -308,6 +315,14 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
     alpha, beta, segments = beside(scene, 48)
     found = semi_global_matching(alpha, beta, beta * tint, *segments)
     assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
+
+
+def test_a_match_of_other_brightness_has_less_weight():
+    unlike = torch.zeros(1, 1, 5, 12)
+    unlike[..., 6:] = -LIKENESS
+    weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
+    torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
+    torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))
 
 
 def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():

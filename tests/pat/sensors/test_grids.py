@@ -147,7 +147,7 @@ def test_each_camera_draws_for_itself():
     assert not torch.equal(three["a"], record_array(images, rig, chains, seed=2).images["a"])
 
 
-def test_mistakes_are_told():
+def test_mistakes_are_named():
     image = torch.rand(1, 3, 7, 8)
     for step, words in ((Mosaic(), "even"), (Crop(4, 0, (5, 5)), "leaves the image")):
         with pytest.raises(ValueError, match=words):

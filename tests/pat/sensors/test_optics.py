@@ -170,7 +170,7 @@ def test_gradients_in_the_image(step):
     assert torch.autograd.gradcheck(lambda x: record(x, [step], generator()).image, image)
 
 
-def test_what_a_step_misses_is_told():
+def test_what_a_step_misses_is_named():
     image = torch.rand(1, 1, 8, 8)
     for step, words in (
         (Defocus(2, 2, 50), "depth"),

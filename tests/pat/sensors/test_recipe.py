@@ -101,12 +101,12 @@ def test_a_chain_from_a_file_runs():
         ("{linear: 1}", r"wanted a list of steps"),
     ],
 )
-def test_typos_are_told_with_their_place(text, words):
+def test_typos_are_named_with_their_entry(text, words):
     with pytest.raises(ValueError, match=words):
         read_chain(yaml.safe_load(text))
 
 
-def test_typos_of_cases_are_told():
+def test_typos_of_cases_are_named():
     with pytest.raises(ValueError, match="did you mean 'beta'"):
         read_cases([{"name": "x", "bta": []}])
     with pytest.raises(ValueError, match="list of cases"):

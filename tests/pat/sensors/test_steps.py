@@ -39,7 +39,7 @@ def run(image: torch.Tensor, *steps, seed: int = 0) -> torch.Tensor:
     return record(image, steps, generator(seed)).image
 
 
-def test_linear_and_coded_are_inverses_and_match_the_standard():
+def test_linear_and_srgb_encoded_are_inverses_and_match_the_standard():
     x = torch.linspace(0, 1, 101, dtype=torch.float64).view(1, 1, 1, -1)
     torch.testing.assert_close(run(x, DecodeSRGB(), EncodeSRGB()), x, atol=1e-12, rtol=0)
     assert run(torch.full((1, 1, 1, 1), 0.5), DecodeSRGB()).item() == pytest.approx(0.214041, abs=1e-6)
@@ -116,7 +116,7 @@ def test_maps_of_several_steps_compose():
     torch.testing.assert_close(pixels, direct)
 
 
-def test_blurs_keep_flat_images_and_spread_a_point_as_stated():
+def test_blurs_keep_flat_images_and_diffuse_a_point_as_stated():
     point = torch.zeros(1, 1, 41, 41, dtype=torch.float64)
     point[..., 20, 20] = 1
     x = torch.arange(41.0).double() - 20
@@ -225,7 +225,7 @@ def test_the_four_cases_are_equally_likely_and_do_what_they_say():
         torch.testing.assert_close(pairs.beta[met], run(beta[met], *steps))
 
 
-def test_mistakes_are_told():
+def test_mistakes_are_named():
     with pytest.raises(ValueError, match="odd"):
         BoxBlur(4)
     with pytest.raises(ValueError, match="900 nm"):

@@ -71,7 +71,7 @@ def test_local_workers_keep_freed_memory(monkeypatch):
     assert list(told.values()) == [(None, "1")] * 2
 
 
-def test_what_workers_are_told_does_not_stay_in_this_process(monkeypatch):
+def test_the_environment_of_workers_does_not_stay_in_this_process(monkeypatch):
     monkeypatch.delenv("OPENBLAS_NUM_THREADS", raising=False)
     with Workers(1).client():
         pass

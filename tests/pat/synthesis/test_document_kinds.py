@@ -54,7 +54,7 @@ def test_plain_data_becomes_dataclasses():
         ([1], "file: is .*; wanted a mapping"),
     ],
 )
-def test_what_does_not_fit_is_named_with_its_place(data, words):
+def test_what_does_not_fit_is_named_with_its_entry(data, words):
     with pytest.raises(ValueError, match=words):
         from_document(Outer, data, "file")
 

@@ -12,7 +12,7 @@ def images() -> list[np.ndarray]:
     return [rng.integers(0, 256, (64, 96, 3), dtype=np.uint8), rng.integers(0, 256, (70, 32, 3), dtype=np.uint8)]
 
 
-def look(bank: PhotoBank, texture: int, xy: list[list[float]], level: float) -> np.ndarray:
+def seen_values(bank: PhotoBank, texture: int, xy: list[list[float]], level: float) -> np.ndarray:
     n = len(xy)
     return bank.lookup(
         torch.full((n,), texture), torch.tensor(xy, dtype=torch.float32), torch.full((n,), level)
@@ -21,14 +21,14 @@ def look(bank: PhotoBank, texture: int, xy: list[list[float]], level: float) -> 
 
 def test_texel_centres_return_the_texels(images):
     bank = PhotoBank(images)
-    found = look(bank, 1, [[0, 0], [31, 63], [5, 7]], 0.0)
+    found = seen_values(bank, 1, [[0, 0], [31, 63], [5, 7]], 0.0)
     wanted = images[1][[0, 63, 7], [0, 31, 5]] / 255
     np.testing.assert_allclose(found, wanted, atol=1e-6)
 
 
 def test_mirrored_beyond_the_edges(images):
     bank = PhotoBank(images)
-    found = look(bank, 0, [[-1, -3], [96, 64], [-96.0, 0], [95.0 + 192 * 3, 0]], 0.0)
+    found = seen_values(bank, 0, [[-1, -3], [96, 64], [-96.0, 0], [95.0 + 192 * 3, 0]], 0.0)
     wanted = images[0][[2, 63, 0, 0], [0, 95, 95, 95]] / 255
     np.testing.assert_allclose(found, wanted, atol=1e-6)
 
@@ -37,7 +37,7 @@ def test_levels_are_area_averages_without_shift(images):
     bank = PhotoBank(images)
     reduced = cv2.resize(images[0].astype(np.float32) / 255, (24, 16), interpolation=cv2.INTER_AREA)
     centre = [[4 * (3 + 0.5) - 0.5, 4 * (2 + 0.5) - 0.5]]
-    np.testing.assert_allclose(look(bank, 0, centre, 2.0)[0], reduced[2, 3], atol=1 / 255)
+    np.testing.assert_allclose(seen_values(bank, 0, centre, 2.0)[0], reduced[2, 3], atol=1 / 255)
 
 
 def test_between_pixels_it_is_bilinear(images):
@@ -46,7 +46,7 @@ def test_between_pixels_it_is_bilinear(images):
     image = torch.from_numpy(images[0] / np.float32(255)).movedim(-1, 0)[None]
     grid = torch.from_numpy((2 * xy + 1) / np.float32([96, 64]) - 1)[None, None]
     wanted = torch.nn.functional.grid_sample(image, grid, align_corners=False)[0, :, 0].T.numpy()
-    np.testing.assert_allclose(look(bank, 0, xy.tolist(), 0.0), wanted, atol=1e-4)
+    np.testing.assert_allclose(seen_values(bank, 0, xy.tolist(), 0.0), wanted, atol=1e-4)
 
 
 def test_a_folder_of_colour_and_grey_with_its_cache(tmp_path, images):
@@ -57,7 +57,7 @@ def test_a_folder_of_colour_and_grey_with_its_cache(tmp_path, images):
     bank = PhotoBank.load(tmp_path, max_edge=48, cache=tmp_path / "cache.npz")
     assert bank.photos == 2
     assert bank.wh[0, 0].tolist() == [32, 32]
-    grey = look(bank, 1, [[3, 4]], 0.0)[0]
+    grey = seen_values(bank, 1, [[3, 4]], 0.0)[0]
     assert grey.max() == grey.min()
     again = PhotoBank.load(tmp_path, max_edge=48, cache=tmp_path / "cache.npz")
     assert torch.equal(again.texels, bank.texels)

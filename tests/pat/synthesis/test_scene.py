@@ -46,7 +46,7 @@ def test_a_mistake_in_a_scene_file_is_named(old, new, said):
         Scene.from_yaml(text.replace(old, new, 1), "my.yaml")
 
 
-def test_motion_passes_through_its_keys_and_turns_evenly():
+def test_motion_passes_through_its_keys_and_rotates_evenly():
     keys = (
         Key(position=(0, 0, 5)),
         Key(position=(1, 0, 5), rotation=(0, 0, np.pi / 2), extent=(2, 1, 1), time=2.0),

@@ -61,7 +61,7 @@ def test_the_papers_recipes_are_the_papers():
         ("steps: 0", "c: steps must be at least 1, got 0"),
         ("minutes: -1", "c: minutes must be more than 0, got -1"),
         ("[1, 2]", "c: wanted entries (name: value), got [1, 2]"),
-        ("a: [", "c: not YAML"),
+        ("a: [", "c: not valid YAML at line 2"),
     ],
 )
 def test_what_is_wrong_is_named_in_one_line(text, message):

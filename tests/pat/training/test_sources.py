@@ -29,7 +29,7 @@ from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import Rendered, save_frame
 from pat.synthesis.rig_distribution import RigDistribution
 from pat.training.config import RecordingConfig, TrainConfig, parse_config
-from pat.training.lenses import lens_over, one_camera, through_lenses
+from pat.training.lenses import lens_over, through_lenses
 from pat.training.loop import new_network
 from pat.training.losses import explained, match_loss, validation
 from pat.training.samples import degraded, pair_of, plan, scenes, transfer
@@ -117,7 +117,7 @@ def test_what_is_wrong_with_shares(text, message):
     assert message in str(caught.value)
 
 
-def test_all_items_have_their_turn_equally_often():
+def test_all_items_are_drawn_equally_often():
     count = ACTIVE + 5
     drawn = [active_items(number, count, 3) for number in range(20 * GROUPS_PER_EXCHANGE * count)]
     assert all(len(hand) == ACTIVE for hand in drawn)
@@ -126,6 +126,9 @@ def test_all_items_have_their_turn_equally_often():
     assert len(times) == count
     assert times.max() <= 1.2 * times.min()
     assert active_items(40, count, 3) == drawn[40] != active_items(40, count, 4)
+    newest = [active[0] for active in drawn[::GROUPS_PER_EXCHANGE]]
+    assert sorted(newest[:count]) == sorted(newest[count : 2 * count])
+    assert newest[:count] != newest[count : 2 * count]
 
 
 # Rendered scenes -------------------------------------------------------------------------------------------
@@ -313,7 +316,7 @@ def test_nobody_knows_where_a_pairs_points_are(tmp_path):
     assert facts["psnr"] > 5
 
 
-def test_middleburys_collections_say_how_far_to_look(shared_data):
+def test_middleburys_collections_say_their_largest_disparity(shared_data):
     crops = PairCrops([shared_data / "middlebury"], hw=(96, 192))
     assert {round(pair.max_disparity) for pair in crops.pairs} >= {64, 85, 128}
     assert crops.sample(2, generator(), number=0).images[0].std() > 0.05
@@ -362,7 +365,7 @@ def scene():
 def test_a_lens_sees_all_that_the_pinhole_sees_but_for_what_is_lost(mode):
     strengths = []
     for seed in range(6):
-        pinhole = one_camera(replace(RIGS, mode=mode).sample(1, (48, 64), generator(seed)).cameras[1], 0)
+        pinhole = replace(RIGS, mode=mode).sample(1, (48, 64), generator(seed)).cameras[1][0].to(torch.float64)
         lens = lens_over(pinhole, generator(seed))
         rays, valid = pinhole.rays(torch.tensor([[0.0, 0.0], [63, 0], [0, 47], [63, 47], [30, 20]]).double())
         x = lens.project_local(rays)

@@ -16,7 +16,7 @@ from pat.training.spectra import Spectra
 from .runs import short_run
 
 
-def test_bands_are_mixtures_bent_and_stretched():
+def test_bands_are_mixtures_with_gamma_and_contrast():
     spectra = Spectra.drawn(2, 5, Generator().manual_seed(0))
     image = torch.rand(2, 3, 6, 7)
     bands = spectra.of(image)
@@ -35,7 +35,7 @@ def test_some_are_inverted_and_some_of_one_colour():
     assert 0.4 < (spectra.mixture.amax(-1) == 1).float().mean() < 0.6
 
 
-def test_samples_have_random_bands_in_truth_and_beta_alike(tmp_path):
+def test_samples_have_random_bands_in_ground_truth_and_beta_alike(tmp_path):
     config = short_run(tmp_path)
     config = replace(config, recording=replace(config.recording, spectral=1.0, paper=0.0, ideal=True, noise=0.0))
     counts = set()

@@ -28,7 +28,7 @@ def config(tmp_path_factory):
     )
 
 
-def test_truth_is_where_the_geometry_says(config):
+def test_ground_truth_is_where_the_geometry_says(config):
     """Beta looked up at the true positions is alpha's view in colour, wherever beta sees the surface."""
     learn, _ = scenes(config)
     errors = []

@@ -21,7 +21,7 @@ def plane_depth(camera):
 
 
 @pytest.mark.parametrize("name", ["oblong", "shifted", "turned"])
-def test_a_pinhole_is_rendered_as_it_is_turned_upright(name):
+def test_a_pinhole_is_rendered_as_it_is_brought_upright(name):
     camera, lens = RIG[name], lens_for(RIG[name], name)
     X = torch.randn(50, 3, dtype=torch.float64) + torch.tensor([0, 0, 5.0])
     torch.testing.assert_close(lens.pinhole.project(X).x, camera.project(X).x)

@@ -295,7 +295,7 @@ def test_twenty_scenes_of_four_unlike_cameras(worker, tmp_path):
 
 
 @pytest.mark.slow
-def test_leaves_and_skin_look_unlike_their_luminance_in_near_infrared(worker, tmp_path):
+def test_leaves_and_skin_are_unlike_their_luminance_in_near_infrared(worker, tmp_path):
     """Leaves are dark green and bright in the near infrared, skin is brighter than its luminance."""
     leaf, skin, soot = Paint((0.05, 0.12, 0.03), 0.5), Paint((0.45, 0.25, 0.17), 0.6), Paint((0.04, 0.04, 0.04), 0.04)
     strips = [
