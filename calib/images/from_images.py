@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import logging
+import math
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import NamedTuple
@@ -14,13 +14,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
+from arraygeom.progress import part, stage
 
 from .held_out import line_distances, split
 from .lenses import describe_lenses
-from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, with_map
+from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, matching_time, with_map
 from .refinement import refine_matches
 
-LOG = logging.getLogger(__name__)
+JOINED = 1.0
+"""Seconds that one core takes for each pair to fit all lines jointly, roughly."""
 
 
 class UncalibratedRig(NamedTuple):
@@ -49,6 +51,7 @@ class UncalibratedRig(NamedTuple):
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
 
 
+@stage()
 def rig_from_images(
     images: Mapping[str, Float[Tensor, "_ _ _"]],
     *,
@@ -70,17 +73,19 @@ def rig_from_images(
             raise ValueError(f"--focal: '{name}={length:g}' is no camera with an image, or not positive")
     sizes = {name: (int(p.shape[1]), int(p.shape[2])) for name, p in images.items()}
     K = {name: intrinsics(length, sizes[name]) for name, length in focal.items()}
-    found = UncalibratedRig(
-        Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, match_cameras(images, alpha=alpha)
-    )
-    links, matched = {}, found.matches
+    pairs = math.comb(len(images), 2) if alpha is None else len(images) - 1
+    matched_at = (matching := matching_time(images, pairs)) / (matching + JOINED * pairs)
+    with part(0, matched_at):
+        matched = match_cameras(images, alpha=alpha)
+    found = UncalibratedRig(Rig({name: View(hw=hw) for name, hw in sizes.items()}), {}, {}, {}, {}, matched)
+    links = {}
     for names, matches in matched.items():
-        LOG.info("lines of %s and %s", *names)
         F, distance, by_focal = _fundamental(matches, *(K.get(name) for name in names))
         links[names] = fit_link(matches, F, within=AGREE).link
         found.distance[names], found.by_focal[names] = distance, by_focal
     rig = found.rig.replace(links=links)
-    refined = refine_matches(rig, [matched])
+    with part(matched_at, 1):
+        refined = refine_matches(rig, [matched])
     if refined.accepted:
         rig = refined.rig
         found.distance.update(_distances(rig, matched))

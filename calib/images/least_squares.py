@@ -6,6 +6,7 @@ free; the rest are considered: uncertain, so that they explain what they may, bu
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,9 +15,15 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from arraygeom.progress import log_step
+
+LOG = logging.getLogger(__name__)
+
 LARGEST_POSTERIOR = 0.9
 """A parameter is fixed if its posterior standard deviation stays above this share of the prior's."""
 STEPS = 40
+FURTHER_STEPS = 6
+"""About so many follow, wherever a fit is: they are fewer than `STEPS` in most."""
 CONVERGED = 5e-3
 """Iteration ends at a step of this many prior deviations."""
 LEAST_NOISE = 0.03
@@ -101,7 +108,8 @@ def most_probable(
     residuals: Residuals, z: Float[Tensor, " k"], basis: Float[Tensor, "k m"], *, steps: int = STEPS
 ) -> Float[Tensor, " k"]:
     """The most probable parameters z + basis y, from z on."""
-    for _ in range(steps):
+    for i in range(steps):
+        log_step(LOG, i / (i + FURTHER_STEPS), "step %d of the fit", i + 1)
         r, J = jacobian(residuals, z)
         information, slope = _normal_equations(r, J, z)
         step = basis @ torch.linalg.solve(basis.T @ information @ basis, basis.T @ slope)

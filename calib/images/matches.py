@@ -18,6 +18,7 @@ from torch import Tensor
 
 from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
 from arraygeom.pixels import shift_matrix
+from arraygeom.progress import log_step
 
 from .patch_matching import refine_points
 
@@ -38,6 +39,8 @@ MANY = 60
 """With fewer consistent matches, mirrored images are tried."""
 AGREE = 5.0
 """Largest distance, in pixels, of a consistent match from its line: lenses distort lines."""
+MEGAPIXEL, PAIR = 0.35, 0.65
+"""Seconds that one core takes for the features of a megapixel, and to match a pair, roughly."""
 STILL = 0.05
 """Images in which nine points in ten move less than this, in pixels, are the same image."""
 
@@ -131,18 +134,21 @@ def match_cameras(
     """
     if len(images) < 2:
         raise ValueError("matching needs the images of two cameras or more: give --image NAME=FILE for each")
+    pairs = list(combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha))
+    total, done = matching_time(images, len(pairs)), 0.0
     features = {}
     for name, image in images.items():
-        LOG.info("features of %s", name)
+        log_step(LOG, done / total, "features of %s", name)
         features[name] = detect_features(image)
+        done += matching_time({name: image}, 0)
     for name, own in features.items():
         if len(own.points) < ENOUGH:
             raise ValueError(f"the image of '{name}' has hardly any texture to match: take one in focus, with detail")
     found = {}
-    pairs = combinations(images, 2) if alpha is None else ((alpha, name) for name in images if name != alpha)
     for a, b in pairs:
-        LOG.info("matching %s and %s", a, b)
+        log_step(LOG, done / total, "matching %s and %s", a, b)
         found[a, b] = _agreeing(features[a], features[b], images[b])
+        done += PAIR
     kept = {names: matches for names, matches in found.items() if len(matches.alpha) >= ENOUGH}
     for (a, b), matches in kept.items():
         displacement = float((matches.alpha - matches.beta).norm(dim=-1).quantile(0.9))
@@ -155,6 +161,11 @@ def match_cameras(
             "see the same things, at the same time and in focus?"
         )
     return kept
+
+
+def matching_time(images: Mapping[str, Float[Tensor, "_ _ _"]], pairs: int) -> float:
+    """Roughly how long one core takes to match that many pairs of the images, seconds."""
+    return sum(MEGAPIXEL * image[0].numel() / 1e6 for image in images.values()) + PAIR * pairs
 
 
 def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> Matches:

@@ -16,20 +16,23 @@ fusion: see `photometric`.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Camera, Rig
+from arraygeom.progress import log_step, part, stage
 
 from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
 from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, nearer, split
 from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
-from .matches import ENOUGH, Matches, match_cameras, with_map
+from .matches import ENOUGH, Matches, match_cameras, matching_time, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
@@ -56,8 +59,10 @@ UNCHANGED = 1e-3
 """Relative deviation of depth within which a pattern of depth stays."""
 CORRELATED_PIXELS = 10.0
 """Photometric errors of this many neighbouring pixels count as one measurement."""
-ROUNDS = 8
-"""Iterations of the photometric minimisation."""
+ROUNDS, EVALUATIONS = 8, 13
+"""Iterations of the photometric minimisation, and how often it evaluates the error of all pairs, roughly."""
+FITTED = 1.4
+"""Seconds that one core takes to fit a rig to the points of a pair, roughly."""
 
 
 def refine(
@@ -80,11 +85,20 @@ def refine(
     """
     for frame in frames:
         _check(rig, frame)
-    fit, solution = fitted(rig, [match_cameras(frame) for frame in frames], free=free, sigma=sigma)
+    with stage("points" + ", stage 1 of 2" * (attend is not None), new=True):
+        seconds = sum(matching_time(frame, math.comb(len(frame), 2)) for frame in frames)
+        matched_at = seconds / (seconds + FITTED * math.comb(len(frames[0]), 2))
+        pairs = []
+        for i, frame in enumerate(frames):
+            with part(matched_at * i / len(frames), matched_at * (i + 1) / len(frames)):
+                pairs.append(match_cameras(frame))
+        with part(matched_at, 1):
+            fit, solution = fitted(rig, pairs, free=free, sigma=sigma)
     refined = fit.report(solution, force=force)
     if attend is None or not refined.accepted or not solution.directions.shape[1]:
         return refined
-    polished, errors = polish(fit, solution, frames, attend)
+    with stage("the fusion's error, stage 2 of 2", new=True):
+        polished, errors = polish(fit, solution, frames, attend)
     improved = fit.report(polished, force=force)
     return replace(improved if errors.accepted and improved.accepted else refined, photometric=errors)
 
@@ -123,11 +137,14 @@ def fitted(
     if (with_lens := with_lenses(rig, rig.names)) is not rig:
         candidates.append((with_lens, free))
     problems = [RefinementProblem.of(*candidate, frames=frames, sigma=sigma) for candidate in candidates]
-    best = problems[0], problems[0].solve()
-    for problem in problems[1:]:
+    ends = [sum(problem.count**2 for problem in problems[:i]) for i in range(len(problems) + 1)]
+    with part(0, ends[1] / ends[-1]):
+        best = problems[0], problems[0].solve()
+    for problem, begin, end in zip(problems[1:], ends[1:], ends[2:]):
         if _at_its_best(*best):
             break
-        other = problem, problem.solve()
+        with part(begin / ends[-1], end / ends[-1]):
+            other = problem, problem.solve()
         distances = [line_distances(fit.after(solution.z), fit.held_out) for fit, solution in (best, other)]
         best = other if nearer(*distances) else best
     return best
@@ -185,7 +202,7 @@ class RefinementProblem:
         If depth still changes by more than they determine it, without any change of depth that can be avoided.
         """
         systematic = systematic_columns(self.rig, self.used)
-        LOG.info("refining %d parameters by %d points", self.count, len(systematic))
+        log_step(LOG, 0, "refining %d parameters by %d points", self.count, len(systematic))
         columns = systematic.split([len(matches.alpha) for matches in self.used.values()])
 
         def parts(z: Tensor) -> list[Tensor]:
@@ -293,8 +310,8 @@ NO_NEARER = "held-out points are no nearer to their lines"
 def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]:
     """An objection for each parameter vector that changes by more than its prior allows."""
     found = []
-    for u, part in zip(parameters, z.split([len(u.sigma) for u in parameters])):
-        change = u.root @ part
+    for u, change_of in zip(parameters, z.split([len(u.sigma) for u in parameters])):
+        change = u.root @ change_of
         worst = int((change / u.sigma).abs().argmax())
         ratio = float((change / u.sigma)[worst].abs())
         if ratio > LARGEST_CHANGE and u.unit != "F":
@@ -357,11 +374,18 @@ def polish(
     views = [PhotometricFrame.of(frame) for frame in frames]
     root = solution.directions
 
+    done = 0
+    total = EVALUATIONS * len(views) * len(fit.used)
+
     def errors(z: Tensor, *, held_out: bool) -> Tensor:
-        parts = [photometric_errors(base.after(z), v, names, attend) for v in views for names in fit.used]
+        nonlocal done
+        parts = []
+        for view, names in product(views, fit.used):
+            log_step(LOG, min(done / total, 0.95), "photometric error of %s and %s", *names)
+            parts.append(photometric_errors(base.after(z), view, names, attend))
+            done += 1
         return torch.cat([error[valid & (held_out_pixels(error) == held_out)] for error, valid in parts])
 
-    LOG.info("minimising the photometric error, %d frames", len(frames))
     noise = noise_scale(errors(solution.z, held_out=False).detach())
     y = torch.zeros(root.shape[1], dtype=torch.float64, requires_grad=True)
     optimiser = torch.optim.LBFGS([y], max_iter=ROUNDS, line_search_fn="strong_wolfe", tolerance_change=1e-4)

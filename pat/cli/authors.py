@@ -14,7 +14,11 @@ from . import options
 from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ..evaluation.protocols import StereoMethod
     from ..networks.protocol import FusionNetwork
+    from ..networks.weights import Network
 
 RenderedFolder = Annotated[Positional[Path], arg(metavar="FOLDER", help="Folder written by `pat render`.")]
 
@@ -41,6 +45,8 @@ class Evaluate:
     """The paper's: mono + colour (table1), or mono + three bands (table2)."""
     controls: bool = False
     """Also fuse without beta, with another scene's, and with shuffled fields: the fusion must get worse."""
+    without_rig: bool = False
+    """Also fuse with the rig that is found from the two images alone, as `pat fuse a.png b.png` does."""
     conditions: bool = False
     """Instead: other responses, exposures, noise, misalignment; by region, with depth. Also conditions.png."""
     only: tuple[str, ...] = ()
@@ -62,6 +68,8 @@ class Evaluate:
         folders = {name: getattr(self, name) for name in stereo.DATA_SETS if getattr(self, name) is not None}
         if not folders:
             raise ValueError(f"no images: give at least one of --{', --'.join(stereo.DATA_SETS)}")
+        if self.without_rig and (self.protocol != "table1" or self.conditions or self.only):
+            raise ValueError("--without-rig: is of --protocol table1, without --conditions")
         if not self.rates or min(self.rates) < 1:
             raise ValueError(f"--rates: {' '.join(map(str, self.rates))}: give whole numbers from 1 up")
         writable(self.out, folder=True)
@@ -70,10 +78,13 @@ class Evaluate:
             return self._under_conditions(network, folders)
         wrong = protocols.controls(network, bands=bands) if self.controls else {}
         methods = {**protocols.BASELINES, "fusion": protocols.rectified_fusion(network, bands=bands), **wrong}
+        if self.without_rig:
+            methods[RIG_FOUND] = with_found_rig(network)
         rows = stereo.evaluate_sets(folders, methods, self.rates, out=self.out, half=self.half)
         every = [row for found in rows.values() for row in found]
         text = stereo.sets_markdown(rows, protocol=self.protocol)
-        text += "\n" + stereo.falls(every, names=wrong) if wrong else ""
+        compared = (*wrong, *[RIG_FOUND] * self.without_rig)
+        text += "\n" + stereo.falls(every, names=compared) if compared else ""
         write_text(self.out / "scores.md", text)
         write_csv(self.out / "scores.csv", stereo.StereoRow._fields, every)
         print(text, end="")
@@ -99,6 +110,22 @@ class Evaluate:
         conditions.save_condition_curves(rows, self.out / "conditions.png")
         print(text, end="")
         say(f"written: {self.out / 'conditions.md'}")
+
+
+RIG_FOUND = "fusion, rig found"
+
+
+def with_found_rig(network: Network) -> StereoMethod:
+    """The fusion of two images with the rig found from them."""
+    from ..fusion.fuse import fuse
+    from .from_images import found_rig
+
+    def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
+        images = {"alpha": alpha, "beta": beta}
+        rig, _ = found_rig(images, "alpha", {}, network, lambda line: None)
+        return fuse(network, rig, images, alpha="alpha").image
+
+    return fused
 
 
 @dataclass

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Rig
+from arraygeom.progress import log_step, part, stage
 from calib.images.from_images import UncalibratedRig, rig_from_images
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
@@ -36,6 +37,8 @@ MATCHED = 1600
 """Images are reduced to this many pixels along their longer side to match features."""
 COARSE = 640
 """And to this many of alpha for the first, coarse fusion."""
+LINES = 0.45
+"""The share of the time to find a rig that epipolar lines take; the rest is calibration."""
 EVEN = 0.004
 """The standard deviation below which an image is of one colour: a count of 8 bits."""
 WAVELENGTHS = {"red": 620, "green": 540, "blue": 460}
@@ -123,6 +126,7 @@ def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str
     return files, rates
 
 
+@stage()
 def found_rig(
     images: Images, alpha: str, focal: Mapping[str, float], network: Network, note: Say
 ) -> tuple[Rig, list[str]]:
@@ -133,7 +137,8 @@ def found_rig(
     factors = {name: min(MATCHED / max(image.shape[-2:]), 1.0) for name, image in images.items()}
     reduced = {name: _scaled(image, factors[name]) for name, image in images.items()}
     lengths = {name: length * factors[name] for name, length in focal.items()}
-    found = rig_from_images(reduced, focal=lengths, alpha=alpha)
+    with part(0, LINES):
+        found = rig_from_images(reduced, focal=lengths, alpha=alpha)
     betas = [name for name in images if (alpha, name) in found.rig.links]
     if not betas:
         raise ValueError(f"no image shows enough of what '{alpha}' shows: choose another alpha with --alpha NAME")
@@ -160,7 +165,8 @@ def _calibrated(
     """The calibrated rig, each pair refined by what a coarse fusion of it matches; None if one cannot be calibrated."""
     pairs: dict[str, RefinedPair] = {}
     depths: dict[str, Frame] = {}
-    for name in betas:
+    for i, name in enumerate(betas):
+        log_step(LOG, LINES + (1 - LINES) * i / len(betas), "calibrating %s and %s", alpha, name)
         link, matches = found.rig.links[alpha, name], found.matches[alpha, name]
         views = {n: found.rig[n] for n in (alpha, name)}
         pair = None if _distorted(found.rig) else self_calibrated(views, link, matches, focal=focal)

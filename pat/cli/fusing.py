@@ -107,6 +107,8 @@ class Fuse:
     """Of a single frame, also write points.ply: the pixels of known depth as a coloured point cloud."""
     report: bool = True
     """Of a single frame, also write index.html: a page that shows images, confidence, depth and rig."""
+    classical: bool = False
+    """Show the classical baseline (semi-global matching, warped colour) on that page, to compare; some seconds more."""
     strict: bool = False
     """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
     on_error: Literal["stop", "skip"] = "stop"
@@ -130,6 +132,10 @@ class Fuse:
         if self.max_memory is not None:
             parse_bytes(self.max_memory)
         options.response_of(self.response)
+        options.noise_of(self.noise)
+        options.device_of(self.device)
+        if self.classical and not self.report:
+            raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
         with self._judged() as self._warnings:
             self._with_rig() if self._rig_given() else self._without_rig()
@@ -146,8 +152,7 @@ class Fuse:
             return True
         if self.image or len(self.given) < 2:
             raise ValueError(
-                "give two images or more, such as `pat fuse mono.png colour.png`; or a rig with "
-                "`--alpha NAME --image NAME=FILE --image NAME=FILE`"
+                "give two images or more, as `pat fuse mono.png colour.png`; or a rig, --alpha and each --image"
             )
         return False
 
@@ -159,6 +164,8 @@ class Fuse:
         if self.alpha is None:
             raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
         files = options.files_by_name(self.image)
+        if unknown := [path for path in self.given[1:] if path.stem not in rig.names]:
+            raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
         if not self.sequence:
@@ -170,10 +177,13 @@ class Fuse:
     def _without_rig(self) -> None:
         from .from_images import camera_names, files_of, frames_of_videos
 
-        only_with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
-        if named := [option for option, value in only_with_rig.items() if value]:
+        with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
+        if named := [option for option, value in with_rig.items() if value]:
             raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
         cameras = camera_names(self.given)
+        noise = options.noise_of(self.noise)
+        if isinstance(noise, dict) and (unknown := noise.keys() - cameras.keys()):
+            raise ValueError(f"--noise: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}")
         videos = [path for path in cameras.values() if path.suffix.lower() in options.VIDEO_SUFFIXES]
         if videos and len(videos) < len(cameras):
             others = [path for path in cameras.values() if path not in videos]
@@ -273,7 +283,7 @@ class Fuse:
                 device=self.device,
                 precision=self.precision,
             )
-            frame = self._exposed(frame)
+            frame, gain = self._exposed(frame)
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
             points = rig[alpha] if self.points else None
@@ -285,6 +295,8 @@ class Fuse:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
                 facts = self._facts(found, time.monotonic() - begin)
+                if self.classical:
+                    facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
                 written.append(write_report(self.out / "index.html", frame, images, rig, alpha, facts))
         say(f"written to {self.out}: {', '.join(path.name for path in written)}")
         if self.report:
@@ -304,19 +316,35 @@ class Fuse:
         say(line)
         self._notes.append(line)
 
-    def _exposed(self, frame: Frame) -> Frame:
+    def _classical(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, gain: float) -> Tensor | None:
+        """The classical baseline as bright as the fused image; None, and a line, where the cameras do not allow it."""
+        from ..evaluation.baseline import classical_view
+        from ..fusion.report import LONGEST
+        from ..media.exposure import exposed
+
+        try:
+            with options.working("classical baseline"):
+                return exposed(classical_view(rig, images, alpha, longest=LONGEST), gain)
+        except ValueError as error:
+            say(f"no classical baseline: {error}")
+            return None
+
+    def _exposed(self, frame: Frame) -> tuple[Frame, float]:
         from ..media.exposure import exposed, exposure_gain
 
         gain = exposure_gain(frame.image) if self.exposure == "auto" else 1.0
         if gain != 1:
             what = "dark" if gain > 1 else "overexposed"
             self._note(f"exposure: light times {gain:.2f}, as the image is {what} (--exposure keep leaves it)")
-        return frame._replace(image=exposed(frame.image, gain))
+        return frame._replace(image=exposed(frame.image, gain)), gain
 
     def _many(self, rig: Rig, files: dict[str, list[Path]], alpha: str) -> None:
         from ..fusion.batch import Batch
         from ..support.jobs import Workers, cores
 
+        single = {"--points": self.points, "--classical": self.classical, "--device cuda": self.device == "cuda"}
+        if named := [option for option, given in single.items() if given]:
+            raise ValueError(f"{', '.join(named)}: of a single frame alone: leave it out for many")
         batch = Batch(
             rig,
             files,
@@ -449,7 +477,7 @@ def fuse_with_progress(
     from ..fusion.results import Frame
     from ..networks.weights import load_weights
 
-    where = device_of(device)
+    where = options.device_of(device)
     network = load_weights(weights, precision=precision).to(where)
     if where != "cpu":
         rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
@@ -470,16 +498,3 @@ def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:
         if count > 1:
             LOG.info("tile %d of %d", i, count)
         yield tile
-
-
-def device_of(name: str) -> str:
-    """ "cpu" or "cuda". Raises ValueError for a GPU that is not there."""
-    if name == "cpu":
-        return name
-    import torch
-
-    if torch.cuda.is_available():
-        return "cuda"
-    if name == "cuda":
-        raise ValueError("--device cuda: no CUDA device is available: leave it out, or install torch for CUDA")
-    return "cpu"

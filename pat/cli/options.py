@@ -9,9 +9,10 @@ import ast
 import importlib.util
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import cache
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
@@ -111,7 +112,7 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
     """The arguments with the other `spellings` of a command's options replaced.
 
     FIRST and LAST stand for the first and the last positional argument, whose value follows the option: a rig may
-    always be given so.
+    always be given so. Images that are positional arguments may stand anywhere.
     """
     spellings = {"--rig": FIRST} if "rig" in command.__annotations__ else {}
     spellings |= getattr(command, "spellings", {})
@@ -129,7 +130,24 @@ def respelled(arguments: Iterable[str], command: Any) -> list[str]:
         if not value:
             raise ValueError(f"{option}: give a file")
         (first if new == FIRST else last).append(value)
+    if "given" in command.__annotations__:
+        rest = _images_first(rest)
     return [*first, *rest, *last]
+
+
+def _images_first(words: Sequence[str]) -> list[str]:
+    """Words of a command line with the image files that stand between options moved before those."""
+    leading = len(list(takewhile(lambda word: not word.startswith("-"), words)))
+    files = {
+        i
+        for i in range(leading + 1, len(words))
+        if Path(words[i]).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES
+        and not words[i].startswith("-")
+        and "=" not in words[i]
+        and words[i - 1] not in ("-o", "--out", "--weights")
+    }
+    others = [word for i, word in enumerate(words) if i >= leading and i not in files]
+    return [*words[:leading], *(words[i] for i in sorted(files)), *others]
 
 
 def writable(out: Path, *, folder: bool = False) -> Path:
@@ -146,6 +164,19 @@ def writable(out: Path, *, folder: bool = False) -> Path:
         if not os.access(place, os.W_OK):
             raise ValueError(f"--out: {place} is not to be written to: give another path, or permission")
     return out
+
+
+def device_of(name: str) -> str:
+    """ "cpu" or "cuda". Raises ValueError for a GPU that is not there."""
+    if name == "cpu":
+        return name
+    import torch
+
+    if torch.cuda.is_available():
+        return "cuda"
+    if name == "cuda":
+        raise ValueError("--device cuda: no CUDA device is available: leave it out, or install torch for CUDA")
+    return "cpu"
 
 
 def field_named(name: str) -> ReceptiveField | None:

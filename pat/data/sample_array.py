@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from arraygeom import Rig
-from pat.media.colour import luminance_of
+from arraygeom import Camera, Pose, Rig
+from pat.media.colour import luminance, luminance_of
 
 from ..media.images import read_image
 
@@ -32,3 +34,19 @@ def load_sample(folder: Path = SAMPLE) -> SampleArray:
     rig = Rig.load(folder / "rig.yaml")
     images = {name: read_image(folder / f"{name}.png") for name in rig.names}
     return SampleArray(rig, {**images, ALPHA: luminance_of(images[ALPHA])}, read_image(folder / "truth.png"))
+
+
+def load_motorcycle() -> SampleArray:
+    """A real pair that comes with scikit-image, and its published geometry (Scharstein et al., GCPR 2014).
+
+    The left photograph made grey is the mono camera's, the right one at half its size the colour one's.
+    """
+    from skimage.data import stereo_motorcycle
+
+    left, right = (torch.from_numpy(photo[:, :740].copy()).movedim(-1, 0) / 255 for photo in stereo_motorcycle()[:2])
+    K = torch.tensor([[994.978, 0, 311.193], [0, 994.978, 254.877], [0, 0, 1]], dtype=torch.float64)
+    one = Camera(K=K, cam_from_world=Pose.identity(), hw=(500, 740))
+    shifted = K + torch.tensor([[0, 0, 31.086], [0, 0, 0], [0, 0, 0]])
+    other = Camera(K=shifted, cam_from_world=Pose(one.R, torch.tensor([-0.193001, 0, 0]).to(K)), hw=(500, 740))
+    rig = Rig({ALPHA: one, BETA: other.resize((250, 370))}, depth=(1.8, 8.0), name="motorcycle")
+    return SampleArray(rig, {ALPHA: luminance(left), BETA: avg_pool2d(right, 2)}, left)

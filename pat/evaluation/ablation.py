@@ -174,7 +174,7 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 
     Raises ValueError for a folder without rendered scenes, or with incomplete ones.
     """
-    found = sorted(path.parent for path in folder.rglob("scene.yaml"))
+    found = sorted({path.parent for name in ("scene.yaml", RENDER_FILE) for path in folder.rglob(name)})
     broken = [path for path in found if not is_rendered(path)]
     if not found or broken:
         incomplete = f"{broken[0]} is incomplete ({RENDER_FILE} is missing)" if broken else ""
@@ -312,14 +312,14 @@ def _cells(rows: Sequence[AblationRow], every: Sequence[AblationRow]) -> list[st
         return [""] * (len(RATIOS) + 4) + [rows[0].note]
     reference = {row.scene: row.psnr for row in every if row.family == "calibrated"}
     psnr, ssim = [row.psnr for row in served], [row.ssim for row in served]
-    low, high = bootstrap_interval(psnr)
+    interval = " ({:.2f} to {:.2f})".format(*bootstrap_interval(psnr)) if len(psnr) > 1 else ""
     difference = np.mean([row.psnr - reference[row.scene] for row in served]) if reference else math.nan
     groups = [[r.psnr for r in served if a <= r.ratio < b] for a, b in zip(RATIOS, (*RATIOS[1:-1], math.inf))]
     means = [f"{np.mean(g):.2f}" if g else "" for g in groups]
     note = "" if len(served) == len(rows) else f"{len(rows) - len(served)} scenes omitted"
     error, within = (np.mean([getattr(row, name) for row in served]) for name in ("end_point_error", "within_one"))
     off = ["", ""] if math.isnan(error) else [f"{error:.2f}", f"{within:.1%}"]
-    image = [f"{np.mean(psnr):.2f} ({low:.2f} to {high:.2f})", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
+    image = [f"{np.mean(psnr):.2f}{interval}", f"{np.mean(ssim):.4f}", f"{difference:+.2f}"]
     return [*image, *means, *off, note]
 
 

@@ -21,9 +21,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from arraygeom import Pair, Rig
+from arraygeom import Camera, Pair, Rig
 
+from ..fusion.results import Frame
+from ..fusion.steps import Undistort
+from ..fusion.views import Views
 from ..media.colour import from_luma_chroma, luminance, luminance_of, to_bytes
+from ..media.figures import reduced
 
 Image = NDArray[Any]
 
@@ -58,6 +62,22 @@ def classical_baseline(rig: Rig, images: Mapping[str, Tensor], alpha: str) -> Fl
     if images[betas[0]].shape[0] == 3:
         return classical(rig, images, alpha, betas[0])
     return torch.cat([classical(rig, images, alpha, name) for name in betas])
+
+
+def classical_view(rig: Rig, images: Mapping[str, Tensor], alpha: str, *, longest: int) -> Float[Tensor, "_ h w"]:
+    """`classical_baseline` at alpha's own view, reduced to at most `longest` pixels along its longer side.
+
+    Raises ValueError for cameras that are not calibrated, and for those that cannot be rectified.
+    """
+    if names := [name for name in images if not isinstance(rig[name], Camera)]:
+        raise ValueError(f"{', '.join(names)}: not calibrated, and the classical baseline needs poses and depths")
+    small = {name: reduced(image, longest).clamp(0, 1) for name, image in images.items()}
+    for name, image in small.items():
+        h, w = image.shape[-2:]
+        rig = rig.resize(name, (h, w))
+    views, back = Undistort().do(Views.of(rig, small, alpha=alpha))
+    image = classical_baseline(views.rig, views.images, alpha)
+    return back(Frame(image, *torch.zeros(2, *image.shape[-2:]))).image
 
 
 def classical(rig: Rig, images: Mapping[str, Tensor], alpha: str, beta: str) -> Float[Tensor, "_ h w"]:

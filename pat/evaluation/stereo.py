@@ -180,12 +180,12 @@ def _depth_cell(rows: Sequence[StereoRow]) -> str:
 
 
 def falls(rows: Sequence[StereoRow], *, method: str = "fusion", names: Iterable[str]) -> str:
-    """One line for each control: by how much mean PSNR is below that of `method`, and the least of any image."""
+    """A line for each of `names`: its mean PSNR against that of `method`, and the extremes over the images."""
     psnr = {(row.pair, row.rate, row.method): row.psnr for row in rows}
     lines = []
     for name in names:
-        fall = [value - psnr[pair, rate, name] for (pair, rate, m), value in psnr.items() if m == method]
-        lines.append(f"- {name}: {np.mean(fall):.2f} dB below {method}, at least {min(fall):.2f} dB\n")
+        gains = [psnr[pair, rate, name] - value for (pair, rate, m), value in psnr.items() if m == method]
+        lines.append(f"- {name}: {np.mean(gains):+.2f} dB against {method}, {min(gains):+.2f} to {max(gains):+.2f}\n")
     return "".join(lines)
 
 

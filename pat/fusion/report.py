@@ -13,14 +13,13 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
 from arraygeom.viz import COLOURS, frustum, frustum_size
 
 from ..media.colour import to_bytes
-from ..media.figures import colour_depth
+from ..media.figures import colour_depth, reduced
 from .results import Frame
 
 LONGEST = 1600
@@ -36,7 +35,7 @@ class Facts(NamedTuple):
     """What the page says beside the images.
 
     notes: what was found or normalised. warnings: with what to do. seconds, memory (bytes): of the fusion, if known.
-    unit: of depths.
+    unit: of depths. classical: the classical baseline at alpha's view, a layer to compare with.
     """
 
     notes: Sequence[str] = ()
@@ -44,6 +43,7 @@ class Facts(NamedTuple):
     seconds: float | None = None
     memory: float | None = None
     unit: str = "m"
+    classical: Float[Tensor, "_ _ _"] | None = None
 
 
 def write_report(
@@ -61,16 +61,18 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
     """The page as text."""
     shown = {f"alpha: {alpha}": images[alpha]}
     shown |= {f"beta: {name}": images[name] for name in rig.betas(alpha) if name in images}
+    if facts.classical is not None:
+        shown["classical"] = _shown(facts.classical)
     shown["fused"] = _shown(frame.image)
     overlays = {"confidence": _confidence_layer(frame.confidence)}
     known = frame.depth[frame.depth.isfinite()]
     if len(known):
-        overlays["depth"] = _data_url(_reduced(colour_depth(frame.depth)))
+        overlays["depth"] = _data_url(reduced(colour_depth(frame.depth), LONGEST))
     h, w = frame.depth.shape
     parts = {
         "TITLE": html.escape(f"{' + '.join(name for name in rig.names if name in images)}, fused"),
         "RATIO": f"{w} / {h}",
-        "LAYERS": "\n".join(_layer(name, _data_url(_reduced(_shown(image)))) for name, image in shown.items()),
+        "LAYERS": "\n".join(_layer(name, _data_url(reduced(_shown(image), LONGEST))) for name, image in shown.items()),
         "OVERLAYS": "\n".join(
             f'<img class="overlay" id="{name}" alt="{name}" src="{url}" hidden>' for name, url in overlays.items()
         ),
@@ -148,13 +150,6 @@ def _shown(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
     return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
 
 
-def _reduced(image: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
-    factor = LONGEST / max(image.shape[-2:])
-    if factor >= 1:
-        return image
-    return interpolate(image[None], scale_factor=factor, mode="bicubic", antialias=True)[0]
-
-
 def _data_url(image: Float[Tensor, "c h w"]) -> str:
     pixels = to_bytes(image.detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
@@ -163,7 +158,7 @@ def _data_url(image: Float[Tensor, "c h w"]) -> str:
 
 def _confidence_layer(confidence: Float[Tensor, "h w"]) -> str:
     """A PNG that covers pixels the more, the less their confidence."""
-    cover = 1 - _reduced(confidence[None].detach().cpu())
+    cover = 1 - reduced(confidence[None].detach().cpu(), LONGEST)
     colour = torch.tensor(UNCONFIDENT[::-1])[:, None, None] / 255
     layers = torch.cat([colour.expand(3, *cover.shape[1:]), 0.85 * cover])
     _, content = cv2.imencode(".png", to_bytes(layers).transpose(1, 2, 0))

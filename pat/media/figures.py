@@ -11,6 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from arraygeom.atomic import write_atomically
 from arraygeom.viz import new_figure
@@ -31,6 +32,15 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
         scaled = ((found - low) / max(high - low, 1e-12)).clamp(0, 1)
         rows[:, seen] = turbo[:, (256 * scaled).long().clamp(max=255)][:, seen]
     return colours
+
+
+def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 w2"]:
+    """The image with at most `longest` pixels along its longer side."""
+    factor = longest / max(image.shape[-2:])
+    if factor >= 1:
+        return image
+    hw = [max(round(n * factor), 1) for n in image.shape[-2:]]
+    return interpolate(image[None], hw, mode="bicubic", align_corners=False, antialias=True)[0]
 
 
 def save_figure(figure: Figure, path: Path, *, dpi: int = 110) -> Path:

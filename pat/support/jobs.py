@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from .steps import steps_shown
+from .steps import about, steps_shown
 
 if TYPE_CHECKING:
     from distributed import Client, Future, LocalCluster
@@ -225,8 +225,7 @@ def time_left(ends: Sequence[float], left: int) -> str:
     if left == 0 or len(ends) < 2:
         return ""
     first = 0 if len(ends) == 2 else 1
-    seconds = left * (ends[-1] - ends[first]) / (len(ends) - 1 - first)
-    return f"about {seconds:.0f} s left" if seconds < 100 else f"about {seconds / 60:.0f} min left"
+    return about(left * (ends[-1] - ends[first]) / (len(ends) - 1 - first))
 
 
 def _in_this_process(tasks: Iterable[Task], workers: Workers) -> Iterator[TaskOutcome]:

@@ -6,20 +6,50 @@ Modules say them to their loggers, at level INFO: `logging.basicConfig(level=log
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from arraygeom.progress import progress
+
 PACKAGES = ("arraygeom", "calib", "pat")
+
+
+EARLIEST = 0.1
+"""Share of a stage that is done before the time left is estimated."""
+LEAST = 1.5
+"""Seconds: less is not said."""
 
 
 class _Shown(logging.Handler):
     def __init__(self, show: Callable[[str], None]) -> None:
         super().__init__(logging.INFO)
         self.show = show
+        self.stage: str | None = None
+        self.begin, self.share = 0.0, 0.0
 
     def emit(self, record: logging.LogRecord) -> None:
         if record.levelno == logging.INFO:
-            self.show(record.getMessage())
+            self.show(record.getMessage() + self._left())
+
+    def _left(self) -> str:
+        """The current stage and the time left in it, if any."""
+        if (now := progress()) is None:
+            return ""
+        stage, share = now
+        if stage != self.stage:
+            self.stage, self.begin, self.share = stage, time.monotonic(), 0.0
+        self.share = max(share, self.share)
+        named = f" ({stage})" * bool(stage)
+        if self.share < EARLIEST:
+            return named
+        left = (time.monotonic() - self.begin) * (1 - self.share) / self.share
+        return f"{named}, {about(left)}" if left > LEAST else named
+
+
+def about(seconds: float) -> str:
+    """A time that is left, roughly."""
+    return f"about {seconds:.0f} s left" if seconds < 100 else f"about {seconds / 60:.0f} min left"
 
 
 @contextmanager

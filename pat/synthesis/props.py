@@ -5,7 +5,7 @@ Such a frame has x to the right, y down and z away from the camera, in metres.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -91,6 +91,13 @@ def plain(*rgb: float, roughness: float = 0.5, specular: float = 0.3, grain: flo
     return Material(texture=texture, roughness=roughness, specular=specular, **more)
 
 
+def wood(dark: Vec3, light: Vec3, scale: float) -> Material:
+    """Two tones of wood with a wavy grain, `scale` rings a metre."""
+    paints = (paint(*dark), paint(*light), paint(*(0.6 * d + 0.4 * v for d, v in zip(dark, light))), paint(*light))
+    texture = Texture(kind="wave", paints=paints, scale=scale, distortion=9.0, grain=0.12)
+    return Material(texture=texture, roughness=0.35, specular=0.35)
+
+
 def box(name: str, middle: Vec3, extent: Vec3, material: Material, *, yaw: float = 0.0, roll: float = 0.0) -> Object:
     """A box, rotated by degrees about the vertical and about the axis of view."""
     rotation = Rotation.from_euler("yz", (yaw, roll), degrees=True).as_rotvec()
@@ -118,6 +125,18 @@ def lathed(name: str, foot: Vec3, profile: Profile, material: Material, *, euler
     extent = (float(2 * widest), float(high - low), float(2 * widest))
     key = Key(position=vec(middle), rotation=vec(rotation.as_rotvec()), extent=extent)
     return Object(name=name, shape="lathe", motion=Motion((key,)), material=material, profile=tuple(unit))
+
+
+def moved(items: Iterable[Object], name: str, to: Vec3, *, yaw: float = 0.0, size: float = 1.0) -> Iterator[Object]:
+    """Objects made about the origin, enlarged, rotated about the vertical by degrees and moved; names get a prefix."""
+    R = torch.from_numpy(Rotation.from_euler("y", yaw, degrees=True).as_matrix())
+    pose = Pose(R, R.new_tensor(to))
+    for item in items:
+        keys = (
+            replace(key, position=vec(size * np.array(key.position)), extent=vec(size * np.array(key.extent)))
+            for key in item.motion.keys
+        )
+        yield replace(item, name=f"{name} {item.name}", motion=_placed(Motion(tuple(keys)), pose))
 
 
 def on_path(item: Object, path: Sequence[tuple[float, Vec3]], spin: Vec3 = (0, 0, 0)) -> Object:

@@ -14,14 +14,18 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial.transform import Rotation
 
+from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from .furnish import seeded, vec
-from .props import arranged, ball, box, first_camera, lathed, on_path, paint, plain
+from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain, wood
+from .room import FLOOR, furniture
 from .scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 VIEW = 1.4
 """Metres of the still life that the first camera's image is wide."""
+WIDE = 2.0 * VIEW
+"""What a camera sees at the table, metres, from which on there is a room around it."""
 DOWNWARDS = 13.0
 """Degrees by which the first camera faces downwards."""
 AIM = (0.0, -0.17, 0.2)
@@ -34,12 +38,14 @@ BULB = 12.0
 def still_life(seed: int, rig: Rig, *, moving: float = 0.0) -> Scene:
     """The room in front of a rig's first camera, level and at a distance that shows the still life whole.
 
-    `seed` draws the books. With `moving` seconds, the ball is thrown through the image and takes so long. Raises
-    ValueError if the rig has no calibrated camera.
+    `seed` draws the books. Where a camera sees much more than the table, there is a whole room. With `moving` seconds,
+    the ball is thrown through the image and takes so long. Raises ValueError if the rig has no calibrated camera.
     """
     camera, rng = first_camera(rig), seeded("still-life", seed)
     objects = [*_furniture(), *_books(rng), *_plant(rng), *_pottery(), *_fruit(), *_toys(moving), *_lamp()]
     distance = VIEW * float(camera.K[0, 0]) / camera.hw[1]
+    if any(isinstance(c, Camera) and distance * c.hw[1] / float(c.K[0, 0]) > WIDE for c in rig.cameras.values()):
+        objects += _room(rng)
     world = World((0.06, 0.065, 0.07), 0.06)
     return arranged("still-life", seed, rig, objects, _LIGHTS, world, aim=AIM, distance=distance, down=DOWNWARDS)
 
@@ -53,14 +59,8 @@ _LIGHTS = (
 # Surfaces -------------------------------------------------------------------------------------------------------
 
 
-def _wood(dark: Vec3, light: Vec3, scale: float) -> Material:
-    paints = (paint(*dark), paint(*light), paint(*(0.6 * d + 0.4 * v for d, v in zip(dark, light))), paint(*light))
-    texture = Texture(kind="wave", paints=paints, scale=scale, distortion=9.0, grain=0.12)
-    return Material(texture=texture, roughness=0.35, specular=0.35)
-
-
-_OAK = _wood((0.21, 0.10, 0.042), (0.36, 0.19, 0.085), 14.0)
-_WALNUT = _wood((0.07, 0.035, 0.018), (0.13, 0.066, 0.034), 18.0)
+_OAK = wood((0.21, 0.10, 0.042), (0.36, 0.19, 0.085), 14.0)
+_WALNUT = wood((0.07, 0.035, 0.018), (0.13, 0.066, 0.034), 18.0)
 _PLASTER = Material(
     texture=Texture(kind="noise", paints=(paint(0.40, 0.43, 0.36), paint(0.47, 0.50, 0.42)), scale=7.0, grain=0.05),
     roughness=0.95,
@@ -98,14 +98,27 @@ _CLOTHBOUND: tuple[Vec3, ...] = (
 
 def _books(rng: Generator) -> Iterator[Object]:
     for row, (top, left, right) in enumerate(((-0.28, -1.2, 0.33), (0.14, -1.2, 0.33), (-0.28, 0.37, 0.8))):
-        x = left + 0.01
-        while x < right - 0.06:
-            width, height = float(rng.uniform(0.018, 0.055)), float(rng.uniform(0.2, 0.33))
-            yield from _book(rng, f"book{row}.{x:.2f}", x + width / 2, top - 0.0125, (width, height))
-            x += width + (float(rng.uniform(0.05, 0.16)) if rng.uniform() < 0.06 else 0.0015)
+        yield from _row_of_books(rng, f"book{row}", top, left, right)
     for i, colour in enumerate(_CLOTHBOUND[1:5]):
         y = -0.0125 + 0.14 - 0.02 - 0.036 * i
         yield box(f"lying{i}", (0.72 + 0.01 * i, y, SHELF + 0.14), (0.27, 0.034, 0.19), plain(*colour), yaw=6 * i - 8)
+
+
+def _room(rng: Generator) -> Iterator[Object]:
+    """What is around the table: furniture, more books, a tall plant."""
+    yield from furniture()
+    for i, (left, right) in enumerate(((-1.2, 0.33), (0.37, 1.16))):
+        yield from _row_of_books(rng, f"upper book{i}", -0.70, left, right)
+    yield from moved(_plant(rng), "tall", (3.3, FLOOR, 0.2), size=2.3)
+
+
+def _row_of_books(rng: Generator, name: str, board: float, left: float, right: float) -> Iterator[Object]:
+    """Books on a shelf's board of some height, between two sides."""
+    x = left + 0.01
+    while x < right - 0.06:
+        width, height = float(rng.uniform(0.018, 0.055)), float(rng.uniform(0.2, 0.33))
+        yield from _book(rng, f"{name}.{x:.2f}", x + width / 2, board - 0.0125, (width, height))
+        x += width + (float(rng.uniform(0.05, 0.16)) if rng.uniform() < 0.06 else 0.0015)
 
 
 def _book(rng: Generator, name: str, x: float, floor: float, wh: tuple[float, float]) -> Iterator[Object]:

@@ -16,8 +16,9 @@ import torch
 import yaml
 
 from arraygeom import Pose, Rig
+from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
-from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
+from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named, respelled
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
@@ -328,6 +329,14 @@ def test_a_rig_is_an_argument_or_an_option_and_o_is_out_everywhere(small, capsys
     main([*fuse[:1], rig, *fuse[1:], "-o", str(first), "--match-levels", "--no-carry"])
     main([*fuse, "--rig", rig, "-o", str(second), "--normalise-radiometry", "--no-propagate"])
     assert (first / "fused.png").read_bytes() == (second / "fused.png").read_bytes()
+
+
+def test_images_stand_anywhere_among_the_options_of_fuse():
+    given = ["rig.yaml", "--alpha", "mono", "a.png", "--depth", "1", "9", "b.tif", "--image", "c=c.png"]
+    given += ["-o", "out.png"]
+    others = ["--alpha", "mono", "--depth", "1", "9", "--image", "c=c.png", "-o", "out.png"]
+    assert respelled(given, Fuse) == ["rig.yaml", "a.png", "b.tif", *others]
+    assert respelled(given[3:], Fuse) == ["a.png", "b.tif", *others[2:]]
 
 
 def test_writers_take_o_and_out():

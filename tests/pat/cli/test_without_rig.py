@@ -11,6 +11,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Camera, Pose, Rig
 from pat import fuse, load_weights
+from pat.cli.authors import with_found_rig
 from pat.cli.from_images import camera_names
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
@@ -50,7 +51,9 @@ def fails(arguments, capsys) -> str:
     with pytest.raises(SystemExit) as stop:
         main(["fuse", *map(str, arguments)])
     assert stop.value.code == 2
-    return capsys.readouterr().err.splitlines()[-1]
+    error = capsys.readouterr().err.splitlines()
+    assert len(error) <= 3, error
+    return error[-1]
 
 
 def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
@@ -59,6 +62,15 @@ def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
+
+
+def test_the_evaluation_without_a_rig_is_that_of_the_command(halved, folder):
+    _, images, ground_truth = halved
+    found = with_found_rig(load_weights("mono-colour"))(images["mono"], images["colour"], 0.0)
+    written = score(read_image(folder / "out" / "fused.png"), ground_truth).psnr
+    assert score(found.clamp(0, 1), ground_truth).psnr == pytest.approx(written, abs=0.3)
+    with pytest.raises(SystemExit):
+        main(["evaluate", "--folder", str(folder), "--without-rig", "--protocol", "table2"])
 
 
 def test_the_rig_that_was_found_serves_the_next_command(folder):
@@ -109,7 +121,25 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
         assert message in fails([mono, *(tmp_path / name for name in names), *out], capsys)
         assert not (tmp_path / "out").exists()
     assert "no camera 'tele'; the images' names are mono, colour" in fails([mono, colour, "--alpha", "tele"], capsys)
+    for noise, said in {"mono=-5": "must be more than 0, got -5", "tele=100": "--noise: no camera 'tele'"}.items():
+        assert said in fails([mono, colour, "--noise", noise, *out], capsys)
+    assert not (tmp_path / "out").exists()
     assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
+
+
+def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_path, capsys):
+    images = []
+    for name in ("mono", "colour"):
+        (tmp_path / name).mkdir()
+        for i in range(2):
+            shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
+        images += ["--image", f"{name}={tmp_path / name}"]
+    given = [folder / "out" / "rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
+    rig = folder / "out" / "rig.yaml"
+    stray = [rig, "--alpha", "mono", tmp_path / "mono" / "0.png", folder / "colour.png", "-o", tmp_path / "out"]
+    assert "0.png: no camera of the rig has its name: give --image NAME=" in fails(stray, capsys)
+    assert "--points, --classical: of a single frame alone" in fails([*given, "--points", "--classical"], capsys)
+    assert not (tmp_path / "out").exists()
 
 
 def test_names_of_cameras_are_those_of_files_or_folders(tmp_path):

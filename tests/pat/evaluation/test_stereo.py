@@ -170,12 +170,12 @@ def test_controls_take_the_reference_away():
     assert (looked.end - x).norm(dim=-1).mean() > 5
 
 
-def test_falls_are_means_and_the_least():
+def test_falls_are_means_and_extremes():
     rows = [
         StereoRow(p, 2, m, v, 0.9)
         for p, m, v in (("a", "fusion", 30), ("a", "no", 25), ("b", "fusion", 30), ("b", "no", 27))
     ]
-    assert falls(rows, names=["no"]) == "- no: 4.00 dB below fusion, at least 3.00 dB\n"
+    assert falls(rows, names=["no"]) == "- no: -4.00 dB against fusion, -5.00 to -3.00\n"
 
 
 def test_the_papers_figures_stand_beside_the_mean_and_are_marked():

@@ -6,10 +6,13 @@ import shutil
 import pytest
 import torch
 
-from arraygeom import Rig
+from arraygeom import Distortion, Rig, View
 from pat.data.sample_array import SAMPLE, load_sample
+from pat.evaluation.baseline import classical_view
+from pat.evaluation.metrics import score
 from pat.fusion.report import Facts, report_page, rig_drawing, write_report
 from pat.fusion.results import Frame
+from pat.media.figures import reduced
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -22,7 +25,8 @@ def page(tmp_path_factory):
     depth = torch.linspace(2, 9, w).expand(h, w).clone()
     depth[:, :40] = torch.nan
     frame = Frame(sample.ground_truth, depth, torch.linspace(0, 1, h)[:, None].expand(h, w))
-    facts = Facts(("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30)
+    baseline = classical_view(sample.rig, sample.images, "mono", longest=h)
+    facts = Facts(("weights: <mono> & more",), ("the rig may be wrong: check it",), 12.0, 2.0**30, classical=baseline)
     path = tmp_path_factory.mktemp("report") / "index.html"
     return write_report(path, frame, sample.images, sample.rig, "mono", facts)
 
@@ -31,7 +35,7 @@ def test_the_page_needs_no_other_file(page):
     text = page.read_text()
     assert not re.findall(r"\{\{\w+\}\}", text)
     sources = re.findall(r'(?:src|href)="([^"]{0,30})', text)
-    assert len(sources) == 6
+    assert len(sources) == 7
     assert all(source.startswith("data:") for source in sources)
     assert not re.findall(r"https?://|@import|url\(", text)
     assert "weights: &lt;mono&gt; &amp; more" in text
@@ -81,10 +85,37 @@ def test_slider_and_overlays_work_in_a_browser(page):
         assert run("return document.querySelector('.legend').hidden") is False
         driver.find_element("css selector", "#left option:nth-child(2)").click()
         assert run(shown.replace("SIDE", "left")) == ["beta: colour"]
+        driver.find_element("css selector", "#left option:nth-child(3)").click()
+        assert run(shown.replace("SIDE", "left")) == ["classical"]
+        clipped = run("return getComputedStyle(document.querySelector('.layer.left')).clipPath")
+        assert float(re.findall(r"[\d.]+(?=%)", clipped)[0]) == pytest.approx(100 - float(boundary[:-1]), abs=0.01)
         assert len(driver.get_screenshot_as_png()) > 20_000
         assert driver.get_log("browser") == []
     finally:
         driver.quit()
+
+
+@pytest.mark.parametrize("lens", [None, [-0.12, 0.03, 0.0, 0.0]])
+def test_the_classical_layer_is_at_alphas_own_pixels(lens):
+    sample, rig = load_sample(), load_sample().rig
+    if lens is not None:
+        rig = rig.with_camera(
+            "mono", rig["mono"].replace(distortion=Distortion("brown-conrady", torch.tensor(lens, dtype=torch.float64)))
+        )
+    found = classical_view(rig, sample.images, "mono", longest=320)
+    small = reduced(sample.ground_truth, 320)
+    assert found.shape == small.shape
+    if lens is None:
+        assert score(found, small).psnr > score(reduced(sample.images["mono"], 320).expand(3, -1, -1), small).psnr + 8
+    else:
+        assert float((found.mean(0) - reduced(sample.images["mono"], 320)[0]).abs().median()) < 0.05
+
+
+def test_there_is_no_classical_layer_of_cameras_known_by_lines_alone():
+    sample = load_sample()
+    views = {name: View(hw=sample.rig[name].hw) for name in sample.rig.names}
+    with pytest.raises(ValueError, match="mono, colour: not calibrated"):
+        classical_view(Rig(views), sample.images, "mono", longest=320)
 
 
 def drag(driver, share):

@@ -12,6 +12,7 @@ from pat.synthesis.scene import BoardObject, Key, Motion, Object, Scene
 from pat.synthesis.shapes import inside, mesh
 from tests.pat.synthesis.scenes import posed, unlike_cameras
 
+ENDS = ("armchair seat", "rug", "window panes", "chair seat")
 BOARD = BoardObject(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
 
 
@@ -70,6 +71,21 @@ def test_arranged_scenes_fill_the_first_image_wherever_the_rig_stands(generator,
     up = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     sun = torch.tensor(scene.lights[0].direction, dtype=torch.float64)
     assert float((camera.R @ sun) @ up) < 0, "the light comes from above"
+
+
+def test_a_wide_camera_sees_a_room_around_the_still_life():
+    narrow = Camera(K=intrinsics(820.0, (400, 640)), cam_from_world=posed(), hw=(400, 640))
+    wide = Camera(K=intrinsics(240.0, (400, 640)), cam_from_world=posed(), hw=(400, 640))
+    table, room = (GENERATORS["still-life"](1, Rig(c)) for c in ({"a": narrow}, {"a": narrow, "b": wide}))
+    assert room.objects[: len(table.objects)] == table.objects
+    around = {o.name: o for o in room.objects[len(table.objects) :]}
+    assert len(around) > 80
+    middles = {name: torch.tensor(around[name].motion.keys[0].position, dtype=torch.float64) for name in ENDS}
+    x = {name: wide.project(X).x for name, X in middles.items()}
+    assert all(bool(wide.contains(at)) for at in x.values())
+    assert x["armchair seat"][0] < x["rug"][0] < x["window panes"][0]
+    assert x["window panes"][1] < x["chair seat"][1]
+    assert not bool(narrow.contains(narrow.project(middles["armchair seat"]).x))
 
 
 def test_the_ball_is_thrown_in_the_time_that_is_given():
