@@ -123,6 +123,7 @@ def _low_light(electrons: float) -> Condition:
 
 CONDITIONS: dict[str, Condition] = {
     "ideal": Condition(),
+    "x1": Condition(rate=1),
     "x4": Condition(rate=4),
     "x8": Condition(rate=8),
     "alpha = mean": Condition(alpha=_weights(1 / 3, 1 / 3, 1 / 3)),
@@ -267,7 +268,15 @@ def depth_errors(
 def conditions_markdown(rows: Sequence[ConditionRow]) -> str:
     """PSNR / SSIM by condition and method with intervals of the gain over classical; regions; depth."""
     return "\n".join(
-        [_by_condition(rows), "By region, ideal:", "", _by_region(rows), "Depth, ideal:", "", _depth(rows)]
+        [
+            _by_condition(rows),
+            "By region, ideal:",
+            "",
+            _by_region(rows),
+            "Depth, without noise or misalignment:",
+            "",
+            _depth(rows),
+        ]
     )
 
 
@@ -306,14 +315,15 @@ def _by_region(rows: Sequence[ConditionRow]) -> str:
 
 def _depth(rows: Sequence[ConditionRow]) -> str:
     lines = []
-    for method in distinct(r.method for r in rows):
-        found = [r for r in rows if (r.condition, r.method) == ("ideal", method) and r.within_one is not None]
-        if found:
-            shares = [100 * float(np.mean([r.within_one[i] for r in found if r.within_one])) for i in range(2)]
-            errors = [r.end_point_error for r in found if r.end_point_error is not None]
-            name = "OpenCV's SGBM" if method == "classical" else method
-            lines.append([name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
-    return markdown_table(["", "end-point error", "within 1 px, of all", "of those that beta sees"], lines)
+    known = [r for r in rows if r.condition in ("ideal", "x1") and r.within_one is not None]
+    for condition, method in distinct((r.condition, r.method) for r in known):
+        found = [r for r in known if (r.condition, r.method) == (condition, method)]
+        shares = [100 * float(np.mean([r.within_one[i] for r in found if r.within_one])) for i in range(2)]
+        errors = [r.end_point_error for r in found if r.end_point_error is not None]
+        name = "OpenCV's SGBM" if method == "classical" else method
+        rate = f"x{CONDITIONS[condition].rate}"
+        lines.append([rate, name, f"{np.mean(errors):.2f} px", *(f"{share:.1f} %" for share in shares)])
+    return markdown_table(["beta", "", "end-point error", "within 1 px, of all", "of those that beta sees"], lines)
 
 
 def save_condition_curves(rows: Sequence[ConditionRow], path: Path) -> None:
