@@ -7,7 +7,8 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,11 +162,17 @@ class Fuse:
         files = options.files_by_name(self.image)
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
-        if not self.sequence:
-            warn_of_wrong_rig(views)
-        if self.sequence or max(map(len, found.values())) > 1:
+        if self.sequence:
             return self._many(rig, found, self.alpha)
-        self._one(views.developed, views, self.alpha)
+        with ThreadPoolExecutor(1) as beside:
+            compared = beside.submit(warn_of_wrong_rig, views)
+            several = max(map(len, found.values())) > 1
+            if several or self.strict or self.max_memory is not None:
+                with options.working("comparing the rig with the images"):
+                    compared.result()
+            if several:
+                return self._many(rig, found, self.alpha)
+            self._one(views.developed, views, self.alpha, before_writing=compared.result)
 
     def _without_rig(self) -> None:
         from .from_images import camera_names, files_of, frames_of_videos
@@ -239,7 +246,15 @@ class Fuse:
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
         return rig
 
-    def _one(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None) -> None:
+    def _one(
+        self,
+        rig: Rig,
+        images: Mapping[str, Tensor],
+        alpha: str,
+        *,
+        found: tuple[str, ...] | None = None,
+        before_writing: Callable[[], None] = lambda: None,
+    ) -> None:
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep
@@ -273,6 +288,7 @@ class Fuse:
                 device=self.device,
                 precision=self.precision,
             )
+            before_writing()
             frame = self._exposed(frame)
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
@@ -423,13 +439,12 @@ def warn_of_wrong_rig(views: ViewFiles) -> None:
 
     from ..fusion.checks import LowConfidenceWarning
 
-    with options.working("comparing the rig with the images"):
-        try:
-            found = find_misfit(views.developed, dict(views))
-        except (ValueError, OSError):  # of a file or an image: the fusion says so
-            return
-        verdict = found.verdict if found else ""
+    try:
+        found = find_misfit(views.developed, dict(views))
+    except (ValueError, OSError):  # of a file or an image: the fusion says so
+        return
     if found is not None:
+        verdict = found.verdict
         wrong = bool(verdict) or found.outside > OUTSIDE
         advice = f"`pat rig doctor` says: {verdict}" if verdict else "see `pat rig doctor`"
         warnings.warn(f"{found.text}; {advice}", LowConfidenceWarning if wrong else UserWarning, stacklevel=2)

@@ -71,6 +71,13 @@ class BandwisePAT(nn.Module):
         estimates = [estimate for _, estimate in parts]
         return output_of(torch.cat([image for image, _ in parts], 1), estimates), estimates
 
+    def matched(self, inputs: Inputs) -> FusionOutput:
+        """Positions and their confidences alone: the image is alpha."""
+        state = self.prepare(inputs)
+        own, parts = self.single.encoder(inputs.alpha), zip(inputs.betas, state.matches, state.common)
+        estimates = [self.single.estimate(own, inputs.alpha, b, found, guide=mix.of) for b, found, (mix, _) in parts]
+        return output_of(inputs.alpha, estimates)
+
     def _of_beta(
         self, own: Encoded, alpha: Tensor, beta: Beta, found: SemiGlobalMatches, mix: SpectralMix
     ) -> tuple[Tensor, BetaEstimate]:

@@ -170,15 +170,24 @@ class GuidedPAT(nn.Module):
         bands = sum(beta.image.shape[1] for beta in inputs.betas)
         if parts and bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
-        alpha, state = inputs.alpha, state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
-        own = self.encoder(alpha)
-        estimates = [self.estimate(own, alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
+        alpha = inputs.alpha
+        own, estimates = self._estimates(inputs, state)
         used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
         return (output if parts else output._replace(overall=used[0].confidence)), estimates
+
+    def matched(self, inputs: Inputs) -> FusionOutput:
+        """Positions and their confidences alone: the image is alpha."""
+        return output_of(inputs.alpha, self._estimates(inputs, None)[1])
+
+    def _estimates(self, inputs: Inputs, state: Prepared | None) -> tuple[Encoded, list[BetaEstimate]]:
+        """Alpha's features, and the estimate of each beta."""
+        state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
+        own = self.encoder(inputs.alpha)
+        return own, [self.estimate(own, inputs.alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
 
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
