@@ -44,7 +44,7 @@ class BandwisePAT(nn.Module):
 
     def prepare(self, inputs: Inputs) -> Prepared:
         """For each beta how its bands are combined and normalised, and by that its semi-global matches."""
-        return prepared(inputs, self._combination, lambda combined: combined[0].of, _matches)
+        return prepared(inputs, self._combination, lambda found: (found[0].of, found[1]), _matches)
 
     def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
         """The combination of the one beta's bands that is most like alpha, and how that is normalised."""

@@ -131,7 +131,7 @@ class GuidedPAT(nn.Module):
 
         Betas that each have all bands agree on depth, and share the colour that is diffused.
         """
-        found = prepared(inputs, _normalisations, lambda _: brightness, _matches)
+        found = prepared(inputs, _normalisations, lambda found: (brightness, found), _matches)
         if not can_agree(inputs) or self._in_parts(inputs):
             return found
         return replace(found, matches=self._shared(inputs, found))
@@ -249,7 +249,13 @@ class GuidedPAT(nn.Module):
 
     def _key(self, features: Encoded) -> Tensor:
         """What queries and keys are at full size."""
-        return self._exact(pixel_shuffle(self.fine_key(features.half), 2))
+        x = self.fine_key(features.half)
+        if self.training:
+            return pixel_shuffle(x, 2)
+        b, c, h, w = x.shape  # shuffled and made exact in one copy
+        pixels = x.view(b, c // 4, 2, 2, h, w).permute(0, 4, 2, 5, 3, 1)
+        exact = pixels.to(torch.float64, memory_format=torch.contiguous_format)
+        return exact.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
 
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there. The
