@@ -53,8 +53,6 @@ class Segments(Batched):
         """Length in pixels. Differentiable, also at zero length (where the gradient is zero)."""
         x, y = (self.end - self.start).unbind(-1)  # a sum over an axis of two takes four times as long
         squared = x * x + y * y
-        if not squared.requires_grad:
-            return squared.sqrt_()
         positive = squared > 0
         return torch.where(positive, torch.where(positive, squared, 1.0).sqrt(), 0.0)
 

@@ -123,7 +123,8 @@ class Prepared:
     @property
     def nbytes(self) -> int:
         """Memory held, of a large frame: as `stored`."""
-        return sum(f.disparity.nbytes + f.facts.nbytes + 2 * (f.matched.numel() + f.colour.numel()) for f in self.matches)
+        colours = sum(found.matched.numel() + found.colour.numel() for found in self.matches)
+        return 2 * colours + sum(found.disparity.nbytes + found.facts.nbytes for found in self.matches)
 
     def cut(self, box: Box) -> Prepared:
         """Of a part of alpha."""

@@ -212,7 +212,7 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
-    length = segments.length
+    length = length_of(segments)
     cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
     end, towards = (segments.end + 0.5) / factor - 0.5, along(segments, length)
     length = torch.where(segments.valid, length / factor, -1.0)
@@ -422,16 +422,25 @@ def matches(
 
     Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`.
     """
-    length = segments.length
+    length = length_of(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
         disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
     far = disparity[:, 0].to(length).clamp(min=0)
     return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments, length)
 
 
+def length_of(segments: Segments) -> Float[Tensor, "*n"]:
+    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the same."""
+    step = segments.end - segments.start
+    if step.requires_grad or not compilable(step):
+        return segments.length
+    x, y = step.unbind(-1)
+    return (x * x).add_(y * y).sqrt_()
+
+
 def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
     """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is known."""
-    length = segments.length if length is None else length
+    length = length_of(segments) if length is None else length
     return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
 
 

@@ -25,7 +25,10 @@ class _Shown(logging.Handler):
 
 @contextmanager
 def steps_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """A block in which `show` is called with the line of every step that begins in this thread; of the innermost block alone."""
+    """A block in which `show` is called with the line of every step that begins in this thread.
+
+    Of the innermost block alone.
+    """
     loggers = [logging.getLogger(name) for name in PACKAGES]
     before = [(logger.level, logger.handlers[:]) for logger in loggers]
     for logger in loggers:
