@@ -22,7 +22,7 @@ from arraygeom import (
 from pat.media.colour import luminance
 from pat.networks import semi_global_kernels as kernels
 from pat.networks.matching import semi_global_matching
-from pat.networks.semi_global import Normalisation, SemiGlobalMatches, equalising_blurs, matches
+from pat.networks.semi_global import Normalisation, SemiGlobalMatches, equalising_blurs, length_of, matches
 
 HW = (64, 96)
 
@@ -56,6 +56,16 @@ def test_aggregation_is_that_of_its_slow_twin():
     total = np.empty(cost.shape, np.int16)
     kernels.aggregate(cost, guide, total)
     assert np.abs(total / kernels.PARTS - slow_aggregate(cost, guide)).max() < 8 / kernels.PARTS
+
+
+def test_lengths_of_plain_numbers_are_those_of_the_segments():
+    start, end = 100 * torch.rand(2, 1, 50, 60, 2, generator=torch.Generator().manual_seed(0))
+    end[0, 0] = start[0, 0]
+    segments = Segments(start, end, torch.ones(1, 50, 60, dtype=torch.bool))
+    assert torch.equal(length_of(segments), segments.length)
+    freed = Segments(start.requires_grad_(), end, segments.valid)
+    (gradient,) = torch.autograd.grad(length_of(freed).sum(), start)
+    assert bool(gradient.isfinite().all())
 
 
 def test_census_is_which_of_48_neighbours_are_darker():
