@@ -28,7 +28,7 @@ Noise = Literal["estimate"] | Mapping[str, NoiseLevel]
 
 LEAST_DEVIATION = 1.5 / 255
 """Images whose noise has a smaller standard deviation, in the mean, are left as they are."""
-PIECE, HALO = 1024, 96
+PIECE, HALO = 1024, 128
 """Sides of the pieces in which an image is denoised, and of what is seen around them, pixels."""
 
 

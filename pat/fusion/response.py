@@ -8,7 +8,6 @@ the power, and sheared along grey, so that neutral stays neutral. The fused imag
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -26,43 +25,32 @@ GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6,
 class ResponseSettings(NamedTuple):
     """Constants of the fit, chosen on Middlebury's Bowling1 and 2, Cloth1, 2 and 4, Flowerpots, Midd1, Plastic, Wood1.
 
-    prior: standard deviation of the weights about Rec. 601's (where their sum is 1), before anything is fitted.
-    independent: how many independent observations all points count as: as many as there are materials, about.
+    usual: weights of a usual sensor, when it is not Rec. 601's; prior: their standard deviation about these.
+    independent: how many independent observations all points count as: about as many as there are materials.
     error: standard deviation of one of those, at least: light and surfaces differ between the views.
     outlier: residuals of this many robust deviations count half.
     points: pixels used at most, and the fewest that are enough.
-    least_change: root mean square change of luma below which the weights are left at Rec. 601's, usually, and where
-        there is a gamma or a gain that is poorly known: wrong matches and light that differs between the views make
-        as much.
-    known: relative standard deviation of the weights' sum up to which it is well known. In a scene of one hue it is
-        not: there another exposure is as good an explanation as another response.
-    least_gain: logarithm of the weights' sum below which it is not taken for another exposure, where the sum is well
-        known and where not.
-    near_one: logarithm of a gain up to which it is left alone, where it explains alpha as well as other weights do.
+    unlikely: by how much another gain, other weights, and both together must lower the misfit (a sum of squares over
+        independent observations, in standard deviations) to be taken. In a scene of one hue several explain alpha.
+    negative: standard deviation of negative weights.
+    least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
     shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
     explained: share of alpha's variance that must be explained.
-    sensor: weights of a usual unfiltered sensor, which sees more blue than Rec. 601.
-    greenest: share of green beyond which weights are of no sensor, where they have less blue than Rec. 601's and alpha
-        is brighter than luma where a sensor would be darker, or the other way round.
-    light: logarithm of the brightness over luma up to which light that differs between the views may be its cause.
     """
 
-    prior: float = 0.15
-    independent: float = 30.0
+    usual: tuple[float, float, float] = (0.32, 0.48, 0.20)
+    prior: float = 0.2
+    independent: float = 20.0
     error: float = 0.012
     outlier: float = 2.0
     points: tuple[int, int] = (6000, 300)
-    least_change: tuple[float, float] = (0.0125, 0.033)
-    known: float = 0.015
-    least_gain: tuple[float, float] = (0.04, 0.18)
-    near_one: float = 0.06
+    unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
+    negative: float = 0.05
+    least_change: float = 0.01
     better: float = 0.8
     shading: tuple[float, float] = (0.08, 0.7)
     explained: float = 0.5
-    sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
-    greenest: float = 0.62
-    light: float = 0.12
 
 
 SETTINGS = ResponseSettings()
@@ -71,7 +59,7 @@ SETTINGS = ResponseSettings()
 class Response(NamedTuple):
     """alpha = weights . (gain * shaded beta^gamma).
 
-    The weights' sum is near 1; where it is not 1, light differs between the views.
+    The weights' sum is 1, where they are not stated otherwise.
     explained: the share of alpha's variance at the matches that this explains, 0 to 1.
     shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none without.
     """
@@ -144,7 +132,7 @@ def fit(
     where: Float[Tensor, "n 2"] | None = None,
     settings: ResponseSettings = SETTINGS,
 ) -> Response:
-    """The response by robust least squares over points, drawn towards Rec. 601 as far as the scene is grey.
+    """The response by robust least squares over points: the most plausible of those that explain alpha.
 
     `where` are the points in beta, in its width and height, from its middle: with them vignetting is found too. Rec.
     601's where there are too few points, or where a combination of bands does not explain alpha.
@@ -207,81 +195,79 @@ def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) ->
 
 
 class _Fit(NamedTuple):
-    """`deviation` is the relative standard deviation of the weights' sum."""
+    """`share` is what each point counts, 0 to 1; `deviation` the robust standard deviation of what is not explained."""
 
     weights: Tensor
     share: Tensor
+    deviation: float
     error: float
     explained: float
-    deviation: float
 
 
 def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> Response:
-    """The response of a fit: its gain apart if it is one, and Rec. 601's weights if hardly anything changes."""
-    rec601, gain = Response.rec601().weights, float(found.weights.sum())
-    unknown = found.deviation > settings.known
-    exposed = gamma != 1 or abs(math.log(gain)) > settings.least_gain[unknown]
-    gain = gain if exposed else 1.0
-    if not exposed and _only_a_gain(x, y, found, settings):
-        return Response(rec601, explained=found.explained)
-    weights = found.weights / gain
-    change = gain * float(((weights - rec601) @ x).square().mean().sqrt())
-    unlike, share = _unlike_sensors(x, y, found, settings), weights / weights.sum()
-    no_sensor = unlike and bool((share[1] > settings.greenest) & (share[2] < rec601[2]))
-    if no_sensor or change < settings.least_change[gamma != 1 or (exposed and unknown)]:
-        return Response(rec601, _ratio(y, rec601 @ x, found) if exposed else 1.0, gamma, found.explained)
-    brighter = _ratio(y, rec601 @ x, found)
-    if unknown and not exposed and unlike and abs(math.log(brighter)) < settings.light:
-        return Response((weights / weights.sum() + rec601) / 2, math.sqrt(brighter), gamma, found.explained)
-    return Response(weights, gain, gamma, found.explained)
+    """The most plausible explanation of alpha: luma as it is, another gain, other weights of sum 1, or both.
 
-
-def _only_a_gain(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
-    """Whether Rec. 601's luma times a gain near 1 explains alpha as well: light differs a little, or exposure."""
-    luma = Response.rec601().weights @ x
-    gain = _ratio(y, luma, found)
-    change = float((found.weights @ x - gain * luma).square().mean().sqrt())
-    apart = abs(math.log(float(found.weights.sum()) / gain))
-    same = apart < 2 * max(found.deviation, 0.005) and change < settings.least_change[0]
-    return same and abs(math.log(gain)) < settings.near_one
-
-
-def _unlike_sensors(x: Tensor, y: Tensor, found: _Fit, settings: ResponseSettings) -> bool:
-    """Whether alpha is brighter than luma where a usual sensor would be darker, or the other way round.
-
-    In a scene of one hue light or exposure explain that as well as a response does, and are as likely if it is little.
+    Several explain it where the scene has one hue. The least unlikely one is taken then, and of a gain little is asked.
     """
-    luma = Response.rec601().weights @ x
-    sensor = luma.new_tensor(settings.sensor) @ x
-    return (_ratio(y, luma, found) - 1) * (_ratio(sensor, luma, found) - 1) < 0
+    rec601, usual = Response.rec601().weights, x.new_tensor(settings.usual)
+    luma, grey, hues = rec601 @ x, usual @ x, CHANGES.T @ x
+    counts = found.share * _importance(found.share, found.deviation, settings)
+    precision = CHANGES.T @ CHANGES / settings.prior**2
+    scale = float(found.weights.sum())
+
+    def explained(rest: Tensor, design: Tensor, *precisions: Tensor) -> tuple[float, Tensor]:
+        prior = torch.block_diag(*precisions)
+        values = torch.linalg.solve((design * counts) @ design.T + prior, (design * counts) @ rest)
+        return float(counts @ (rest - values @ design).square() + values @ prior @ values), values
+
+    def negative(weights: Tensor) -> float:
+        return float((weights.clamp(max=0) / settings.negative).square().sum())
+
+    only_gain, (gain,) = explained(y, luma[None], x.new_zeros(1, 1))
+    only_weights, change = explained(y - grey, hues, precision)
+    both, (total, *rest) = explained(y, torch.stack([grey, *hues]), x.new_zeros(1, 1), precision / scale**2)
+    weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
+    trials = [
+        (only_gain + settings.unlikely[0], rec601, float(gain)),
+        (both + settings.unlikely[2] + negative(further), further, float(total)),
+    ]
+    if gamma == 1:
+        trials.append((only_weights + settings.unlikely[1] + negative(weights), weights, 1.0))
+        trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
+    _, chosen, exposure = min(trials, key=lambda trial: trial[0])
+    if exposure == 1 and float(((chosen - rec601) @ x).square().mean().sqrt()) < settings.least_change:
+        chosen = rec601
+    return Response(chosen, exposure, gamma, found.explained)
 
 
-def _ratio(y: Tensor, luma: Tensor, found: _Fit) -> float:
-    """The factor by which luma is y, by least squares with the fit's weights."""
-    return float((found.share * luma) @ y / ((found.share * luma) @ luma))
+CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
+"""What weights may change by while their sum stays."""
+
+
+def _importance(share: Tensor, deviation: float, settings: ResponseSettings) -> Tensor:
+    """What the square of a point's residual counts where its share is 1."""
+    return settings.independent / share.sum() / max(deviation, settings.error) ** 2
 
 
 def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
-    """Weights s (Rec. 601's + d), d's sum 0, by iteratively reweighted least squares with Cauchy's weights.
+    """Weights s (usual ones + d), d's sum 0, by iteratively reweighted least squares with Cauchy's weights.
 
     Nothing is assumed of s; d is drawn to 0.
     """
-    rec601 = Response.rec601().weights
-    free = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
-    design = torch.stack([rec601 @ x, *(free.T @ x)])
-    weights, share = rec601 * (y.median() / (rec601 @ x).median()), torch.ones_like(y)
+    usual = x.new_tensor(settings.usual)
+    design = torch.stack([usual @ x, *(CHANGES.T @ x)])
+    weights, share, deviation = usual * (y.median() / (usual @ x).median()), torch.ones_like(y), 1.0
     for _ in range(8):
         rest = y - weights @ x
         deviation = max(1.4826 * float(rest.abs().median()), 1e-3)
         share = 1 / (1 + (rest / (settings.outlier * max(deviation, settings.error / 3))).square())
-        counts = share * (settings.independent / share.sum() / max(deviation, settings.error) ** 2)
-        prior = torch.zeros(3, 3, dtype=torch.float64)
-        prior[1:, 1:] = free.T @ free / (settings.prior * float(weights.sum())) ** 2
-        covariance = torch.linalg.inv((design * counts) @ design.T + prior)
-        scale, *change = covariance @ ((design * counts) @ y)
-        weights = scale * rec601 + free @ torch.stack(change)
+        counts = share * _importance(share, deviation, settings)
+        prior = x.new_zeros(3, 3)
+        prior[1:, 1:] = CHANGES.T @ CHANGES / (settings.prior * float(weights.sum())) ** 2
+        scale, *change = torch.linalg.solve((design * counts) @ design.T + prior, (design * counts) @ y)
+        weights = scale * usual + CHANGES @ torch.stack(change)
     rest = y - weights @ x
     centred = y - share @ y / share.sum()
     explained = 1 - float(share @ rest.square() / (share @ centred.square()).clamp(min=1e-12))
     error = float(torch.log1p((rest / 0.02).square()).mean())
-    return _Fit(weights, share, error, max(explained, 0.0), float(covariance[0, 0].sqrt() / scale))
+    return _Fit(weights, share, deviation, error, max(explained, 0.0))

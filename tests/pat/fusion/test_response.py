@@ -55,18 +55,31 @@ def points_of_one_hue():
     return torch.tensor([0.95, 0.65, 0.3])[:, None] * value * (1 + 0.03 * torch.randn(3, 4000, generator=g)), g
 
 
-def test_in_one_hue_a_darker_alpha_is_a_sensor_and_a_brighter_one_may_be_light():
-    """Usual sensors see warm surfaces darker than Rec. 601's luma does: what is brighter may as well be exposure."""
+def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_large_gain_to_weights_of_none():
+    """Both explain alpha there; weights of sum 1 then leave beta's exposure, which is the truth if gains are equal."""
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
-    sensor = fit(x, (torch.tensor([0.33, 0.39, 0.28])[:, None] * x).sum(0) + noise)
-    assert sensor.gain == 1
-    assert not sensor.is_rec601
-    brighter = fit(x, 1.12 * luminance(x[:, None])[0, 0] + noise)
-    assert brighter.gain == pytest.approx(1.12**0.5, abs=0.02)
-    red = fit(x, (torch.tensor([0.65, 0.3, 0.05])[:, None] * x).sum(0) + noise)
-    assert red.gain == 1, "15 % brighter: more than light explains"
-    assert red.weights[0] > 0.45
+    for weights in ((0.33, 0.39, 0.28), (0.65, 0.3, 0.05)):
+        found = fit(x, (torch.tensor(weights)[:, None] * x).sum(0) + noise)
+        assert found.gain == 1
+        assert float(found.weights.sum()) == pytest.approx(1)
+        as_seen = (torch.tensor(weights).double() - found.weights) @ x.double()
+        assert float(as_seen.square().mean().sqrt()) < 0.006
+    exposed = fit(0.5 * x, luminance(x[:, None])[0, 0] + noise)
+    assert exposed.gain == pytest.approx(2.0, abs=0.03)
+    assert exposed.weights.tolist() == list(REC601)
+
+
+def test_light_that_differs_by_object_is_not_taken_for_other_weights():
+    """Four materials, each up to 2 % brighter or darker in the other view, of an alpha that sees another exposure."""
+    g = torch.Generator().manual_seed(0)
+    colours = torch.tensor([[0.7, 0.6, 0.5], [0.3, 0.45, 0.6], [0.6, 0.3, 0.3], [0.35, 0.5, 0.3]]).T
+    material = torch.randint(4, (4000,), generator=g)
+    truth = colours[:, material] * (0.7 + 0.6 * torch.rand(4000, generator=g))
+    light = torch.tensor([1.02, 0.985, 1.015, 0.98])[material]
+    found = fit(0.6 * truth * light, luminance(truth[:, None])[0, 0] + 0.005 * torch.randn(4000, generator=g))
+    assert found.weights.tolist() == list(REC601)
+    assert found.gain == pytest.approx(1 / 0.6, rel=0.02)
 
 
 def test_fusion_of_another_response():
