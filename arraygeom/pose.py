@@ -80,9 +80,9 @@ class Pose(Batched):
 
 def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
     """[v]x, the matrix with [v]x w = v x w."""
-    from kornia.geometry.epipolar import cross_product_matrix  # here, as kornia takes as long to import as torch's ops
-
-    return cross_product_matrix(v)
+    x, y, z = v.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
 
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:

@@ -90,9 +90,9 @@ def _project(first, last, s, lens, x, y, seen):
     elif lens.model == BROWN:
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
-            z = Z if Z > 0 else 1.0
-            x[i], y[i], inside = _brown(lens.c, lens.limit, X / z, Y / z)
-            seen[i] = inside & (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
+            inverse = 1 / (Z if Z > 0 else 1.0)
+            x[i], y[i], seen[i] = X * inverse, Y * inverse, (Z > 0) & (X * X + Y * Y + Z * Z > FRONT**2)
+        _brown(lens.c, lens.limit, x, y, seen)
     else:
         for i in range(len(s)):
             X, Y, Z = a[0] + s[i] * b[0], a[1] + s[i] * b[1], a[2] + s[i] * b[2]
@@ -105,24 +105,32 @@ def _project(first, last, s, lens, x, y, seen):
 
 
 @compiled(inline="always")
-def _brown(c, limit, x, y):
-    """Distorted normalised points, and which are valid; `distortion._brown_distort` without a tilt."""
-    squared = x * x + y * y
-    pull = math.sqrt(limit / (squared if squared > limit else limit))
-    x, y = x * pull, y * pull
+def _brown(c, limit, x, y, seen):
+    """Normalised points become distorted ones, and those that are not valid unseen; `distortion._brown_distort` without
+    a tilt."""
+    farthest = 0.0
+    for i in range(len(x)):
+        farthest = max(farthest, x[i] * x[i] + y[i] * y[i])
+    if not farthest < limit:
+        for i in range(len(x)):
+            squared = x[i] * x[i] + y[i] * y[i]
+            pull = math.sqrt(limit / (squared if squared > limit else limit))
+            x[i], y[i], seen[i] = x[i] * pull, y[i] * pull, seen[i] & (squared < limit)
     k1, k2, p1, p2, k3, k4 = c[0], c[1], c[2], c[3], c[4], c[5]
     k5, k6, s1, s2, s3, s4 = c[6], c[7], c[8], c[9], c[10], c[11]
-    u = x * x + y * y
-    top, bottom = 1 + u * (k1 + u * (k2 + u * k3)), 1 + u * (k4 + u * (k5 + u * k6))
-    g = top / bottom
-    dg = (k1 + u * (2 * k2 + 3 * u * k3) - g * (k4 + u * (2 * k5 + 3 * u * k6))) / bottom
-    x_d = x * g + 2 * p1 * x * y + p2 * (u + 2 * x * x) + u * (s1 + s2 * u)
-    y_d = y * g + p1 * (u + 2 * y * y) + 2 * p2 * x * y + u * (s3 + s4 * u)
-    cross, prism_x, prism_y = 2 * (x * y * dg + p1 * x + p2 * y), 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
-    xx = g + 2 * x * x * dg + 2 * p1 * y + 6 * p2 * x + prism_x * x
-    yy = g + 2 * y * y * dg + 6 * p1 * y + 2 * p2 * x + prism_y * y
-    determinant = xx * yy - (cross + prism_x * y) * (cross + prism_y * x)
-    return x_d, y_d, (squared < limit) & (determinant > 0) & (xx + yy > 0)
+    for i in range(len(x)):
+        a, b = x[i], y[i]
+        u = a * a + b * b
+        inverse = 1 / (1 + u * (k4 + u * (k5 + u * k6)))
+        g = (1 + u * (k1 + u * (k2 + u * k3))) * inverse
+        dg = (k1 + u * (2 * k2 + 3 * u * k3) - g * (k4 + u * (2 * k5 + 3 * u * k6))) * inverse
+        x[i] = a * g + 2 * p1 * a * b + p2 * (u + 2 * a * a) + u * (s1 + s2 * u)
+        y[i] = b * g + p1 * (u + 2 * b * b) + 2 * p2 * a * b + u * (s3 + s4 * u)
+        cross, prism_x, prism_y = 2 * (a * b * dg + p1 * a + p2 * b), 2 * (s1 + 2 * s2 * u), 2 * (s3 + 2 * s4 * u)
+        xx = g + 2 * a * a * dg + 2 * p1 * b + 6 * p2 * a + prism_x * a
+        yy = g + 2 * b * b * dg + 6 * p1 * b + 2 * p2 * a + prism_y * b
+        determinant = xx * yy - (cross + prism_x * b) * (cross + prism_y * a)
+        seen[i] = seen[i] & (determinant > 0) & (xx + yy > 0)
 
 
 @compiled(inline="always")

@@ -22,12 +22,12 @@ def nearest_pixels(first, last, line, centre, usable, window, tie, hw, xy, mask)
     count, most = mask.shape[1], (2 * window + 1) ** 2
     keys, pixels = np.empty(most, line.dtype), np.empty((most, 2), np.int32)
     order, begins = np.empty(most, np.int32), np.empty(BUCKETS + 1, np.int32)
-    sorted_keys = np.empty(most, line.dtype)
+    sorted_keys, buckets = np.empty(most, line.dtype), np.empty(most, np.int32)
     for p in range(first, last):
         found = 0
         if usable[p]:
             found, limit = _within(line[p], centre[p], window, tie, hw, count, keys, pixels)
-            _sort(keys, found, limit, order, begins, sorted_keys)
+            _sort(keys, found, limit, order, begins, buckets, sorted_keys)
         for i in range(count):
             mask[p, i] = i < found
             xy[p, i, 0] = pixels[order[i], 0] if i < found else 0
@@ -74,18 +74,20 @@ def _collect(line, at_centre, x, y, window, tie, hw, limit, keys, pixels):
 
 
 @compiled(inline="always")
-def _sort(keys, n, limit, order, begins, found):
+def _sort(keys, n, limit, order, begins, buckets, found):
     """The order of keys in 0 .. limit, and `found`, the keys in that order: into buckets, then by insertion."""
-    scale = BUCKETS / limit
+    scale = keys.dtype.type(BUCKETS / limit)
     begins[:] = 0
     for i in range(n):
-        begins[min(int(keys[i] * scale), BUCKETS - 1) + 1] += 1
+        buckets[i] = min(np.int32(keys[i] * scale), BUCKETS - 1)
+    for i in range(n):
+        begins[buckets[i] + 1] += 1
     for k in range(BUCKETS):
         begins[k + 1] += begins[k]
     for i in range(n):
-        bucket = min(int(keys[i] * scale), BUCKETS - 1)
-        order[begins[bucket]], found[begins[bucket]] = i, keys[i]
-        begins[bucket] += 1
+        at = begins[buckets[i]]
+        order[at], found[at] = i, keys[i]
+        begins[buckets[i]] = at + 1
     for i in range(1, n):
         one, key, at = order[i], found[i], i
         while at > 0 and found[at - 1] > key:

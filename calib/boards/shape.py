@@ -12,7 +12,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import f as f_distribution
 
 PARAMETERS = 4
 """Per board: stretch of y against x, curvatures xx, xy, yy (1/m)."""
@@ -102,6 +101,8 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
 
 def is_significant(values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int) -> bool:
     """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's test)."""
+    from scipy.stats import f as f_distribution  # here, as it takes half a second to import
+
     count = len(values)
     if frames < 2 * count + 2:
         return False

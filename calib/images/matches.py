@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
-from kornia.color import rgb_to_grayscale
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -90,8 +89,9 @@ def detect_features(image: Float[Tensor, "_ h w"]) -> SiftFeatures:
 
 def contrast_equalised(image: Float[Tensor, "_ h w"]) -> UInt8[NDArray, "h w"]:
     """An image's luminance, its contrast equalised (CLAHE)."""
-    grey = rgb_to_grayscale(image)[0] if image.shape[0] == 3 else image[0]
-    return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clamp(0, 1).numpy() * 255).astype(np.uint8))
+    values = image.movedim(0, -1).float().contiguous().numpy()
+    grey = cv2.cvtColor(values, cv2.COLOR_RGB2GRAY) if image.shape[0] == 3 else values[..., 0]
+    return cv2.createCLAHE(3, (8, 8)).apply(np.rint(grey.clip(0, 1) * 255).astype(np.uint8))
 
 
 def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:

@@ -12,13 +12,14 @@ from torch import Tensor
 
 from arraygeom import Rig
 
-from .doctor import diagnose_matches
 from .held_out import line_distances
 from .matches import Matches, match_cameras
 from .residuals import match_depths, own_distance, related
 
 LARGEST_SIDE = 1000
-"""Images are reduced to this many pixels."""
+"""Images are reduced to this many pixels..."""
+ROUGH_SIDE = 500
+"""... but first to this many: a rig that fits then is not compared again. That takes a quarter of the time."""
 MOST_CAMERAS = 4
 BADLY, OF_OWN = 1.5, 3.0
 """A rig fits badly whose points lie farther from their lines than this, in pixels of the reduced images (median), and
@@ -59,10 +60,48 @@ def find_misfit(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Misfi
     some = {name: images[name] for name in list(images.keys())[:MOST_CAMERAS]}
     if len(some) < 2 or any(rig[name].hw != tuple(image.shape[1:]) for name, image in some.items()):
         return None
+    rough = _compared(rig, some, ROUGH_SIDE)
+    limit = BADLY * _scale(some, ROUGH_SIDE) / _scale(some, LARGEST_SIDE)
+    if rough is not None and rough.off <= limit and rough.outside <= OUTSIDE:
+        return None
+    found = _compared(rig, some, LARGEST_SIDE)
+    if found is None:
+        return None
+    rig, pairs, off, outside = found
+    if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)) and not outside > OUTSIDE:
+        return None
+    points = sum(len(matches.alpha) for matches in pairs.values())
+    at = "" if _scale(some, LARGEST_SIDE) == 1 else f", in images reduced to {LARGEST_SIDE} px"
+    text = f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines (median{at})"
+    if outside > OUTSIDE:
+        text += f", {outside:.0%} of them behind the cameras or outside the depth range"
+    from .doctor import diagnose_matches  # here, as SciPy's statistics take long to import
+
+    diagnosis = diagnose_matches(rig, {name: rig[name].hw for name in some}, pairs)
+    verdict = "" if diagnosis.healthy else f"; `pat rig doctor` says: {diagnosis.verdict}"
+    return Misfit(off, outside, diagnosis.named.kind != "nothing", text + verdict)
+
+
+class _Compared(NamedTuple):
+    """Matched points of reduced images: their median distance from their lines (pixels), and `share_outside`."""
+
+    rig: Rig
+    pairs: Mapping[tuple[str, str], Matches]
+    off: float
+    outside: float
+
+
+def _scale(images: Mapping[str, Tensor], largest: int) -> float:
+    """By what an image is reduced, of all the one that is reduced most."""
+    return min(1.0, *(largest / max(image.shape[1:]) for image in images.values()))
+
+
+def _compared(rig: Rig, images: Mapping[str, Tensor], largest: int) -> _Compared | None:
+    """Points matched between images whose sides are reduced to that many pixels at most; None if they are too few."""
     reduced = {}
-    for name, image in some.items():
+    for name, image in images.items():
         h, w = image.shape[1:]
-        scale = min(1.0, LARGEST_SIDE / max(h, w))
+        scale = min(1.0, largest / max(h, w))
         hw = round(h * scale), round(w * scale)
         rig = rig.resize(name, hw)
         reduced[name] = torch.nn.functional.interpolate(image[None], hw, mode="area")[0] if scale < 1 else image
@@ -70,23 +109,15 @@ def find_misfit(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Misfi
         pairs = related(rig, match_cameras(reduced))
     except ValueError:
         return None
-    off, outside = float(line_distances(rig, pairs).abs().median()), share_outside(rig, pairs)
-    if off <= max(BADLY, OF_OWN * own_distance(rig, pairs)) and outside <= OUTSIDE:
-        return None
-    points = sum(len(matches.alpha) for matches in pairs.values())
-    at = "" if all(reduced[name] is some[name] for name in some) else f", in images reduced to {LARGEST_SIDE} px"
-    text = f"the rig fits these images badly: {points} matched points lie {off:.1f} px from their lines (median{at})"
-    if outside > OUTSIDE:
-        text += f", {outside:.0%} of them behind the cameras or outside the depth range"
-    found = diagnose_matches(rig, {name: rig[name].hw for name in some}, pairs)
-    verdict = "" if found.healthy else f"; `pat rig doctor` says: {found.verdict}"
-    return Misfit(off, outside, found.named.kind != "nothing", text + verdict)
+    off = float(line_distances(rig, pairs).abs().median())
+    return _Compared(rig, pairs, off, share_outside(rig, pairs))
 
 
 def share_outside(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:
-    """The share of points of observable depth that are behind the cameras or outside the rig's depth range; 0 for few.
+    """The share of points of observable depth that are behind the cameras or outside the rig's depth range.
 
-    Points of calibrated pairs only; the depth range counts with a margin.
+    Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range counts with a
+    margin.
     """
     near, far = (0.0, math.inf) if rig.depth is None else (float(rig.depth[0]) / BEYOND, float(rig.depth[1]) * BEYOND)
     outside = []
@@ -94,5 +125,7 @@ def share_outside(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:
         if (found := match_depths(rig.pair(*names), matches)) is not None:
             inside = found.front & (found.depth >= near) & (found.depth <= far)
             outside.append(~inside[found.observable])
-    joined = torch.cat(outside) if outside else torch.zeros(0)
-    return float(joined.double().mean()) if len(joined) >= FEW else 0.0
+    if not outside:
+        return 0.0
+    joined = torch.cat(outside)
+    return float(joined.double().mean()) if len(joined) >= FEW else math.nan

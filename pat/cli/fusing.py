@@ -7,7 +7,8 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Positional, UseAppendAction, arg
 
 from . import options
+from .one_frame import fuse_with_progress
 from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Numbers, Out, Weights, optional, say
 
 if TYPE_CHECKING:
@@ -26,9 +28,7 @@ if TYPE_CHECKING:
 
     from ..fusion.report import Facts
     from ..fusion.results import Frame
-    from ..fusion.tiles import Plan
     from ..fusion.views import ViewFiles
-    from ..networks.pieces import Tile
 
 LOG = logging.getLogger(__name__)
 
@@ -168,11 +168,17 @@ class Fuse:
             raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
-        if not self.sequence:
-            warn_of_wrong_rig(views)
-        if self.sequence or max(map(len, found.values())) > 1:
+        if self.sequence:
             return self._many(rig, found, self.alpha)
-        self._one(views.developed, views, self.alpha)
+        with ThreadPoolExecutor(1) as beside:
+            compared = beside.submit(warn_of_wrong_rig, views)
+            several = max(map(len, found.values())) > 1
+            if several or self.strict or self.max_memory is not None:
+                with options.working("comparing the rig with the images"):
+                    compared.result()
+            if several:
+                return self._many(rig, found, self.alpha)
+            self._one(views.developed, views, self.alpha, before_writing=compared.result)
 
     def _without_rig(self) -> None:
         from .from_images import camera_names, files_of, frames_of_videos
@@ -249,7 +255,15 @@ class Fuse:
             rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, time_offset=offset)))
         return rig
 
-    def _one(self, rig: Rig, images: Mapping[str, Tensor], alpha: str, *, found: tuple[str, ...] | None = None) -> None:
+    def _one(
+        self,
+        rig: Rig,
+        images: Mapping[str, Tensor],
+        alpha: str,
+        *,
+        found: tuple[str, ...] | None = None,
+        before_writing: Callable[[], None] = lambda: None,
+    ) -> None:
         """Fuse one frame. `found` is what was found out about the rig, if it was found from the images."""
         from arraygeom import Camera
         from arraygeom.atomic import sweep
@@ -283,6 +297,7 @@ class Fuse:
                 device=self.device,
                 precision=self.precision,
             )
+            before_writing()
             frame, gain = self._exposed(frame)
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
@@ -453,48 +468,10 @@ def warn_of_wrong_rig(views: ViewFiles) -> None:
 
     from ..fusion.checks import LowConfidenceWarning
 
-    with options.working("comparing the rig with the images"):
-        try:
-            found = find_misfit(views.developed, dict(views))
-        except (ValueError, OSError):  # of a file or an image: the fusion says so
-            return
+    try:
+        found = find_misfit(views.developed, dict(views))
+    except (ValueError, OSError):  # of a file or an image: the fusion says so
+        return
     if found is not None:
         wrong = found.mistaken or found.outside > OUTSIDE
         warnings.warn(found.text, LowConfidenceWarning if wrong else UserWarning, stacklevel=2)
-
-
-def fuse_with_progress(
-    weights: str,
-    rig: Rig,
-    images: Mapping[str, Tensor],
-    *,
-    device: str = "cpu",
-    precision: Literal["float32", "bfloat16"] = "float32",
-    **further: Any,
-) -> Frame:
-    """`fuse` with weights by name, the plan and a bar on the terminal. The frame is on the CPU."""
-    from ..fusion.fuse import fuse
-    from ..fusion.results import Frame
-    from ..networks.weights import load_weights
-
-    where = options.device_of(device)
-    network = load_weights(weights, precision=precision).to(where)
-    if where != "cpu":
-        rig, images = rig.to(where), {name: image.to(where) for name, image in images.items()}
-    options.say_when_compiling()
-    with options.working("fusing") as retitle:
-
-        def announce(plan: Plan) -> None:
-            say(f"plan: {plan}")
-            retitle("fusing" if plan.seconds is None else f"fusing, about {plan.duration} in all")
-
-        frame = fuse(network, rig, images, progress=_numbered, announce=announce, **further)
-    return Frame(*(part.cpu() for part in frame))
-
-
-def _numbered(tiles: Iterable[Tile], count: int) -> Iterator[Tile]:
-    """The tiles, each said as it begins where there are several."""
-    for i, tile in enumerate(tiles, 1):
-        if count > 1:
-            LOG.info("tile %d of %d", i, count)
-        yield tile

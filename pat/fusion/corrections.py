@@ -89,9 +89,10 @@ def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given
     ValueError for a stated response that is not three weights, none negative, or where there is no RGB beta.
     """
     found = Corrections(_given(response, frame.inputs))
-    judges = isinstance(network, GuidedPAT | BandwisePAT)
-    fits = response == "fit" and judges and any(map(_is_rgb, frame.inputs.betas))
-    align = align and judges and all(beta.field.pixels is not None for beta in frame.inputs.betas)
+    if not isinstance(network, GuidedPAT | BandwisePAT):
+        return found
+    fits = response == "fit" and any(map(_is_rgb, frame.inputs.betas))
+    align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
     if not fits and not align:
         return found
     small = _reduced_frame(frame)
@@ -185,10 +186,10 @@ class _Matches(NamedTuple):
         return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
 
 
-def _matches(network: FusionNetwork, frame: FrameInputs, found: Corrections) -> list[_Matches]:
+def _matches(network: GuidedPAT | BandwisePAT, frame: FrameInputs, found: Corrections) -> list[_Matches]:
     """Matches of each beta with what has been found put right."""
     inputs = found.applied(frame.inputs, frame.hw)
-    output = network(inputs)
+    output = network.matched(inputs)
     parts = zip(frame.inputs.betas, inputs.betas, output.position, output.confidence)
     return [_of_beta(inputs.alpha, *part, frame.hw) for part in parts]
 

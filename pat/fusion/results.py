@@ -24,6 +24,8 @@ from ..media.raw import developed
 
 MOST = 65535
 """The largest count of 16 bits."""
+ROWS = 64
+"""Rows whose depth is converted at a time."""
 
 ImageFormat = Literal["png", "tif", "exr"]
 
@@ -90,11 +92,12 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
     known = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[known].min()))
     counts = np.zeros(depth.shape, np.uint16)
-    for rows, found, seen in zip(counts, depth, known):
-        rows[seen.numpy()] = np.rint(found[seen].double().numpy() * scale).clip(1, MOST)
+    for top in range(0, len(counts), ROWS):
+        part, seen = slice(top, top + ROWS), known[top : top + ROWS]
+        counts[part][seen.numpy()] = np.rint(depth[part][seen].double().numpy() * scale).clip(1, MOST)
     said = PngInfo()
     said.add_text("Description", f"depth: {scale:g} counts a metre; 0 is unknown, {MOST} that far or farther")
-    Image.fromarray(counts).save(path, format="PNG", pnginfo=said)
+    Image.fromarray(counts).save(path, format="PNG", pnginfo=said, compress_level=4)
     return scale
 
 

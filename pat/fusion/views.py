@@ -116,14 +116,19 @@ class DevelopedImages(NamedTuple):
     images: dict[str, Tensor]
 
 
+KEPT = 4_000_000
+"""Values of an image up to which it is kept: reading it again takes longer than the memory is worth."""
+
+
 class ViewFiles(Mapping[str, Tensor]):
-    """An image file of each camera, read and developed when asked for, and not kept.
+    """An image file of each camera, read and developed when asked for; kept if it is small (`KEPT`).
 
     Asking raises as `read_views` does.
     """
 
     def __init__(self, rig: Rig, files: Mapping[str, str | Path], *, alpha: str) -> None:
         self.rig, self.files, self.like = rig, files, rig[alpha].sensor
+        self._kept: dict[str, Tensor] = {}
 
     def __iter__(self) -> Iterator[str]:
         return iter(self.files)
@@ -135,7 +140,12 @@ class ViewFiles(Mapping[str, Tensor]):
         return name in self.files
 
     def __getitem__(self, name: str) -> Tensor:
-        return read_view(self.rig, name, self.files[name], like=self.like)
+        if name in self._kept:
+            return self._kept[name]
+        image = read_view(self.rig, name, self.files[name], like=self.like)
+        if image.numel() <= KEPT:
+            self._kept[name] = image
+        return image
 
     @property
     def developed(self) -> Rig:

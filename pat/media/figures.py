@@ -25,12 +25,14 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     known = depth.isfinite()
     inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
     low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
-    colours = torch.zeros(3, *depth.shape)
+    colours = torch.empty(3, *depth.shape)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
-    turbo = torch.from_numpy(table.T / np.float32(255))
+    turbo = torch.from_numpy(np.pad(table, ((0, 1), (0, 0))).T / np.float32(255))  # and black
     for rows, found, seen in zip(colours.split(256, 1), inverse.split(256), known.split(256)):
-        scaled = ((found - low) / max(high - low, 1e-12)).clamp(0, 1)
-        rows[:, seen] = turbo[:, (256 * scaled).long().clamp(max=255)][:, seen]
+        scaled = (256 / max(high - low, 1e-12) * (found - low)).int().clamp_(0, 255)
+        which = torch.where(seen, scaled, 256).flatten()
+        for row, values in zip(rows, turbo):
+            row.copy_(values.index_select(0, which).view(row.shape))
     return colours
 
 

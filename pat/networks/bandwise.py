@@ -44,7 +44,7 @@ class BandwisePAT(nn.Module):
 
     def prepare(self, inputs: Inputs) -> Prepared:
         """For each beta how its bands are combined and normalised, and by that its semi-global matches."""
-        return prepared(inputs, self._combination, lambda combined: combined[0].of, _matches)
+        return prepared(inputs, self._combination, lambda found: (found[0].of, found[1]), _matches)
 
     def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
         """The combination of the one beta's bands that is most like alpha, and how that is normalised."""
@@ -70,6 +70,13 @@ class BandwisePAT(nn.Module):
         ]
         estimates = [estimate for _, estimate in parts]
         return output_of(torch.cat([image for image, _ in parts], 1), estimates), estimates
+
+    def matched(self, inputs: Inputs) -> FusionOutput:
+        """Positions and their confidences alone: the image is alpha."""
+        state = self.prepare(inputs)
+        own, parts = self.single.encoder(inputs.alpha), zip(inputs.betas, state.matches, state.common)
+        estimates = [self.single.estimate(own, inputs.alpha, b, found, guide=mix.of) for b, found, (mix, _) in parts]
+        return output_of(inputs.alpha, estimates)
 
     def _of_beta(
         self, own: Encoded, alpha: Tensor, beta: Beta, found: SemiGlobalMatches, mix: SpectralMix

@@ -131,7 +131,7 @@ class GuidedPAT(nn.Module):
 
         Betas that each have all bands agree on depth, and share the colour that is diffused.
         """
-        found = prepared(inputs, _normalisations, lambda _: brightness, _matches)
+        found = prepared(inputs, _normalisations, lambda found: (brightness, found), _matches)
         if not can_agree(inputs) or self._in_parts(inputs):
             return found
         return replace(found, matches=self._shared(inputs, found))
@@ -170,15 +170,24 @@ class GuidedPAT(nn.Module):
         bands = sum(beta.image.shape[1] for beta in inputs.betas)
         if parts and bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
-        alpha, state = inputs.alpha, state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
-        own = self.encoder(alpha)
-        estimates = [self.estimate(own, alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
+        alpha = inputs.alpha
+        own, estimates = self._estimates(inputs, state)
         used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
         return (output if parts else output._replace(overall=used[0].confidence)), estimates
+
+    def matched(self, inputs: Inputs) -> FusionOutput:
+        """Positions and their confidences alone: the image is alpha."""
+        return output_of(inputs.alpha, self._estimates(inputs, None)[1])
+
+    def _estimates(self, inputs: Inputs, state: Prepared | None) -> tuple[Encoded, list[BetaEstimate]]:
+        """Alpha's features, and the estimate of each beta."""
+        state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
+        own = self.encoder(inputs.alpha)
+        return own, [self.estimate(own, inputs.alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
 
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
@@ -240,7 +249,13 @@ class GuidedPAT(nn.Module):
 
     def _key(self, features: Encoded) -> Tensor:
         """What queries and keys are at full size."""
-        return self._exact(pixel_shuffle(self.fine_key(features.half), 2))
+        x = self.fine_key(features.half)
+        if self.training:
+            return pixel_shuffle(x, 2)
+        b, c, h, w = x.shape  # shuffled and made exact in one copy
+        pixels = x.view(b, c // 4, 2, 2, h, w).permute(0, 4, 2, 5, 3, 1)
+        exact = pixels.to(torch.float64, memory_format=torch.contiguous_format)
+        return exact.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
 
     def _exact(self, x: Tensor) -> Tensor:
         """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there. The

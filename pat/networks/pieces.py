@@ -83,18 +83,20 @@ def matching_pieces(hw: HW, multiple: int) -> list[Tile]:
     return list(tiles_of(hw, sides_by_work(hw, MATCHING_HALO, multiple, MATCHED_AT_ONCE)[0], MATCHING_HALO))
 
 
-def matched_in_pieces(inputs: Inputs, brightness: Callable[[Tensor], Tensor], match: Match) -> SemiGlobalMatches:
+def matched_in_pieces(
+    inputs: Inputs, brightness: Callable[[Tensor], Tensor], normalisations: Normalisations, match: Match
+) -> SemiGlobalMatches:
     """The matches of a frame with one beta; of a large one, from the inner parts of pieces that begin with matches of
     the whole frame at half the size. Colours of those are stored as float16.
 
-    `brightness` makes of beta's bands what alpha is compared with.
+    `brightness` makes of beta's bands what alpha is compared with; `normalisations` are those of whole images.
     """
     pieces = matching_pieces(inputs.hw, inputs.multiple)
     if len(pieces) == 1:
         return match(inputs, None)
     (beta,) = inputs.betas
     guide, blocks = brightness(beta.image), beta.field.of_blocks(FINE)
-    half = matched_at_half_size(inputs.alpha, guide, blocks, Normalisations.of(inputs.alpha, guide).half)
+    half = matched_at_half_size(inputs.alpha, guide, blocks, normalisations.half)
     del guide, blocks
     give_back()
     found: list[Tensor] = []
@@ -121,7 +123,8 @@ class Prepared:
     @property
     def nbytes(self) -> int:
         """Memory held, of a large frame: as `stored`."""
-        return sum(part.nbytes for found in self.matches for part in found.stored())
+        colours = sum(found.matched.numel() + found.colour.numel() for found in self.matches)
+        return 2 * colours + sum(found.disparity.nbytes + found.facts.nbytes for found in self.matches)
 
     def cut(self, box: Box) -> Prepared:
         """Of a part of alpha."""
@@ -132,14 +135,17 @@ class Prepared:
 def prepared(
     inputs: Inputs,
     common: Callable[[Inputs], Any],
-    brightness: Callable[[Any], Callable[[Tensor], Tensor]],
+    comparison: Callable[[Any], tuple[Callable[[Tensor], Tensor], Normalisations]],
     match: Callable[[Inputs, Any, HalfSizeMatches | None], SemiGlobalMatches],
 ) -> Prepared:
-    """`common` of each beta, and by that its matches. Each beta for itself. For the rest see `matched_in_pieces`."""
+    """`common` of each beta, and by that its matches. Each beta for itself.
+
+    `comparison` gives by that the `brightness` and `normalisations` of `matched_in_pieces`.
+    """
     betas = [inputs.of_beta(i) for i in range(len(inputs.betas))]
     facts = tuple(common(one) for one in betas)
     found = []
     for i, (one, known) in enumerate(zip(betas, facts), 1):
         LOG.info("matching beta %d of %d", i, len(betas))
-        found.append(matched_in_pieces(one, brightness(known), lambda piece, half, f=known: match(piece, f, half)))
+        found.append(matched_in_pieces(one, *comparison(known), lambda piece, half, f=known: match(piece, f, half)))
     return Prepared(tuple(found), facts)

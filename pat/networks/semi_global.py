@@ -212,11 +212,11 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
-    length = segments.length
+    length = length_of(segments)
     cut = segments.valid & ~on_image(segments.start - 0.5, (hw[0] - 1, hw[1] - 1))
-    end = (segments.end + 0.5) / factor - 0.5
+    end, towards = (segments.end + 0.5) / factor - 0.5, along(segments, length)
     length = torch.where(segments.valid, length / factor, -1.0)
-    planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, along(segments), length, cut))
+    planes = (numpy_of(x.expand(batch, *x.shape[1:])) for x in (end, towards, length, cut))
     return _Geometry(*planes)
 
 
@@ -273,7 +273,7 @@ def _block(views: tuple, box: tuple, labels: int, disparity: NDArray, facts: NDA
     a, a_bits, e, u, n, o = (np.ascontiguousarray(x[outer]) for x in planes)
     cost = np.empty((*a.shape, labels), np.uint8)
     kernels.costs(a, a_bits, other, other_bits, e, u, n, o, cost)
-    total = np.zeros(cost.shape, np.float32)
+    total = np.empty(cost.shape, np.int16)
     kernels.aggregate(cost, a, total)
     r, f = np.empty(a.shape, np.float32), np.empty((*a.shape, 3), np.float32)
     kernels.winners(total, e, u, n, o, *other.shape, r, f)
@@ -422,16 +422,25 @@ def matches(
 
     Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`.
     """
-    length = segments.length
+    length = length_of(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
         disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
     far = disparity[:, 0].to(length).clamp(min=0)
-    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments)
+    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments, length)
 
 
-def along(segments: Segments) -> Float[Tensor, "*n 2"]:
-    """Unit vectors from end to start; zero where a segment is a point."""
-    length = segments.length
+def length_of(segments: Segments) -> Float[Tensor, "*n"]:
+    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the same."""
+    step = segments.end - segments.start
+    if step.requires_grad or not compilable(step):
+        return segments.length
+    x, y = step.unbind(-1)
+    return (x * x).add_(y * y).sqrt_()
+
+
+def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
+    """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is known."""
+    length = length_of(segments) if length is None else length
     return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
 
 

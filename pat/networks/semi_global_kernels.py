@@ -11,7 +11,6 @@ NOWHERE = np.uint8(80)
 UNSEEN = np.uint8(24)
 """Cost of a label beyond beta's edge, where the point may well be: about that of a mismatch."""
 MOST = np.float32(1e9)
-MOST_BITS = MOST.view(np.int32)
 LEVELS = np.float32(30.0)
 """Cost of a difference of 1 in (normalised) brightness, which counts up to `TRUNCATED`."""
 TRUNCATED = np.float32(20.0)
@@ -25,6 +24,11 @@ MOST_BEYOND = np.float32(0.3)
 """Brightness this far from the mean of what is around counts as no farther in a regression."""
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
+PARTS = 16
+"""Sums of costs are whole numbers of a 16th, of 16 bits: twice as many as floats go through memory in the same time."""
+STEP = np.int16(SMALL * PARTS)
+WALL = np.int16(30000)
+"""More than a sum of costs along a path can be."""
 
 
 @compiled(nogil=True, cache=True)
@@ -67,6 +71,23 @@ def dissimilarity(own, own_bits, other, other_bits):
     return np.uint8(_count(own_bits ^ other_bits)) + np.uint8(min(abs(own - other) * LEVELS, TRUNCATED))
 
 
+@compiled(inline="always")
+def _places(end, along, count, rows, columns, out):
+    """Where the first labels are in beta, pixels counted row by row; -1 for those that are not on it."""
+    for label in range(count):
+        disparity = np.float32(label)
+        column = np.int32(np.floor(end[0] + disparity * along[0] + HALF))
+        row = np.int32(np.floor(end[1] + disparity * along[1] + HALF))
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
+        out[label] = np.int32(row * columns + column) if inside else np.int32(-1)
+
+
+@compiled(inline="always")
+def _count_within(length, labels):
+    """How many labels are on a segment."""
+    return min(max(int(np.floor(length + HALF)) + 1, 0), labels)
+
+
 @compiled(nogil=True, cache=True)
 def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
     """Dissimilarity of alpha's pixel (own) and beta's (other) at each label: out (h, w, labels).
@@ -76,41 +97,38 @@ def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
     """
     height, width, labels = out.shape
     rows, columns = other.shape
+    values, bits = other.ravel(), other_bits.ravel()
+    places = np.empty(labels, np.int32)
     for y in range(height):
         for x in range(width):
-            disparity = length[y, x] + HALF
-            beyond = UNSEEN if cut[y, x] else NOWHERE
-            for label in range(labels):
-                column, row = _pixel(end[y, x], along[y, x], label)
-                if label > disparity:
-                    out[y, x, label] = beyond
-                elif column < 0 or row < 0 or column >= columns or row >= rows:
-                    out[y, x, label] = NOWHERE
-                else:
-                    place = row, column
-                    out[y, x, label] = dissimilarity(own[y, x], own_bits[y, x], other[place], other_bits[place])
+            count, found = _count_within(length[y, x], labels), out[y, x]
+            _places(end[y, x], along[y, x], count, rows, columns, places)
+            for label in range(count):
+                at = max(places[label], 0)
+                cost = dissimilarity(own[y, x], own_bits[y, x], values[at], bits[at])
+                found[label] = cost if places[label] >= 0 else NOWHERE
+            found[count:] = UNSEEN if cut[y, x] else NOWHERE
 
 
 @compiled(inline="always")
-def _least(bits, first, last):
-    """The least of costs from `first` to before `last`, none of which is negative: by their bits, as loops over floats
-    that keep a minimum do not become vector instructions."""
-    least = MOST_BITS
+def _least(costs, first, last):
+    """The least of costs from `first` to before `last`."""
+    least = WALL
     for i in range(first, last):
-        least = min(least, bits[i])
+        least = min(least, costs[i])
     return least
 
 
 @compiled(inline="always")
-def _advance(before, least, cost, total, now, bits, jump):
-    """One step of a path: its costs `now` (from index 1; a wall at both ends; `bits` are the same), added to `total`;
-    the least. A loop for each array that is written: else they do not become vector instructions."""
-    labels, leap = len(cost), least + jump
-    for i in range(labels):
-        now[i + 1] = np.float32(cost[i]) + min(min(before[i], before[i + 2]) + SMALL, min(before[i + 1], leap)) - least
-    for i in range(labels):
-        total[i] += now[i + 1]
-    return np.int32(_least(bits, 1, labels + 1)).view(np.float32)
+def _advance(before, least, jump, cost, now):
+    """One step of a path: its costs `now`, from index 1, a wall at both ends; the least. All in parts."""
+    leap, fewest = np.int16(least + jump), WALL
+    for i in range(len(cost)):
+        step = np.int16(min(before[i], before[i + 2]) + STEP)
+        stay = min(before[i + 1], leap)
+        path = np.int16(np.int16(cost[i] * PARTS) + np.int16(min(step, stay) - least))
+        now[i + 1], fewest = path, min(fewest, path)
+    return fewest
 
 
 @compiled(inline="always")
@@ -118,61 +136,76 @@ def _jump(a, b):
     return max(SMALL + ONE, LARGE / (ONE + abs(a - b) / EDGE))
 
 
-@compiled(nogil=True, cache=True, fastmath=True)
+@compiled(inline="always")
+def _jump_in_parts(a, b):
+    return np.int16(_jump(a, b) * PARTS + HALF)
+
+
+@compiled(nogil=True, cache=True)
 def aggregate(cost, guide, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008), added to total (h, w, labels)."""
-    for dx in range(-1, 2):
-        for way in range(2):
-            _sweep(cost, guide, total, dx, way)
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008), in parts: total (h, w, labels), int16."""
     for way in range(2):
-        _sweep_rows(cost, guide, total, way)
+        _sweep(cost, guide, total, way)
 
 
 @compiled(inline="always")
-def _sweep_rows(cost, guide, total, way):
-    """Paths along rows."""
+def _sweep(cost, guide, total, way):
+    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the row, and
+    from three of the row before. With `way` 1 rows and columns are taken from the last.
+
+    Paths are kept where the next row reads them, by the column that will.
+    """
     height, width, labels = cost.shape
-    before, now = np.full((2, labels + 2), MOST, np.float32)
-    before_bits, bits = before.view(np.int32), now.view(np.int32)
-    first, step = (0, 1) if way == 0 else (width - 1, -1)
-    for y in range(height):
-        before[1:-1] = 0
-        least = np.float32(0)
+    above, ahead, behind = np.zeros((3, width + 1, labels + 2), np.int16)
+    side, next_side, next_above, pending, next_behind = np.zeros((5, labels + 2), np.int16)
+    for kept in (above, ahead, behind):
+        kept[:, 0], kept[:, -1] = WALL, WALL
+    for kept in (side, next_side, next_above, pending, next_behind):
+        kept[0], kept[-1] = WALL, WALL
+    fewest = np.zeros((3, width + 1), np.int16)
+    step = 1 - 2 * way
+    for row in range(height):
+        y = row if way == 0 else height - 1 - row
+        side[1:-1] = 0
+        pending[1:-1] = 0
+        of_side, of_pending = np.int16(0), np.int16(0)
         for i in range(width):
-            x = first + i * step
-            jump = _jump(guide[y, x], guide[y, x - step]) if i > 0 else LARGE
-            least = _advance(before, least, cost[y, x], total[y, x], now, bits, jump)
-            before, before_bits, now, bits = now, bits, before, before_bits
+            x = i if way == 0 else width - 1 - i
+            here, values, sums = guide[y, x], cost[y, x], total[y, x]
+            jump = _jump_in_parts(here, guide[y, x - step]) if i > 0 else STEP
+            of_side = _advance(side, of_side, jump, values, next_side)
+            jump = _jump_in_parts(here, guide[y - step, x]) if row > 0 else STEP
+            of_above = _advance(above[i], fewest[0, i], jump, values, next_above)
+            jump = _jump_in_parts(here, guide[y - step, x + step]) if row > 0 and i < width - 1 else STEP
+            fewest[1, i] = _advance(ahead[i + 1], fewest[1, i + 1], jump, values, ahead[i])
+            jump = _jump_in_parts(here, guide[y - step, x - step]) if row > 0 and i > 0 else STEP
+            of_behind = _advance(behind[i], fewest[2, i], jump, values, next_behind)
+            _add(sums, next_side, next_above, ahead[i], next_behind, way == 0)
+            _copy(next_above, above[i])
+            _copy(pending, behind[i])
+            fewest[0, i], fewest[2, i] = of_above, of_pending
+            pending, next_behind, of_pending = next_behind, pending, of_behind
+            side, next_side = next_side, side
 
 
 @compiled(inline="always")
-def _sweep(cost, guide, total, dx, way):
-    """Paths from row to row, that move by `dx` columns on the way."""
-    height, width, labels = cost.shape
-    before, now = np.full((2, width, labels + 2), MOST, np.float32)
-    before_bits, bits = before.view(np.int32), now.view(np.int32)
-    fewest, fewer = np.zeros((2, width), np.float32)
-    first, step = (0, 1) if way == 0 else (height - 1, -1)
-    for i in range(height):
-        y = first + i * step
-        for x in range(width):
-            origin = x - dx
-            if i == 0 or origin < 0 or origin >= width:
-                now[x, 1:-1] = cost[y, x]
-                total[y, x] += cost[y, x]
-                fewer[x] = cost[y, x].min()
-            else:
-                jump = _jump(guide[y, x], guide[y - step, origin])
-                there, fell = before[origin], fewest[origin]
-                fewer[x] = _advance(there, fell, cost[y, x], total[y, x], now[x], bits[x], jump)
-        before, before_bits, now, bits = now, bits, before, before_bits
-        fewest, fewer = fewer, fewest
+def _copy(path, out):
+    for k in range(1, len(path) - 1):
+        out[k] = path[k]
+
+
+@compiled(inline="always")
+def _add(total, a, b, c, d, first):
+    """Sums of four paths, written or added."""
+    for k in range(len(total)):
+        four = np.int16(np.int16(a[k + 1] + b[k + 1]) + np.int16(c[k + 1] + d[k + 1]))
+        total[k] = four if first else np.int16(total[k] + four)
 
 
 @compiled(nogil=True, cache=True)
 def winners(total, end, along, length, cut, rows, columns, disparity, facts):
     """Each pixel's best label, to a fraction (disparity); and facts (h, w, 3): its distance from the best label of all
-    alpha pixels that match the same pixel of beta, its margin to the second best, and its cost."""
+    alpha pixels that match the same pixel of beta, its margin to the second best, and its cost. `total` is in parts."""
     claims = _claims(total, end, along, length, rows, columns)
     height, width, labels = total.shape
     for y in range(height):
@@ -184,9 +217,10 @@ def winners(total, end, along, length, cut, rows, columns, disparity, facts):
             column, row = _pixel(end[y, x], along[y, x], best)
             facts[y, x, 0] = ONE
             if best <= length[y, x] + HALF and 0 <= row < rows and 0 <= column < columns:
-                facts[y, x, 0] = min(np.float32(abs(claims[row, column] - best)) / FARTHEST, ONE)
-            facts[y, x, 1] = min((second - lowest) / (8 * LARGE), ONE)
-            facts[y, x, 2] = lowest / (8 * LARGE)
+                claimed = claims[row * columns + column]
+                facts[y, x, 0] = min(np.float32(abs(claimed - best)) / FARTHEST, ONE)
+            facts[y, x, 1] = min(np.float32(second - lowest) / (8 * PARTS * LARGE), ONE)
+            facts[y, x, 2] = np.float32(lowest) / (8 * PARTS * LARGE)
 
 
 @compiled(nogil=True, cache=True)
@@ -207,28 +241,29 @@ def regression(brightness, totals, products, band, floor, out):
 
 @compiled(inline="always")
 def _claims(total, end, along, length, rows, columns):
-    """For each pixel of beta the label of the alpha pixel that matches it at the least cost."""
+    """For each pixel of beta, row by row, the label of the alpha pixel that matches it at the least cost."""
     height, width, labels = total.shape
-    lowest = np.full((rows, columns), MOST, np.float32)
-    claims = np.full((rows, columns), -labels, np.int32)
+    lowest = np.full(rows * columns, WALL, np.int16)
+    claims = np.full(rows * columns, -labels, np.int32)
+    places = np.empty(labels, np.int32)
     for y in range(height):
         for x in range(width):
-            for label in range(min(labels - 1, int(length[y, x] + HALF)) + 1):
-                column, row = _pixel(end[y, x], along[y, x], label)
-                if 0 <= row < rows and 0 <= column < columns and total[y, x, label] < lowest[row, column]:
-                    lowest[row, column], claims[row, column] = total[y, x, label], label
+            count, sums = _count_within(length[y, x], labels), total[y, x]
+            _places(end[y, x], along[y, x], count, rows, columns, places)
+            for label in range(count):
+                at = places[label]
+                if at >= 0 and sums[label] < lowest[at]:
+                    lowest[at], claims[at] = sums[label], label
     return claims
 
 
 @compiled(inline="always")
 def _two_best(total, last):
     """The best of the labels to `last`, and what the best does that is not beside it."""
-    bits, best = total.view(np.int32), 0
-    least = _least(bits, 0, last + 1)
-    while bits[best] > least:
+    best, least = 0, _least(total, 0, last + 1)
+    while total[best] > least:
         best += 1
-    second = min(_least(bits, 0, best - 1), _least(bits, best + 2, last + 1))
-    return best, np.int32(second).view(np.float32)
+    return best, min(_least(total, 0, best - 1), _least(total, best + 2, last + 1))
 
 
 @compiled(inline="always")
@@ -236,8 +271,8 @@ def _between(total, best, last):
     """How far the best is from the label, by the two lines of equal slope through it and its neighbours."""
     if not 0 < best < last:
         return np.float32(0)
-    before, after = total[best - 1], total[best + 1]
-    deepest = max(before, after) - total[best]
+    before, after = np.float32(total[best - 1]), np.float32(total[best + 1])
+    deepest = max(before, after) - np.float32(total[best])
     return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)
 
 

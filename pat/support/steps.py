@@ -9,6 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import get_ident
 
 from arraygeom.progress import progress
 
@@ -24,12 +25,12 @@ LEAST = 1.5
 class _Shown(logging.Handler):
     def __init__(self, show: Callable[[str], None]) -> None:
         super().__init__(logging.INFO)
-        self.show = show
+        self.show, self.thread = show, get_ident()
         self.stage: str | None = None
         self.begin, self.share = 0.0, 0.0
 
     def emit(self, record: logging.LogRecord) -> None:
-        if record.levelno == logging.INFO:
+        if record.levelno == logging.INFO and record.thread == self.thread:
             self.show(record.getMessage() + self._left())
 
     def _left(self) -> str:
@@ -54,7 +55,10 @@ def about(seconds: float) -> str:
 
 @contextmanager
 def steps_shown(show: Callable[[str], None]) -> Iterator[None]:
-    """A block in which `show` is called with the line of every step that begins; of the innermost block alone."""
+    """A block in which `show` is called with the line of every step that begins in this thread.
+
+    Of the innermost block alone.
+    """
     loggers = [logging.getLogger(name) for name in PACKAGES]
     before = [(logger.level, logger.handlers[:]) for logger in loggers]
     for logger in loggers:

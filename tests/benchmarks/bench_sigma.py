@@ -8,7 +8,6 @@ itself good to some 20 %. *raised*: the largest factor by which `calibrate` rais
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.target import parse_board
 from calib.boards.validation import without_blocks
 from pat.evaluation.tables import markdown_header, markdown_row
-from tests.benchmarks.printed import print_tables
+from tests.benchmarks.printed import data_and_out, print_tables
 
 
 def sets(data: Path) -> Iterator[tuple[str, Calibration]]:
@@ -81,10 +80,7 @@ def rows(data: Path) -> Iterator[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    options = data_and_out(__doc__)
     torch.set_num_threads(1)
     print_tables("Stated sigma on real boards", [rows(options.data)], options.out)
 

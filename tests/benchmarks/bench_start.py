@@ -10,7 +10,6 @@ the pairs with most points (median and worst pair).
 
 from __future__ import annotations
 
-import argparse
 import json
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
@@ -31,7 +30,7 @@ from calib.images.held_out import line_distances
 from calib.images.matches import Matches, match_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image
-from tests.benchmarks.printed import print_tables
+from tests.benchmarks.printed import data_and_out, print_tables
 
 BOARD = "chessboard:11x8:30mm"
 ROWS = ((0, 1, 2), (3, 4, 5), (6, 7, 8))
@@ -96,10 +95,7 @@ def _cells(found: Calibration, matches: Mapping[tuple[str, str], Matches]) -> It
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--data", type=Path, default=Path("../shared/data"))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    options = data_and_out(__doc__)
     torch.set_num_threads(1)
     cv2.setRNGSeed(0)
     print_tables(

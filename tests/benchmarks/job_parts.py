@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+import threading
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -101,7 +102,10 @@ def opencv(folder: Path, out: Path) -> None:
 
 
 class Clock:
-    """Seconds by part, of the wall and of cores: of the innermost part that is running."""
+    """Seconds by part, of the wall and of cores: of the innermost part that is running in the main thread.
+
+    What other threads compute meanwhile counts as that part's, too: torch's, and the comparison of rig and images.
+    """
 
     def __init__(self) -> None:
         self.seconds: Counter[str] = Counter()
@@ -124,6 +128,8 @@ class Clock:
         """The function, its time counted."""
 
         def counted(*given: Any, **options: Any) -> Any:
+            if threading.current_thread() is not threading.main_thread():
+                return function(*given, **options)
             self.to(part)
             try:
                 return function(*given, **options)

@@ -1,11 +1,17 @@
 """A rig that fits its images badly says so, wherever it is used."""
 
+import math
 import re
+import subprocess
+import sys
 
+import pytest
 import torch
 
 from arraygeom import Pose
-from calib.images.misfit import find_misfit, misfit_warning
+from calib.images import misfit
+from calib.images.matches import Matches, match_cameras
+from calib.images.misfit import find_misfit, misfit_warning, share_outside
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.calib.scenes import rectified_images, rectified_pair, texture, vector
@@ -54,3 +60,30 @@ def test_show_warns(tmp_path, capsys):
     main(["show", str(tmp_path / "rig.yaml"), *files, "--out", str(tmp_path)])
     assert "badly: 1" in (said := " ".join(capsys.readouterr().err.split()))
     assert "`pat rig doctor` says: none of the usual mistakes" in said
+
+
+@pytest.mark.parametrize(("off", "sides"), [(0.0, [240]), (0.02, [240, 320])])
+def test_images_are_compared_at_full_size_only_where_small_ones_do_not_fit(monkeypatch, off, sides):
+    monkeypatch.setattr(misfit, "ROUGH_SIDE", 240)
+    seen = []
+
+    def noted(images):
+        seen.append(max(images["left"].shape))
+        return match_cameras(images)
+
+    monkeypatch.setattr(misfit, "match_cameras", noted)
+    found = find_misfit(rectified_pair().perturbed({"right.rotation": vector(off, 0, 0)}), rectified_images())
+    assert seen == sides
+    assert (found is None) == (off == 0)
+
+
+def test_too_few_points_of_observable_depth_are_no_share():
+    points = torch.tensor([[10.0, 20.0], [30.0, 25.0], [50.0, 60.0]], dtype=torch.float64)
+    few = {("left", "right"): Matches(points, points - 5)}
+    assert math.isnan(share_outside(rectified_pair(), few))
+
+
+def test_what_a_comparison_needs_is_imported_fast():
+    code = "import sys, calib.images.misfit; print(*sys.modules)"
+    modules = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    assert {"scipy.stats", "scipy.spatial", "kornia"}.isdisjoint(modules)

@@ -73,6 +73,17 @@ def test_each_file_is_read_and_developed_once(bands, lens, places, reads, tmp_pa
     assert reads == {**dict.fromkeys(map(str, files.values()), 1), "develop": len(names)}
 
 
+def test_a_small_image_is_kept_and_a_large_one_read_again(reads, tmp_path, monkeypatch):
+    rig, file = rig_of("ab"), tmp_path / "a.png"
+    write_image(file, smooth(1, 0))
+    for most, times in ((HW[0] * HW[1], 1), (HW[0] * HW[1] - 1, 2)):
+        monkeypatch.setattr(pat.fusion.views, "KEPT", most)
+        reads.clear()
+        images = ViewFiles(rig, {"a": file}, alpha="a")
+        assert torch.equal(images["a"], images["a"])
+        assert reads[str(file)] == times
+
+
 def test_each_file_of_a_sequence_is_read_once(reads, tmp_path):
     torch.manual_seed(0)
     rig = rig_of("ab", frame_rate=30.0)
