@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import shutil
 import sys
 import time
@@ -29,8 +28,6 @@ if TYPE_CHECKING:
     from ..fusion.report import Facts
     from ..fusion.results import Frame
     from ..fusion.views import ViewFiles
-
-LOG = logging.getLogger(__name__)
 
 
 @dataclass

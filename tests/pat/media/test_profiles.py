@@ -1,6 +1,7 @@
 """Colour profiles: other ones are converted to sRGB when an image is read, with a warning; raw files need an extra."""
 
 import sys
+import time
 import warnings
 
 import cv2
@@ -49,6 +50,16 @@ def test_images_of_srgb_are_as_they_are(tmp_path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert torch.equal(read_image(tmp_path / "a.png"), read_image(tmp_path / "b.png"))
+
+
+def test_the_same_image_is_the_same_file_at_any_time(tmp_path):
+    written = []
+    for seconds in (0, 1.1):
+        time.sleep(seconds)
+        srgb_profile.cache_clear()
+        write_image(tmp_path / "a.png", torch.zeros(3, 4, 5))
+        written.append((tmp_path / "a.png").read_bytes())
+    assert written[0] == written[1]
 
 
 def test_what_cannot_be_converted_is_said(tmp_path):
