@@ -1,4 +1,8 @@
-"""What the pages take from elsewhere: {{ file PATH }}, {{ notebook NAME }}, {{ commands }}, {{ formats }}."""
+"""What the site's pages take from elsewhere.
+
+In place of a link titled "included", alone in its line, the file or notebook it leads to; in place of the comments
+`<!-- commands -->` and `<!-- formats -->` what is made of the code. On a code host the link is a link.
+"""
 
 from __future__ import annotations
 
@@ -16,17 +20,18 @@ MISSING = "*(not made yet)*"
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
     """Fill in what a page asks for."""
-    markdown = re.sub(r"\{\{ file (\S+) \}\}", lambda found: included(found[1]), markdown)
-    markdown = re.sub(r"\{\{ notebook (\S+) \}\}", lambda found: notebook(found[1]), markdown)
+    markdown = re.sub(r'(?m)^\[[^]]*\]\((?:\.\./)+(\S+) "included"\)$', lambda found: included(found[1]), markdown)
     for name, made in (("commands", commands), ("formats", formats)):
-        if f"{{{{ {name} }}}}" in markdown:
-            markdown = markdown.replace(f"{{{{ {name} }}}}", made())
+        if f"<!-- {name} -->" in markdown:
+            markdown = markdown.replace(f"<!-- {name} -->", made())
     return markdown
 
 
 def included(name: str) -> str:
-    """A file of the repository without its first heading; a note if it has not been made."""
+    """A notebook, or a file of the repository without its first heading; a note if it has not been made."""
     path = ROOT / name
+    if path.suffix == ".ipynb":
+        return notebook(path.stem)
     if not path.exists():
         return MISSING
     return re.sub(r"\A# .*\n", "", path.read_text(encoding="utf-8"))

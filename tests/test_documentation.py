@@ -11,6 +11,7 @@ import pytest
 import torch
 
 from arraygeom import Rig
+from docs.hooks import on_page_markdown
 from pat.cli.main import command_paths
 from pat.media.images import write_image
 
@@ -58,8 +59,17 @@ def test_samples_in_the_pages_run(page, tmp_path, monkeypatch):
 @pytest.mark.parametrize("page", [*PAGES, ROOT / "README.md", ROOT / "CONTRIBUTING.md"], ids=lambda p: p.stem)
 def test_links_lead_somewhere(page):
     links = re.findall(r"\]\(([^)]+)\)", page.read_text())
-    local = [link.partition("#")[0] for link in links if "://" not in link]
+    local = [link.partition(" ")[0].partition("#")[0] for link in links if "://" not in link]
     assert [link for link in local if link and not (page.parent / link).exists()] == []
+
+
+def test_pages_are_filled_in_on_the_site_and_are_links_on_a_code_host():
+    page = (ROOT / "docs" / "rig_files.md").read_text() + (ROOT / "docs" / "conventions.md").read_text()
+    assert "{{" not in page
+    filled = on_page_markdown(page)
+    assert "| `colmap` |" in filled
+    assert (ROOT / "arraygeom" / "conventions.md").read_text().splitlines()[-1] in filled
+    assert on_page_markdown('[1](../../notebooks/1_ten_minutes.ipynb "included")').count("```python") > 2
 
 
 @pytest.mark.parametrize("notebook", NOTEBOOKS, ids=lambda p: p.stem)
@@ -69,7 +79,7 @@ def test_a_notebook_is_a_page_and_is_found_from_the_readme(notebook):
     links = [link for link in re.findall(r"\]\(([^)]+)\)", prose) if "://" not in link]
     assert [link for link in links if not (notebook.parent / link).exists()] == []
     page = ROOT / "docs" / "notebooks" / f"{notebook.stem}.md"
-    assert page.read_text() == f"{{{{ notebook {notebook.stem} }}}}\n"
+    assert page.read_text() == f'[{notebook.stem}](../../notebooks/{notebook.name} "included")\n'
     assert f"]({page.name})" in (page.parent / "index.md").read_text()
     assert f"](notebooks/{notebook.name})" in (ROOT / "README.md").read_text()
 
