@@ -8,6 +8,7 @@ the power, and sheared along grey, so that neutral stays neutral. The fused imag
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
@@ -33,6 +34,8 @@ class ResponseSettings(NamedTuple):
     unlikely: by how much another gain, other weights, and both together must lower the misfit (a sum of squares over
         independent observations, in standard deviations) to be taken. In a scene of one hue several explain alpha.
     negative: standard deviation of negative weights.
+    sensor: weights of an unfiltered sensor, which sees more blue than Rec. 601.
+    light: logarithm of a gain up to which light that differs between the views may be its cause.
     least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
     equal: the error over the least one up to which a gamma explains alpha as well.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
@@ -48,6 +51,8 @@ class ResponseSettings(NamedTuple):
     points: tuple[int, int] = (6000, 300)
     unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
     negative: float = 0.05
+    sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
+    light: float = 0.12
     least_change: float = 0.01
     equal: float = 1.1
     better: float = 0.8
@@ -215,7 +220,7 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit, and what
     each must gain to be taken decides.
     """
-    rec601, usual = Response.rec601().weights, x.new_tensor(settings.usual)
+    rec601, usual, sensor = Response.rec601().weights, x.new_tensor(settings.usual), x.new_tensor(settings.sensor)
     luma, grey, hues = rec601 @ x, usual @ x, CHANGES.T @ x
     counts = found.share * _importance(found.share, found.deviation, settings)
     precision = CHANGES.T @ CHANGES / settings.prior**2
@@ -241,13 +246,23 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         trials.append((only_weights + settings.unlikely[1] + negative(weights), weights, 1.0))
         trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    if exposure == 1 and float(((chosen - rec601) @ x).square().mean().sqrt()) < settings.least_change:
+    change = float(((chosen - rec601) @ x).square().mean().sqrt())
+    by_light = only_gain < only_weights and _may_be_light(luma @ counts, sensor @ x @ counts, float(gain), settings)
+    if exposure == 1 and (change < settings.least_change or by_light):
         chosen = rec601
     return misfit, Response(chosen, exposure, gamma, found.explained)
 
 
 CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
 """What weights may change by while their sum stays."""
+
+
+def _may_be_light(luma: Tensor, seen: Tensor, gain: float, settings: ResponseSettings) -> bool:
+    """Whether a gain is rather light that differs between the views than an unfiltered sensor, which has `seen` this.
+
+    It is little, and alpha is brighter than luma where a sensor would be darker, or the other way round.
+    """
+    return abs(math.log(gain)) < settings.light and (gain - 1) * float(seen - luma) < 0
 
 
 def _importance(share: Tensor, deviation: float, settings: ResponseSettings) -> Tensor:

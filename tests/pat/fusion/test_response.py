@@ -70,6 +70,15 @@ def test_in_one_hue_weights_of_a_sensor_are_preferred_to_a_small_gain_and_a_larg
     assert exposed.weights.tolist() == list(REC601)
 
 
+def test_in_one_hue_what_no_sensor_does_is_light():
+    """Warm surfaces are darker to an unfiltered sensor than Rec. 601's luma: a little brighter they are by light."""
+    x, g = points_of_one_hue()
+    noise = 0.01 * torch.randn(4000, generator=g)
+    assert fit(x, 1.08 * luminance(x[:, None])[0, 0] + noise).is_rec601
+    assert not fit(x, 0.92 * luminance(x[:, None])[0, 0] + noise).is_rec601
+    assert not fit(x, 1.2 * luminance(x[:, None])[0, 0] + noise).is_rec601
+
+
 def test_light_that_differs_by_object_is_not_taken_for_other_weights():
     """Four materials, each up to 2 % brighter or darker in the other view, of an alpha that sees another exposure."""
     g = torch.Generator().manual_seed(0)
