@@ -35,7 +35,9 @@ class ResponseSettings(NamedTuple):
         independent observations, in standard deviations) to be taken. In a scene of one hue several explain alpha.
     negative: standard deviation of negative weights.
     sensor: weights of an unfiltered sensor, which sees more blue than Rec. 601.
-    light: logarithm of a gain up to which light that differs between the views may be its cause.
+    light: logarithm of a gain up to which light that differs between the views may be its cause: where a sensor might,
+        and where none would.
+    alike: a gain explains alpha as well as weights do if its misfit is up to this much larger.
     least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
     equal: the error over the least one up to which a gamma explains alpha as well.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
@@ -52,7 +54,8 @@ class ResponseSettings(NamedTuple):
     unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
     negative: float = 0.05
     sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
-    light: float = 0.12
+    light: tuple[float, float] = (0.035, 0.12)
+    alike: float = 2.0
     least_change: float = 0.01
     equal: float = 1.1
     better: float = 0.8
@@ -171,8 +174,9 @@ def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float
     least = min(trial.error for trial in trials.values())
     if least > settings.better * trials[1.0].error:
         return 1.0, trials[1.0]
-    equal = [gamma for gamma, trial in trials.items() if trial.error <= settings.equal * least]
-    gamma = min(equal, key=lambda g: _decided(x**g, y, g, trials[g], settings)[0])
+    equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= settings.equal * least}
+    equal[1.0] = trials[1.0]._replace(deviation=min(trial.deviation for trial in equal.values()))
+    gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g], settings)[0])
     return gamma, trials[gamma]
 
 
@@ -247,7 +251,8 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
     change = float(((chosen - rec601) @ x).square().mean().sqrt())
-    by_light = only_gain < only_weights and _may_be_light(luma @ counts, sensor @ x @ counts, float(gain), settings)
+    alike = only_gain < only_weights + settings.alike
+    by_light = alike and _may_be_light(luma @ counts, sensor @ x @ counts, float(gain), settings)
     if exposure == 1 and (change < settings.least_change or by_light):
         chosen = rec601
     return misfit, Response(chosen, exposure, gamma, found.explained)
@@ -260,9 +265,10 @@ CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float
 def _may_be_light(luma: Tensor, seen: Tensor, gain: float, settings: ResponseSettings) -> bool:
     """Whether a gain is rather light that differs between the views than an unfiltered sensor, which has `seen` this.
 
-    It is little, and alpha is brighter than luma where a sensor would be darker, or the other way round.
+    It is very little, or little and alpha is brighter than luma where a sensor would be darker, or the reverse.
     """
-    return abs(math.log(gain)) < settings.light and (gain - 1) * float(seen - luma) < 0
+    very_little, little = settings.light
+    return abs(math.log(gain)) < (little if (gain - 1) * float(seen - luma) < 0 else very_little)
 
 
 def _importance(share: Tensor, deviation: float, settings: ResponseSettings) -> Tensor:

@@ -75,6 +75,7 @@ def test_in_one_hue_what_no_sensor_does_is_light():
     x, g = points_of_one_hue()
     noise = 0.01 * torch.randn(4000, generator=g)
     assert fit(x, 1.08 * luminance(x[:, None])[0, 0] + noise).is_rec601
+    assert fit(x, 0.975 * luminance(x[:, None])[0, 0] + noise).is_rec601, "too little to be a sensor"
     assert not fit(x, 0.92 * luminance(x[:, None])[0, 0] + noise).is_rec601
     assert not fit(x, 1.2 * luminance(x[:, None])[0, 0] + noise).is_rec601
 
@@ -89,6 +90,16 @@ def test_light_that_differs_by_object_is_not_taken_for_other_weights():
     found = fit(0.6 * truth * light, luminance(truth[:, None])[0, 0] + 0.005 * torch.randn(4000, generator=g))
     assert found.weights.tolist() == list(REC601)
     assert found.gain == pytest.approx(1 / 0.6, rel=0.02)
+
+
+def test_a_gamma_needs_a_range_of_brightness():
+    """Dark surfaces whose light varies: a gamma explains them better, as anything would."""
+    g = torch.Generator().manual_seed(1)
+    x = torch.tensor([0.2, 0.16, 0.12])[:, None] * (1 + 0.1 * torch.rand(4000, generator=g))
+    level = (x[0] - x[0].min()) / (x[0].max() - x[0].min())
+    assert (
+        fit(x, (0.97 + 0.02 * level) * luminance(x[:, None])[0, 0] + 0.0005 * torch.randn(4000, generator=g)).gamma == 1
+    )
 
 
 def test_fusion_of_another_response():
