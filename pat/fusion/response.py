@@ -250,10 +250,10 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         trials.append((only_weights + settings.unlikely[1] + negative(weights), weights, 1.0))
         trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    change = float(((chosen - rec601) @ x).square().mean().sqrt())
+    differing = float(((chosen - rec601) @ x).square().mean().sqrt())
     alike = only_gain < only_weights + settings.alike
     by_light = alike and _may_be_light(luma @ counts, sensor @ x @ counts, float(gain), settings)
-    if exposure == 1 and (change < settings.least_change or by_light):
+    if exposure == 1 and (differing < settings.least_change or by_light):
         chosen = rec601
     return misfit, Response(chosen, exposure, gamma, found.explained)
 
