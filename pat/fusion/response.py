@@ -37,6 +37,8 @@ class ResponseSettings(NamedTuple):
     sensor: weights of an unfiltered sensor, which sees more blue than Rec. 601.
     light: logarithm of a gain up to which light that differs between the views may be its cause: where a sensor might,
         and where none would.
+    greenest: share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's, and alpha is
+        brighter than luma where an unfiltered sensor would be darker, or the other way round: that is light too.
     alike: a gain explains alpha as well as weights do if its misfit is up to this much larger.
     least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
     equal: the error over the least one up to which a gamma explains alpha as well.
@@ -55,6 +57,7 @@ class ResponseSettings(NamedTuple):
     negative: float = 0.05
     sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
     light: tuple[float, float] = (0.035, 0.12)
+    greenest: float = 0.62
     alike: float = 2.0
     least_change: float = 0.01
     equal: float = 1.1
@@ -251,8 +254,11 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
     differing = float(((chosen - rec601) @ x).square().mean().sqrt())
-    alike = only_gain < only_weights + settings.alike
-    by_light = alike and _may_be_light(luma @ counts, sensor @ x @ counts, float(gain), settings)
+    unlike_sensors = float(gain - 1) * float((sensor @ x - luma) @ counts) < 0
+    light = settings.light[unlike_sensors]
+    by_light = only_gain < only_weights + settings.alike and abs(math.log(float(gain))) < light
+    no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in (weights, further))
+    by_light = by_light or (unlike_sensors and no_sensor)
     if exposure == 1 and (differing < settings.least_change or by_light):
         chosen = rec601
     return misfit, Response(chosen, exposure, gamma, found.explained)
@@ -260,15 +266,6 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
 
 CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
 """What weights may change by while their sum stays."""
-
-
-def _may_be_light(luma: Tensor, seen: Tensor, gain: float, settings: ResponseSettings) -> bool:
-    """Whether a gain is rather light that differs between the views than an unfiltered sensor, which has `seen` this.
-
-    It is very little, or little and alpha is brighter than luma where a sensor would be darker, or the reverse.
-    """
-    very_little, little = settings.light
-    return abs(math.log(gain)) < (little if (gain - 1) * float(seen - luma) < 0 else very_little)
 
 
 def _importance(share: Tensor, deviation: float, settings: ResponseSettings) -> Tensor:
