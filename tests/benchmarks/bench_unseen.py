@@ -63,7 +63,7 @@ def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], 
 
 
 def best(images: list[Tensor], truth: Tensor) -> Tensor:
-    """Of each block that of the images which is nearest to the truth."""
+    """Of each block that of the images which is nearest to the ground truth."""
     h, w = truth.shape[-2:]
     errors = torch.stack([(image - truth).square().mean(0) for image in images])
     of_blocks = avg_pool2d(errors, BLOCK, ceil_mode=True).argmin(0)
