@@ -15,18 +15,7 @@ from numba.extending import intrinsic, models, register_model
 
 from arraygeom.compiled import compiled, separate_cache
 
-__all__ = [
-    "LANES",
-    "NARROW",
-    "Code",
-    "Vector",
-    "accumulated",
-    "compiled",
-    "instruction",
-    "row_of",
-    "separate_cache",
-    "vector_of",
-]
+__all__ = ["LANES", "NARROW", "Code", "Vector", "accumulated", "compiled", "instruction", "row_of", "separate_cache"]
 
 LANES = 16
 NARROW = 8
