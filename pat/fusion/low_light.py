@@ -55,11 +55,9 @@ class DenoisedViews:
 
     def without_images(self) -> DenoisedViews:
         """The same, if no view had noise, without images: nothing more is asked of them."""
-        return (
-            self
-            if self.noisy
-            else DenoisedViews(*(replace(views, images={}) for views in (self.given, self.views)), {})
-        )
+        if self.noisy:
+            return self
+        return DenoisedViews(replace(self.given, images={}), replace(self.views, images={}), {})
 
     def wrapped(self, network: FusionNetwork) -> FusionNetwork:
         """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""

@@ -237,10 +237,8 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
         margin = min(labels + 32, MOST_MARGIN)
         small = a.shape[0] * (BLOCK + 2 * margin) * labels <= MOST_COSTS
-        boxes = (
-            inner_and_outer(a.shape, margin, a.shape[0]) if small else _large_blocks(a.shape, geometry.along[i], labels)
-        )
-        boxes = list(boxes)
+        large = _large_blocks(a.shape, geometry.along[i], labels)
+        boxes = list(inner_and_outer(a.shape, margin, a.shape[0]) if small else large)
         tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in boxes]
         largest = max(_pixels_in(outer, a.shape) for _, outer in boxes)
         nbytes = max(nbytes, largest * (BLOCK_BYTES + COST_BYTES * labels))
