@@ -14,15 +14,15 @@ from functools import lru_cache
 import torch
 
 
-def in_parallel(tasks: Sequence[Callable[[], None]]) -> None:
-    """Run tasks on the threads that torch may use, this one included; an error of any of them is raised."""
+def in_parallel(tasks: Sequence[Callable[[], None]], *, most: int | None = None) -> None:
+    """Run tasks on the threads that torch may use, or `most` of them, this one included; an error of any is raised."""
     left = iter(tasks)
 
     def work() -> None:
         for task in left:
             task()
 
-    helpers = min(torch.get_num_threads(), len(tasks)) - 1
+    helpers = min(torch.get_num_threads(), len(tasks), most or len(tasks)) - 1
     waiting = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
     work()
     for future in waiting:

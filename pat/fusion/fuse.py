@@ -14,7 +14,7 @@ from arraygeom import ReceptiveField, Rig
 from ..media.images import Images
 from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
-from ..support.memory import give_back, parse_bytes
+from ..support.memory import give_back, limited, parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, expected_work, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
@@ -111,6 +111,8 @@ def fuse(
     quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     views = quiet.views
     inputs, undo = _prepared(network, views, match_levels)
+    betas, quiet = views.betas, quiet.without_images()
+    del views  # whose images are there again, padded
     LOG.info("planning")
     before = 0.0 if corrections else expected_work(inputs, response, align=align)
     estimate = announce is not None
@@ -119,17 +121,20 @@ def fuse(
         announce(plan)
     found = corrections or find_corrections(network, inputs, response, align=align)
     if explain:
-        for line in found.described(views.betas, inputs.hw):
+        for line in found.described(betas, inputs.hw):
             explain(line)
     fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=fused)
-    state = network.prepare(inputs.inputs)
+    with limited(limit):
+        state = network.prepare(inputs.inputs)
     LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
     with torch.set_grad_enabled(differentiable):
         wrapped = quiet.wrapped(network)
         frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
         frame, matched = quiet.split(frame, len(inputs.inputs.betas))
     warn_of_confidence(network, frame, inputs)
+    if limit is not None:
+        give_back()
     frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
     if luminance != "alpha":
         frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal, NamedTuple
 
@@ -52,6 +52,12 @@ class DenoisedViews:
     given: Views
     views: Views
     noisy: Mapping[str, NoisyView]
+
+    def without_images(self) -> DenoisedViews:
+        """The same, if no view had noise, without images: nothing more is asked of them."""
+        if self.noisy:
+            return self
+        return DenoisedViews(replace(self.given, images={}), replace(self.views, images={}), {})
 
     def wrapped(self, network: FusionNetwork) -> FusionNetwork:
         """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""

@@ -20,8 +20,10 @@ from arraygeom import Segments
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
+from ..support.memory import how_many_fit
 from . import band_kernels as kernels
 from .semi_global import (
+    BLOCK,
     CONSISTENT,
     DISPARITY_FILL,
     FINE,
@@ -43,6 +45,8 @@ NEIGHBOURHOOD = 5
 """Side of the neighbourhood at half the size, pixels."""
 MARGIN = 48
 """What is matched around a block, pixels."""
+BLOCK_BYTES = 120.0 * (BLOCK + 2 * MARGIN) ** 2
+"""What a block takes."""
 
 
 @torch.no_grad()
@@ -107,7 +111,7 @@ def matched_at_full_size(
     for i, half in enumerate(numpy_of(disparity[:, 0])):
         views = planes[0][i], bits[0][i], planes[1][i], bits[1][i], *(g[i] for g in geometry), *_runs(half)
         tasks += [partial(_block, views, box, found[i], unlike[i]) for box in inner_and_outer(found.shape[1:], MARGIN)]
-    in_parallel(tasks)
+    in_parallel(tasks, most=how_many_fit(BLOCK_BYTES))
     smooth = np.stack([_smoothed(*one) for one in zip(found, unlike, to_bytes(alpha[:, 0]))])
     return torch.from_numpy(smooth)[:, None].to(alpha), torch.from_numpy(unlike)[:, None].to(alpha)
 

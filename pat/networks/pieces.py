@@ -95,9 +95,7 @@ def matched_in_pieces(
     if len(pieces) == 1:
         return match(inputs, None)
     (beta,) = inputs.betas
-    guide, blocks = brightness(beta.image), beta.field.of_blocks(FINE)
-    half = matched_at_half_size(inputs.alpha, guide, blocks, normalisations.half)
-    del guide, blocks
+    half = matched_at_half_size(inputs.alpha, brightness(beta.image), beta.field.of_blocks(FINE), normalisations.half)
     give_back()
     found: list[Tensor] = []
     for inner, outer in pieces:

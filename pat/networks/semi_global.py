@@ -8,6 +8,7 @@ is computed on images of half the size; `matching` goes on from there to the ful
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from arraygeom.sampling import on_image, sample
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
+from ..support.memory import how_many_fit
 from . import semi_global_kernels as kernels
 
 FINE = 2
@@ -35,6 +37,8 @@ BLOCK = 320
 LONG_BLOCK = 640
 """The longer side of the blocks of large images, along the segments."""
 LEAST_MARGIN, MOST_MARGIN = 64, 192
+BLOCK_BYTES, COST_BYTES = 128, 3
+"""What a block takes for each pixel, and for each label of each pixel: cost, and sum of costs."""
 MOST_COSTS = 2**25
 """Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
 CONSISTENT = 0.2
@@ -162,6 +166,7 @@ def matched_at_half_size(
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
     geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
+    del guide, blocks
     found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry)
     consistent = (measured[..., 0] < CONSISTENT).astype(np.float32)
     planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
@@ -227,17 +232,22 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
     facts = np.ones((*own.shape, 3), np.float32)
     bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
     in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
-    tasks = []
+    tasks, nbytes = [], 1.0
     for i, (a, b) in enumerate(zip(own, other)):
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
         margin = min(labels + 32, MOST_MARGIN)
         small = a.shape[0] * (BLOCK + 2 * margin) * labels <= MOST_COSTS
-        boxes = (
-            inner_and_outer(a.shape, margin, a.shape[0]) if small else _large_blocks(a.shape, geometry.along[i], labels)
-        )
+        large = _large_blocks(a.shape, geometry.along[i], labels)
+        boxes = list(inner_and_outer(a.shape, margin, a.shape[0]) if small else large)
         tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in boxes]
-    in_parallel(tasks)
+        largest = max(_pixels_in(outer, a.shape) for _, outer in boxes)
+        nbytes = max(nbytes, largest * (BLOCK_BYTES + COST_BYTES * labels))
+    in_parallel(tasks, most=how_many_fit(nbytes))
     return disparity, facts
+
+
+def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
+    return math.prod(min(s.stop, n) - s.start for s, n in zip(box, hw))
 
 
 def _large_blocks(hw: tuple[int, ...], along: NDArray, labels: int) -> Iterator[Any]:

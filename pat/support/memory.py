@@ -6,7 +6,9 @@ import ctypes
 import re
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from threading import Thread
 
@@ -42,6 +44,31 @@ def give_back() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim:
             trim(0)
+
+
+ROOM = 0.96
+"""The part of a limit up to which tasks at once may fill it."""
+_LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
+
+
+@contextmanager
+def limited(limit: float | None) -> Iterator[None]:
+    """Within this, `how_many_fit` knows how many bytes the process may take in all; None: as many as it likes."""
+    token = _LIMIT.set(limit)
+    try:
+        yield
+    finally:
+        _LIMIT.reset(token)
+
+
+def how_many_fit(nbytes: float) -> int | None:
+    """How many tasks of so many bytes may run at once, at least one; None where there is no limit."""
+    limit = _LIMIT.get()
+    if limit is None:
+        return None
+    give_back()
+    resident = re.search(r"VmRSS:\s+(\d+) kB", _text(Path("/proc/self/status")))
+    return max(int((ROOM * limit - float(resident[1]) * 2**10) // nbytes), 1) if resident else 1
 
 
 def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:

@@ -4,8 +4,8 @@ The work on one alpha pixel is done on *taps*, the pixels of beta that its sampl
 samples share them (a bilinear look-up has four, of which the next sample usually needs two again), so all
 work along the channels is done once a tap: inner products of the query with its taps, sums of taps with
 weights, and in backward the addition of the query to the taps' gradients. Neighbouring alpha pixels do so
-in turn, a few taps at a time, since they share most of them. Everything else is work on samples, eight at a
-time.
+in turn, a few taps at a time, since they share most of them. Everything else is work on samples, sixteen at
+a time.
 
 Images come channels-last and flat. The numbers in them are float64, float32, or 16-bit ones seen as
 integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the first and in float32 for the

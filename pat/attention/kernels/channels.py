@@ -6,10 +6,11 @@ import math
 from inspect import unwrap
 
 import numpy as np
+from llvmlite.binding import get_host_cpu_features
 from numba import types
 from numba.extending import overload
 
-from .emit import LANES, compiled
+from .emit import LANES, NARROW, compiled
 from .layout import BLOCK, from_pixel, of, pointers
 from .vectors import (
     TAP_BLOCK,
@@ -22,17 +23,20 @@ from .vectors import (
     from_index,
     gather_row,
     half_bits,
-    load,
+    load_narrow,
     load_one,
     load_row,
+    nothing_narrow,
     splat,
     store,
     store_row,
     zero,
 )
 
-ROW = 8
+ROW = 4
 """Vectors of channels that are processed at once."""
+AT_ONCE = 2 if get_host_cpu_features().get("avx512f") else 1
+"""Taps of which so many vectors are summed at once, each with accumulators of its own: as registers allow."""
 CHUNK = 48
 """Taps that the pixels of a block have in turn, while these lie in the first cache: 16 KiB."""
 
@@ -50,9 +54,9 @@ def fill(numbers, first, last, filler):
 @compiled
 def unpack(array, at, n, out):
     """out[c] = array[at + c], widened."""
-    whole = n // LANES * LANES
-    for c in range(0, whole, LANES):
-        store(out, c, load(array, at + c))
+    whole = n // NARROW * NARROW
+    for c in range(0, whole, NARROW):
+        store(out, c, load_narrow(array, at + c))
     for c in range(whole, n):
         out[c] = load_one(array, at + c)
 
@@ -113,7 +117,7 @@ def inner_products(x, rows, first, last, image, channels, out):
 
 @compiled
 def _inner_products_of_row(x, rows, first, last, image, channels, c, out):
-    row = load_row(x, c, ROW)
+    row = load_row(x, c, ROW, LANES)
     for t in range(first, last, TAP_BLOCK):
         add_totals(
             out,
@@ -127,12 +131,12 @@ def _inner_products_of_row(x, rows, first, last, image, channels, c, out):
 
 @compiled
 def _inner_products_of_rest(x, rows, first, last, image, channels, first_channel, out):
-    whole = first_channel + (channels - first_channel) // LANES * LANES
+    whole = first_channel + (channels - first_channel) // NARROW * NARROW
     for t in range(first, last, TAP_BLOCK):
         starts = rows[t] * channels, rows[t + 1] * channels, rows[t + 2] * channels, rows[t + 3] * channels
-        totals = extend_row((splat(zero(x)),), TAP_BLOCK)
-        for c in range(first_channel, whole, LANES):
-            totals = fma_row(load(x, c), gather_row(image, starts, c), totals)
+        totals = extend_row((nothing_narrow(x),), TAP_BLOCK)
+        for c in range(first_channel, whole, NARROW):
+            totals = fma_row(load_narrow(x, c), gather_row(image, starts, c), totals)
         add_totals(out, t, *totals)
         for c in range(whole, channels):
             for k in range(TAP_BLOCK):
@@ -147,26 +151,26 @@ def weighted_sum(weights, rows, first, last, image, channels, begin, end, out):
     """
     c = begin
     while c + ROW * LANES <= end:
-        _weighted_sum_8(weights, rows, first, last, image, channels, c, out)
-        c += ROW * LANES
-    while c + 4 * LANES <= end:
         _weighted_sum_4(weights, rows, first, last, image, channels, c, out)
-        c += 4 * LANES
-    while c + LANES <= end:
+        c += ROW * LANES
+    while c + 2 * LANES <= end:
+        _weighted_sum_2(weights, rows, first, last, image, channels, c, out)
+        c += 2 * LANES
+    while c + NARROW <= end:
         _weighted_sum_1(weights, rows, first, last, image, channels, c, out)
-        c += LANES
+        c += NARROW
     for tail in range(c, end):
         for t in range(first, last):
             out[tail] += weights[t] * load_one(image, rows[t] * channels + tail)
 
 
-def _weighted_sum(n, taps):
+def _weighted_sum(n, taps, lanes):
     """`weighted_sum` for n vectors of channels, with accumulators for some taps at a time."""
     accumulators = n * taps
 
     @compiled
     def sum_row(weights, rows, first, last, image, channels, c, out):
-        totals = extend_row(load_row(out, c, n), accumulators)
+        totals = extend_row(load_row(out, c, n, lanes), accumulators)
         for t in range(first, last, taps):
             totals = fma_taps(weights, rows, t, image, channels, c, totals, n)
         store_row(out, c, fold_row(totals, n))
@@ -174,7 +178,8 @@ def _weighted_sum(n, taps):
     return sum_row
 
 
-_weighted_sum_8, _weighted_sum_4, _weighted_sum_1 = _weighted_sum(ROW, 1), _weighted_sum(4, 2), _weighted_sum(1, 4)
+_weighted_sum_4, _weighted_sum_2 = _weighted_sum(ROW, AT_ONCE, LANES), _weighted_sum(2, 2, LANES)
+_weighted_sum_1 = _weighted_sum(1, 4, NARROW)
 
 
 # ---- a block of pixels ---------------------------------------------------------------------------
@@ -237,29 +242,29 @@ def scatter(taps, weights, last, x, channels, first_channel, last_channel, out):
 @compiled
 def _scatter(rows, weights, first, last, x, channels, first_channel, last_channel, out):
     c = first_channel
-    while c + 4 * LANES <= last_channel:
-        _scatter_4(rows, weights, first, last, x, channels, c, out)
-        c += 4 * LANES
-    while c + LANES <= last_channel:
+    while c + 2 * LANES <= last_channel:
+        _scatter_2(rows, weights, first, last, x, channels, c, out)
+        c += 2 * LANES
+    while c + NARROW <= last_channel:
         _scatter_1(rows, weights, first, last, x, channels, c, out)
-        c += LANES
+        c += NARROW
     for tail in range(c, last_channel):
         one = load_one(x, tail)
         for t in range(first, last):
             out[rows[t] * channels + tail] += weights[t] * one
 
 
-def _scatter_rows(n):
+def _scatter_rows(n, lanes):
     """`_scatter` for n vectors of channels."""
 
     @compiled
     def scatter_row(rows, weights, first, last, x, channels, c, out):
-        row = load_row(x, c, n)
+        row = load_row(x, c, n, lanes)
         for t in range(first, last):
             at = rows[t] * channels + c
-            store_row(out, at, fma_row(splat(weights[t]), row, load_row(out, at, n)))
+            store_row(out, at, fma_row(weights[t], row, load_row(out, at, n, lanes)))
 
     return scatter_row
 
 
-_scatter_4, _scatter_1 = _scatter_rows(4), _scatter_rows(1)
+_scatter_2, _scatter_1 = _scatter_rows(2, LANES), _scatter_rows(1, NARROW)

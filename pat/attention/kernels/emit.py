@@ -15,23 +15,25 @@ from numba.extending import intrinsic, models, register_model
 
 from arraygeom.compiled import compiled, separate_cache
 
-__all__ = ["LANES", "Code", "Vector", "accumulated", "compiled", "instruction", "row_of", "separate_cache", "vector_of"]
+__all__ = ["LANES", "NARROW", "Code", "Vector", "accumulated", "compiled", "instruction", "row_of", "separate_cache"]
 
-LANES = 8
+LANES = 16
+NARROW = 8
+"""Lanes where there may be few channels."""
 
 
 class Vector(types.Type):
-    """`LANES` numbers of the accumulation type, or of int32, in one register (or two)."""
+    """`LANES` numbers (or as many as said) of the accumulation type, or of int32, in one register or two."""
 
-    def __init__(self, scalar):
-        self.scalar = scalar
-        super().__init__(name=f"Vector({scalar})")
+    def __init__(self, scalar, lanes=LANES):
+        self.scalar, self.lanes = scalar, lanes
+        super().__init__(name=f"Vector({scalar}, {lanes})")
 
 
 @register_model(Vector)
 class _VectorModel(models.PrimitiveModel):
     def __init__(self, manager, kind):
-        super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), LANES))
+        super().__init__(manager, kind, ir.VectorType(manager[kind.scalar].get_value_type(), kind.lanes))
 
 
 def accumulated(array):
@@ -73,9 +75,9 @@ class Code:
         place = self.builder.bitcast(self.builder.gep(address, [index]), lane.as_pointer())
         return self.builder.load(place, align=array.dtype.bitwidth // 8)
 
-    def get_wide(self, array, address, index):
+    def get_wide(self, array, address, index, lanes=LANES):
         """The same in the accumulation type."""
-        return self.widen(self.get(array, address, index), array.dtype, LANES)
+        return self.widen(self.get(array, address, index, lanes), array.dtype, lanes)
 
     def put(self, array, address, index, vector):
         """Stores a vector at an index."""
@@ -96,10 +98,10 @@ class Code:
             return self.fpext(self.bitcast(stored, shape(ir.HalfType())), shape(ir.FloatType()))
         return stored
 
-    def repeat(self, number):
+    def repeat(self, number, lanes=LANES):
         """A vector of one number repeated."""
-        undefined = ir.Constant(ir.VectorType(number.type, LANES), ir.Undefined)
-        return self.shuffle(self.insert_element(undefined, number, ir.IntType(32)(0)), None, [0] * LANES)
+        undefined = ir.Constant(ir.VectorType(number.type, lanes), ir.Undefined)
+        return self.shuffle(self.insert_element(undefined, number, ir.IntType(32)(0)), None, [0] * lanes)
 
     def shuffle(self, a, b, lanes):
         """Some lanes of two vectors, or of one."""
@@ -107,8 +109,8 @@ class Code:
 
     def intrinsic(self, name: str, result, args, **options):
         """Calls an intrinsic of LLVM by its name; `%` stands for the kind of vector."""
-        element = args[-1].type.element
-        full = name.replace("%", f"v{LANES}{'f64' if element == ir.DoubleType() else 'f32'}")
+        vector = args[-1].type
+        full = name.replace("%", f"v{vector.count}{'f64' if vector.element == ir.DoubleType() else 'f32'}")
         function = ir.FunctionType(result, [value.type for value in args])
         return self.call(cgutils.get_or_insert_function(self.module, function, full), args, **options)
 

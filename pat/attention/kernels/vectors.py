@@ -1,4 +1,4 @@
-"""Instructions on eight numbers at a time, and on rows of them.
+"""Instructions on `LANES` numbers at a time, and on rows of vectors.
 
 A *row* is a tuple of n vectors that lie side by side, n being known at compile time; it stays in registers.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 from llvmlite import ir
 from numba import types
 
-from .emit import LANES, Vector, accumulated, instruction, row_of, vector_of
+from .emit import LANES, NARROW, Vector, accumulated, instruction, row_of, vector_of
 
 TAP_BLOCK = 4
 
@@ -48,6 +48,12 @@ def load(code, array, i: index):
     return code.get_wide(code.kinds[0], array, i)
 
 
+@instruction(lambda array, i: Vector(accumulated(array), NARROW))
+def load_narrow(code, array, i: index):
+    """The narrow vector at an index, in the accumulation type."""
+    return code.get_wide(code.kinds[0], array, i, NARROW)
+
+
 @instruction(_nothing)
 def store(code, array, i: index, vector):
     """Stores a vector at an index."""
@@ -63,23 +69,23 @@ def load_one(code, array, i: index):
 # ---- rows ----------------------------------------------------------------------------------------
 
 
-@instruction(lambda array, i, n: row_of(vector_of(array), n))
-def load_row(code, array, i: index, n: literal):
-    """n vectors from an index on."""
-    return code.pack([code.get_wide(code.kinds[0], array, code.offset(i, k * LANES)) for k in range(n)])
+@instruction(lambda array, i, n, lanes: row_of(Vector(accumulated(array), lanes.literal_value), n))
+def load_row(code, array, i: index, n: literal, lanes: literal):
+    """n vectors of so many lanes from an index on."""
+    return code.pack([code.get_wide(code.kinds[0], array, code.offset(i, k * lanes), lanes) for k in range(n)])
 
 
-@instruction(lambda array, starts, i: row_of(vector_of(array), starts.count))
+@instruction(lambda array, starts, i: row_of(Vector(accumulated(array), NARROW), starts.count))
 def gather_row(code, array, starts, i: index):
-    """The vector at an index from each of some starts on."""
-    return code.pack([code.get_wide(code.kinds[0], array, code.add(start, i)) for start in code.parts(starts)])
+    """The narrow vector at an index from each of some starts on."""
+    return code.pack([code.get_wide(code.kinds[0], array, code.add(start, i), NARROW) for start in code.parts(starts)])
 
 
 @instruction(_nothing)
 def store_row(code, array, i: index, row):
     """Stores a row from an index on."""
     for k, vector in enumerate(code.parts(row)):
-        code.put(code.kinds[0], array, code.offset(i, k * LANES), vector)
+        code.put(code.kinds[0], array, code.offset(i, k * vector.type.count), vector)
 
 
 @instruction(lambda row, n: row_of(row.dtype, n))
@@ -89,10 +95,19 @@ def extend_row(code, row, n: literal):
     return code.pack(vectors + [ir.Constant(vectors[0].type, None)] * (n - len(vectors)))
 
 
+@instruction(lambda array: Vector(accumulated(array), NARROW))
+def nothing_narrow(code, array):
+    """A narrow vector of 0 in the accumulation type."""
+    return ir.Constant(code.context.get_value_type(code.result), None)
+
+
 @instruction(lambda vector, row, totals: totals)
 def fma_row(code, vector, row, totals):
-    """totals + vector row, each rounded once."""
-    return code.pack([code.fused(vector, a, b) for a, b in zip(code.parts(row), code.parts(totals))])
+    """totals + vector row, each rounded once; instead of a vector a number does."""
+    rows = list(zip(code.parts(row), code.parts(totals)))
+    if not isinstance(vector.type, ir.VectorType):
+        vector = code.repeat(vector, rows[0][0].type.count)
+    return code.pack([code.fused(vector, a, b) for a, b in rows])
 
 
 @instruction(lambda row, array, i: row.dtype)
@@ -100,7 +115,7 @@ def dot_row(code, row, array, i: index):
     """The products of a row with the one at an index, summed lane by lane."""
     total = None
     for k, a in enumerate(code.parts(row)):
-        b = code.get_wide(code.kinds[1], array, code.offset(i, k * LANES))
+        b = code.get_wide(code.kinds[1], array, code.offset(i, k * a.type.count), a.type.count)
         total = code.fmul(a, b) if total is None else code.fused(a, b, total)
     return total
 
@@ -109,12 +124,13 @@ def dot_row(code, row, array, i: index):
 def fma_taps(code, weights, rows, t: index, image, channels: index, c: index, totals, n: literal):
     """Adds, for each group k of n vectors of `totals`, weights[t + k] times the row at image[rows[t + k], c]."""
     vectors = code.parts(totals)
+    lanes = vectors[0].type.count
     for k in range(0, len(vectors), n):
         tap = code.offset(t, k // n)
-        weight = code.repeat(code.at(weights, tap))
+        weight = code.repeat(code.at(weights, tap), lanes)
         start = code.add(code.mul(code.sext(code.at(rows, tap), channels.type), channels), c)
         for i in range(n):
-            vector = code.get_wide(code.kinds[3], image, code.offset(start, i * LANES))
+            vector = code.get_wide(code.kinds[3], image, code.offset(start, i * lanes), lanes)
             vectors[k + i] = code.fused(weight, vector, vectors[k + i])
     return code.pack(vectors)
 
@@ -199,21 +215,40 @@ def largest(code, a):
 @instruction(_nothing)
 def add_totals(code, array, i: index, a, b, c, d):
     """Adds the sums of four vectors to four numbers side by side."""
-
-    def pairs(p, q):
-        even, odd = [0, 2, 8, 10, 4, 6, 12, 14], [1, 3, 9, 11, 5, 7, 13, 15]
-        return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, odd))
-
-    v = pairs(pairs(a, b), pairs(c, d))
-    sums = code.fadd(code.shuffle(v, None, [0, 1, 2, 3]), code.shuffle(v, None, [4, 5, 6, 7]))
+    if a.type.count > NARROW:
+        sums = _wide_totals(code, a, b, c, d)
+    else:
+        v = _neighbours(code, _neighbours(code, a, b), _neighbours(code, c, d))
+        sums = code.fadd(code.shuffle(v, None, [0, 1, 2, 3]), code.shuffle(v, None, [4, 5, 6, 7]))
     code.put(code.kinds[0], array, i, code.fadd(code.get(code.kinds[0], array, i, TAP_BLOCK), sums))
 
 
-# ---- four numbers of each of eight places --------------------------------------------------------
+def _neighbours(code, p, q):
+    """The sums of neighbours in two vectors; in each four of p's and q's, two of p first."""
+    n = p.type.count
+    even = [at for k in range(0, n, 4) for at in (k, k + 2, n + k, n + k + 2)]
+    return code.fadd(code.shuffle(p, q, even), code.shuffle(p, q, [at + 1 for at in even]))
 
-FOURS = [[0, 8, 1, 9, 4, 12, 5, 13], [2, 10, 3, 11, 6, 14, 7, 15]]
-PAIRS = [[0, 1, 8, 9, 4, 5, 12, 13], [2, 3, 10, 11, 6, 7, 14, 15]]
-"""Shuffles that transpose a 4 by 4 block in each half of four vectors."""
+
+def _wide_totals(code, a, b, c, d):
+    """Halves are added first, then neighbours twice."""
+
+    def folded(p, q):
+        low = [*range(8), *range(16, 24)]
+        return code.fadd(code.shuffle(p, q, low), code.shuffle(p, q, [at + 8 for at in low]))
+
+    v = _neighbours(code, folded(a, b), folded(c, d))
+    v = code.fadd(*(code.shuffle(v, None, [k + n for n in (0, 1, 2, 3, 8, 9, 10, 11)]) for k in (0, 4)))
+    return code.fadd(code.shuffle(v, None, [0, 4, 2, 6]), code.shuffle(v, None, [1, 5, 3, 7]))
+
+
+# ---- four numbers of each of some places ---------------------------------------------------------
+
+FOURS, PAIRS = (
+    [[at + n for k in range(0, LANES, 4) for at, n in zip((k + first,) * 4, steps)] for first in (0, 2)]
+    for steps in ((0, LANES, 1, LANES + 1), (0, 1, LANES, LANES + 1))
+)
+"""Shuffles that transpose the 4 by 4 blocks side by side in four vectors."""
 
 
 def _transpose(code, a, b, c, d):
@@ -228,8 +263,15 @@ def load_fours(code, array, starts, i: index):
     def four(k):
         return code.get(code.kinds[0], array, code.at(starts, code.offset(i, k)), 4)
 
-    halves = [code.shuffle(four(k), four(k + 4), [*range(LANES)]) for k in range(4)]
-    return code.pack(_transpose(code, *halves))
+    rows = [_side_by_side(code, [four(at) for at in range(k, LANES, 4)]) for k in range(4)]
+    return code.pack(_transpose(code, *rows))
+
+
+def _side_by_side(code, parts):
+    """One vector of all the numbers."""
+    while len(parts) > 1:
+        parts = [code.shuffle(a, b, [*range(2 * a.type.count)]) for a, b in zip(parts[::2], parts[1::2])]
+    return parts[0]
 
 
 @instruction(_nothing)

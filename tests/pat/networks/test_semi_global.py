@@ -1,5 +1,8 @@
 """Consensus: a slow twin of its aggregation, true depths of a scene found again, the same bits by any road."""
 
+import threading
+import time
+
 import cv2
 import numpy as np
 import pytest
@@ -29,8 +32,10 @@ from pat.networks.semi_global import (
     equalising_blurs,
     length_of,
     match_weight,
+    matched_at_half_size,
     matches,
 )
+from pat.support.memory import limited
 
 HW = (64, 96)
 
@@ -163,6 +168,31 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
     monkeypatch.setattr(pat.networks.semi_global, "MOST_COSTS", 0)
     pieces = semi_global_matching(*call)
     assert (pieces.disparity - whole.disparity).abs().median() < 1e-3
+
+
+@pytest.mark.parametrize(("limit", "at_once"), [(None, {2, 3, 4}), (1.0, {1})])
+def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
+    running, most, lock = [], [], threading.Lock()
+
+    def block(views, box, labels, disparity, facts):
+        with lock:
+            running.append(box)
+            most.append(len(running))
+        time.sleep(0.05)
+        running.remove(box)
+
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    normalisation = Normalisation.of(alpha, beta)
+    monkeypatch.setattr(pat.networks.semi_global, "_block", block)
+    monkeypatch.setattr(pat.networks.semi_global, "BLOCK", 8)
+    monkeypatch.setattr(pat.networks.semi_global, "LONG_BLOCK", 8)
+    monkeypatch.setattr(pat.networks.semi_global, "MOST_COSTS", 0)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
+    with limited(limit):
+        matched_at_half_size(alpha, beta, sampled_at(pair, 2), normalisation)
+    assert max(most) in at_once
+    assert len(most) == 4 * 6
 
 
 def test_a_batch_is_its_images_one_by_one():

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pat.support.memory import give_back, parse_bytes, watch_peak
+from pat.support.memory import ROOM, give_back, how_many_fit, limited, parse_bytes, watch_peak
 
 
 def resident() -> int:
@@ -24,6 +24,15 @@ def test_freed_memory_is_given_back():
     give_back()
     assert before - resident() > 0.8 * 2000 * 2**16
     assert all(block[0] == 1 for block in blocks)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_tasks_fit_into_what_a_limit_leaves():
+    assert how_many_fit(2**30) is None
+    with limited((resident() + 3.5 * 2**30) / ROOM):
+        assert how_many_fit(2**30) == 3
+        assert how_many_fit(2**40) == 1
+    assert how_many_fit(2**30) is None
 
 
 def test_bytes_are_read():
