@@ -30,7 +30,7 @@ SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, 
 INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
 MANY_WRONG = 0.34
-"""The share of moments of which images may be left out because they contradict the others."""
+"""The share of a camera's images that may be left out because they contradict the others."""
 FEWEST_TO_JACKKNIFE = 6
 CONSIDERABLE = 1.3
 """Standard deviations are raised if the jackknife's are larger by this."""
@@ -290,13 +290,13 @@ def _joint_fit(
 def _wrong_images(
     fit: BundleResult, initial: InitialRig, single: Mapping[str, SingleCalibration]
 ) -> list[tuple[str, FrameKey]]:
-    """Images so far off that their camera would be refused, one of a moment, unless they are many."""
+    """Images so far off that their camera would be refused, one of a moment, unless they are many of a camera's."""
     frames, found = tuple(initial.world_from_board), dict[FrameKey, str]()
     for m in misfits(fit):
         if m.rms > _refused_from(single[m.camera]):
             found.setdefault(frames[m.block], m.camera)
-    wrong = [(camera, frame) for frame, camera in found.items()]
-    return wrong if len(wrong) < MANY_WRONG * len(frames) else []
+    shares = (list(found.values()).count(name) / len(v.seen) for name, v in initial.views.items())
+    return [] if max(shares) > MANY_WRONG else [(camera, frame) for frame, camera in found.items()]
 
 
 def _refused_from(single: SingleCalibration) -> float:
