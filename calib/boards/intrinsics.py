@@ -26,6 +26,8 @@ FEWEST_POINTS = 6
 """Points of an image below which none is left out."""
 OUTLIER = 6.0
 """Points beyond this many standard deviations (of a coordinate) are left out."""
+LEAST_SIGMA = 0.02
+"""Lower bound of that deviation, pixels: no real corners are better."""
 MEDIAN_TO_DEVIATION = 1 / 1.17741
 """The standard deviation of a coordinate is this share of the median distance."""
 FEWEST_TILT = 8.0
@@ -95,7 +97,7 @@ def without_outliers(
     distances. Images without a pose, or with fewer than `FEWEST_POINTS` points or one row of them left, keep all.
     """
     off = {key: _distances(camera, poses[key], d, points) for key, d in views.seen.items() if key in poses}
-    sigma = sigma or max(MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), 0.02)
+    sigma = max(sigma or MEDIAN_TO_DEVIATION * float(np.median(np.concatenate(list(off.values())))), LEAST_SIGMA)
     kept = {key: _only(views.seen[key], r < OUTLIER * sigma) for key, r in off.items()}
     return BoardViews(
         views.hw,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import NamedTuple
@@ -64,6 +64,15 @@ class InitialRig(NamedTuple):
     world_from_board: dict[FrameKey, Pose]
     views: dict[str, BoardViews]
     left_out: list[tuple[str, FrameKey]]
+
+    def without(self, images: Collection[tuple[str, FrameKey]]) -> InitialRig:
+        """Without these images too."""
+        views = {
+            name: BoardViews(v.hw, {key: d for key, d in v.seen.items() if (name, key) not in images})
+            for name, v in self.views.items()
+        }
+        boards = {k: p for k, p in self.world_from_board.items() if any(k in v.seen for v in views.values())}
+        return InitialRig(self.cam_from_world, boards, views, [*self.left_out, *images])
 
 
 def initial_rig(cameras: Sequence[CalibratedViews], board: Board) -> InitialRig:

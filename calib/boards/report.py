@@ -27,6 +27,7 @@ from .intrinsics import BoardViews
 from .observability import LENS_TERMS
 from .photos import Photos
 from .rig import Calibration
+from .validation import frame_rms
 
 STYLE = """
 body { font: 15px/1.45 system-ui, sans-serif; max-width: 1080px; margin: 2em auto; padding: 0 1em; color: #222 }
@@ -281,12 +282,8 @@ def draw_by_image(calibration: Calibration) -> Figure:
     frames = calibration.frames
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
-    for colour, (name, r) in zip(cycle(COLOURS), calibration.fit.problem.residuals().items()):
-        block = calibration.fit.problem.seen[name].block
-        counts = np.bincount(block, minlength=len(frames))
-        present = np.flatnonzero(counts)
-        squared = np.bincount(block, (r**2).sum(-1), len(frames))[present] / counts[present]
-        axes.plot(present, np.sqrt(squared), "o", ms=4, color=colour, label=_escaped(name))
+    for colour, (name, rms) in zip(cycle(COLOURS), frame_rms(calibration.fit.problem).items()):
+        axes.plot(list(rms), list(rms.values()), "o", ms=4, color=colour, label=_escaped(name))
     step = max(1, len(frames) // 30)
     axes.set_xticks(range(0, len(frames), step), [_escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
     axes.set(ylim=(0, None), xlabel="frame", ylabel="RMS residual (px)")

@@ -21,14 +21,16 @@ from .known_points import KnownPoints
 from .observability import gate, typical_prior
 from .photos import FrameKey
 from .poses import CalibratedViews, InitialRig, initial_rig
-from .shape import LEAST_GAIN, BoardShape, described, is_significant
+from .shape import LEAST_GAIN, BoardShape, described, fewest_frames, is_significant
 from .start import StartDeviations, rig_near_start, start_cameras, start_notes, start_prior
 from .target import Board
-from .validation import epipolar_errors, held_out_errors, misfit_notes
+from .validation import epipolar_errors, held_out_errors, misfit_notes, misfits
 
 SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
 INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
+MANY_WRONG = 0.34
+"""The share of a camera's images that may be left out because they contradict the others."""
 FEWEST_TO_JACKKNIFE = 6
 CONSIDERABLE = 1.3
 """Standard deviations are raised if the jackknife's are larger by this."""
@@ -96,8 +98,7 @@ def calibrate(
         [CalibratedViews(name, a.camera, a.views, a.cam_from_board) for name, a in single.items()], board
     )
     cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
-    flat = _flat(board, initial.world_from_board, initial.views)
-    together = _joint_fit(_problem(cameras, initial.world_from_board, initial.views, board), flat, single)
+    together, initial = _joint_fit(initial, cameras, board, single)
     return _finished(
         *_scaled_covariance(together), initial, board, single, _images_left_out(views, single, initial.left_out)
     )
@@ -258,18 +259,24 @@ class _JointFit(NamedTuple):
         return described(problem.shape, deviations, board.extents)
 
 
-def _joint_fit(problem: BundleProblem, flat: BoardShape | None, single: Mapping[str, SingleCalibration]) -> _JointFit:
+def _joint_fit(
+    initial: InitialRig, cameras: Mapping[str, Camera], board: Board, single: Mapping[str, SingleCalibration]
+) -> tuple[_JointFit, InitialRig]:
     """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
 
-    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise.
+    Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise. A few
+    images that contradict the others (boards detected a square off, say) are left out.
     """
-    if len(problem.cameras) == 1:
+    if len(cameras) == 1:
         (only,) = single.values()
-        fixed = {name: np.zeros(len(parameter_names(c)), dtype=bool) for name, c in problem.cameras.items()}
-        return _JointFit(only.fit, fixed, list(only.notes))
-    fit, free, notes = _fitted(problem, flat)
+        fixed = {name: np.zeros(len(parameter_names(c)), dtype=bool) for name, c in cameras.items()}
+        return _JointFit(only.fit, fixed, list(only.notes)), initial
+    problem = _problem(cameras, initial.world_from_board, initial.views, board)
+    fit, free, notes = _fitted(problem, _flat(board, initial.world_from_board, initial.views))
+    if wrong := _wrong_images(fit, initial, single):
+        return _joint_fit(initial.without(wrong), cameras, board, single)
     if not (doubts := _inconsistent_cameras(fit, single)):
-        return _JointFit(fit, free, notes)
+        return _JointFit(fit, free, notes), initial
     priors = {name: _as_prior(name, a) for name, a in single.items()}
     free = {name: priors[name].information.diagonal() > 0 for name in problem.cameras}
     for index, mask in enumerate(free.values()):
@@ -277,7 +284,24 @@ def _joint_fit(problem: BundleProblem, flat: BoardShape | None, single: Mapping[
     fit = adjust(replace(problem, priors=priors, shape=fit.problem.shape), free, equal_noise=True)
     kept = "so each camera's intrinsics keep close to its own calibration"
     notes = [note for a in single.values() for note in a.notes]
-    return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"])
+    return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"]), initial
+
+
+def _wrong_images(
+    fit: BundleResult, initial: InitialRig, single: Mapping[str, SingleCalibration]
+) -> list[tuple[str, FrameKey]]:
+    """Images so far off that their camera would be refused, one of a moment, unless they are many of a camera's."""
+    frames, found = tuple(initial.world_from_board), dict[FrameKey, str]()
+    for m in misfits(fit):
+        if m.rms > _refused_from(single[m.camera]):
+            found.setdefault(frames[m.block], m.camera)
+    shares = (list(found.values()).count(name) / len(v.seen) for name, v in initial.views.items())
+    return [] if max(shares) > MANY_WRONG else [(camera, frame) for frame, camera in found.items()]
+
+
+def _refused_from(single: SingleCalibration) -> float:
+    """The reprojection error (RMS, px) with the other cameras from which a camera contradicts them."""
+    return REJECTED * max(single.fit.problem.rms(), 0.3)
 
 
 def _as_prior(name: str, single: SingleCalibration) -> CameraPrior:
@@ -352,19 +376,23 @@ def _fitted(
 
 
 def _with_shape(fit: BundleResult, free: Free, flat: BoardShape | None) -> BundleResult:
-    """The fit with the boards' shapes as unknowns if they matter, by the points and by how frames agree on them."""
+    """The fit with the boards' shapes as unknowns if they matter, by the points and by how frames agree on them.
+
+    Where frames are too few to agree, the loss must fall by half.
+    """
     if flat is None or fit.problem.shape is not None:
         return fit
-    trial = replace(fit.problem, shape=flat)
+    trial, few = replace(fit.problem, shape=flat), len(flat.part) < fewest_frames(len(flat))
     try:
         found = jackknife(trial, free, fit.sigma)
+        if not few and not is_significant(found.step, found.shapes, len(flat.part)):
+            return fit
+        shaped = adjust(trial, free)
     except np.linalg.LinAlgError:  # some parameters are not observable yet
         return fit
-    if not is_significant(found.step, found.shapes, len(flat.part)):
-        return fit
-    shaped = adjust(trial, free)
-    gain = loss(fit.problem, shaped.sigma) - loss(shaped.problem, shaped.sigma)
-    return shaped if gain > LEAST_GAIN else fit
+    left = loss(shaped.problem, shaped.sigma)
+    gain = loss(fit.problem, shaped.sigma) - left
+    return shaped if gain > (max(left, LEAST_GAIN) if few else LEAST_GAIN) else fit
 
 
 def _free(camera: Camera, posed: bool) -> np.ndarray:
@@ -403,7 +431,7 @@ def _inconsistent_cameras(fit: BundleResult, single: Mapping[str, SingleCalibrat
     for name, r in fit.problem.residuals().items():
         together, by_itself = float(np.sqrt((r**2).sum(-1).mean())), single[name].fit.problem.rms()
         fits = f"{name} fits to {by_itself:.2f} px alone but to {together:.2f} px with the others"
-        if together > REJECTED * max(by_itself, 0.3):
+        if together > _refused_from(single[name]):
             raise ValueError(f"{fits}: were the images {SYNCHRONISED}?")
         if together > 0.5 and together > INCONSISTENT * by_itself:
             doubts.append(fits)

@@ -99,13 +99,16 @@ def _deformed(p: np.ndarray, middle: np.ndarray, values: np.ndarray) -> np.ndarr
     return np.stack([middle[:, 0] + x, middle[:, 1] + y, p[:, 2] + first / 2 - first * second / 24], -1)
 
 
+def fewest_frames(count: int) -> int:
+    """The least number of frames whose agreement on so many values means something."""
+    return 2 * count + 2
+
+
 def is_significant(values: Float[np.ndarray, " s"], covariance: Float[np.ndarray, "s s"], frames: int) -> bool:
     """Whether shapes differ from flat ones by more than the jackknife over frames explains (Hotelling's test)."""
     from scipy.stats import f as f_distribution  # here, as it takes half a second to import
 
     count = len(values)
-    if frames < 2 * count + 2:
-        return False
     squared = float(values @ np.linalg.solve(covariance, values))
     ratio = squared * (frames - count) / (count * (frames - 1))
     return bool(f_distribution.sf(ratio, count, frames - count) < SIGNIFICANCE)

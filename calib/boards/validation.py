@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from arraygeom import Pose, Rig, epipolar_distance
 
 from .bundle import BoardPoses, BundleProblem, BundleResult, readjusted
-from .intrinsics import BoardViews
+from .intrinsics import LEAST_SIGMA, BoardViews
 from .photos import FrameKey
 
 FEWEST_TO_HOLD_OUT = 8
@@ -89,7 +89,7 @@ def misfits(fit: BundleResult) -> list[FrameMisfit]:
     found = []
     for name, by_block in frame_rms(fit.problem).items():
         typical = float(np.median(list(by_block.values())))
-        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * fit.sigma[name])
+        limit = max(MISFIT * typical, CONSPICUOUS * 2**0.5 * max(fit.sigma[name], LEAST_SIGMA))
         found += [FrameMisfit(name, block, rms, typical) for block, rms in by_block.items() if rms > limit]
     return sorted(found, key=lambda m: -m.rms / m.typical)
 

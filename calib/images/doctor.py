@@ -21,7 +21,7 @@ from arraygeom.rig import Depths
 
 from .held_out import image_parts
 from .matches import Matches, match_cameras
-from .plausibility import DriftEvidence
+from .plausibility import DriftEvidence, plausible
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
 
@@ -173,10 +173,11 @@ def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosi
 def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnosis:
     """`diagnose` from matched points of images of these sizes."""
     pairs = {names: _thinned(matches) for names, matches in related(rig, pairs).items()}
-    tried = [NOTHING, *remedies(rig, sizes), *_ignored_lens(rig, sizes, pairs)]
+    fits = all(rig[name].hw == hw for name, hw in sizes.items())
+    tried = [r for r in remedies(rig, sizes) if not fits or plausible(r, rig)]
+    tried = [NOTHING, *tried, *_ignored_lens(rig, sizes, pairs)]
     LOG.info("trying %d mistakes on %d pairs", len(tried), len(pairs))
     figures, inliers, noise = _evaluate(rig, tried, pairs)
-    fits = all(rig[name].hw == hw for name, hw in sizes.items())
     order = sorted(range(0 if fits else 1, len(tried)), key=lambda i: figures[i].penalised_misfit)
     least = EQUAL[0] * figures[order[0]].penalised_misfit + EQUAL[1]
     best = min(i for i in order if figures[i].penalised_misfit <= least)

@@ -16,12 +16,13 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from arraygeom import Camera, Rig
+from arraygeom import Camera, LensView, Rig
 
 from .least_squares import JoinedResiduals, jacobian
 from .matches import Matches
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
-from .refinement import systematic_columns
+from .refinement import LARGEST_CHANGE, systematic_columns
+from .remedies import Remedy
 from .residuals import match_depths, sampson_of_pairs
 
 Pairs = Mapping[tuple[str, str], Matches]
@@ -34,8 +35,38 @@ STEPS = 4
 """Steps of Gauss and Newton to the most probable drift."""
 NO_BETTER = 0.1
 """... which end once the evidence improves by less."""
+OFF_CENTRE = 0.05
+"""Principal points within this of the middle of the image, as a share of its longer side, are plausible."""
 CLIPPED = 30.0
 """Residuals count as at most so many pixels."""
+
+
+def plausible(remedy: Remedy, rig: Rig) -> bool:
+    """Whether a rig may hold this mistake, by its numbers alone.
+
+    Another size and exchanged axes change K by more than a drift does, and take principal points away from the middles
+    of images, not towards them. By points alone a drift is taken for such a mistake now and then: lines of distant
+    narrow views depend on little but the difference of two principal points.
+    """
+    if remedy.kind not in ("resized", "x and y exchanged"):
+        return True
+    views = zip(rig.cameras.values(), remedy.repair(rig).cameras.values())
+    changed = [(a, b) for a, b in views if a is not b and isinstance(a, LensView) and isinstance(b, LensView)]
+    nearer = all(_centre_offset(b) <= max(_centre_offset(a), OFF_CENTRE) for a, b in changed)
+    return nearer and (not changed or any(_beyond_drift(a.K, b.K) for a, b in changed))
+
+
+def _beyond_drift(given: Tensor, other: Tensor) -> bool:
+    """Whether a focal length or a principal point differs by more than `LARGEST_CHANGE` prior deviations."""
+    focal = (other / given - 1).diagonal()[:2].abs().max() / SIGMA["focal"]
+    centre = (other - given)[:2, 2].norm() / SIGMA["centre"]
+    return bool(torch.maximum(focal, centre) > LARGEST_CHANGE)
+
+
+def _centre_offset(view: LensView) -> float:
+    """Of the principal point from the middle of the image, as a share of its longer side."""
+    middle = view.K.new_tensor([view.hw[1] - 1, view.hw[0] - 1]) / 2
+    return float((view.K[:2, 2] - middle).norm()) / max(view.hw)
 
 
 @dataclass(frozen=True)

@@ -64,19 +64,20 @@ def rows(data: Path) -> Iterator[str]:
     yield markdown_header(
         ["boards", "frames", "RMS px", "parameters", "stated / jackknife", "within 30 %", "f", "raised", "shape"]
     )
+    notes = []
     for name, found in sets(data):
         ratio = np.sqrt(found.fit.covariance.diagonal()) / jackknifed(found.fit)
         focal = [r for r, n in zip(ratio, found.fit.names) if "focal" in n]
         shape = "; ".join(note.split(";")[0] for note in found.notes if note.startswith("the board is"))
-        cells = (
-            f"{np.median(ratio):.2f}",
-            f"{np.mean(np.abs(np.log(ratio)) < np.log(1.3)):.0%}",
-            f"{np.mean(focal):.2f}",
-        )
+        near = np.abs(np.log(ratio)) < np.log(1.3)
+        others = ", ".join(f"{n} {r:.2f}" for r, n in zip(ratio[~near], np.array(found.fit.names)[~near]))
+        notes.append(f"- {name}: {others or 'none'}")
+        cells = f"{np.median(ratio):.2f}", f"{np.mean(near):.0%}", f"{np.mean(focal):.2f}"
         count = len(found.fit.problem.structure)
         yield markdown_row(
             [name, count, f"{found.rms:.3f}", len(ratio), *cells, f"{found.raised:.1f}", shape or "flat"]
         )
+    yield "\n".join(["", "Stated / jackknife of the parameters that are not within 30 %:", "", *notes])
 
 
 def main() -> None:

@@ -122,6 +122,23 @@ def test_chessboards_that_are_numbered_from_either_end(pair):
     assert float((result.rig["colour"].centre - rig["colour"].centre).norm()) < 2e-3
 
 
+def test_a_chessboard_detected_a_square_off_is_left_out(pair):
+    """Detectors take the board's edge for a row of its corners now and then."""
+    rig, boards, _ = pair
+    views = see(rig, boards, CHESS, noise=0.1)
+
+    class Shifted:
+        points = CHESS.points + np.array([0.06, 0, 0])
+
+    off = see(rig, boards, Shifted, noise=0.1)["colour"].seen
+    key = next(k for k, d in views["colour"].seen.items() if len(d.ids) == len(off[k].ids) == len(CHESS.points))
+    views["colour"] = BoardViews(views["colour"].hw, {**views["colour"].seen, key: off[key]})
+    result = calibrate(views, CHESS)
+    assert result.rms < 0.2
+    assert any(f": left out {key}: " in note and "contradict" in note for note in result.notes), result.notes
+    assert float((result.rig["colour"].centre - rig["colour"].centre).norm()) < 2e-3
+
+
 def test_symmetry_poses_move_points_to_their_images():
     for turn, image in zip(symmetry_poses(CHESS), CHESS.symmetries):
         assert np.abs(turn.apply(torch.from_numpy(CHESS.points)).numpy() - CHESS.points[image]).max() < 1e-12

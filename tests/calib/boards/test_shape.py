@@ -70,6 +70,13 @@ def test_shapes_are_found_modelled_and_said(values, said):
     assert found.rms < 0.15
 
 
+def test_six_frames_of_a_board_with_oblong_squares():
+    found = calibrate(seen_of([0.05, 0.0, 0.0, 0.0], count=6), BOARD)
+    assert found.fit.problem.shape.values[0, 0] == pytest.approx(0.05, abs=1e-3)
+    assert found.rms < 0.15
+    assert calibrate(seen_of([0.0] * 4, count=6), BOARD).fit.problem.shape is None
+
+
 def test_flat_boards_stay_flat():
     found = calibrate(seen_of([0.0] * 4), BOARD)
     assert found.fit.problem.shape is None

@@ -10,7 +10,10 @@ import torch
 
 from arraygeom import Link, Pose, Rig, View
 from calib.images.doctor import diagnose, diagnose_matches
-from calib.images.remedies import TRANSPOSE, on_cameras, swap
+from calib.images.least_squares import most_probable
+from calib.images.parameters import UNCERTAIN, apply_change, free_parameters
+from calib.images.remedies import TRANSPOSE, on_cameras, remedies, swap
+from calib.images.residuals import sampson_of_pairs
 from pat.cli.main import main
 from pat.media.images import write_image
 from tests.benchmarks.bench_drift import drifted
@@ -88,6 +91,27 @@ def test_a_drifted_rig_is_not_given_a_name(field, draw):
     found = diagnose_matches(bad, sizes(rig), simulated_matches(rig, field, g))
     assert found.named.kind == "nothing", found.verdict
     assert found.repaired is bad
+
+
+@pytest.mark.parametrize("words", ["x and y exchanged in focal lengths", "K of all cameras is for images 1.33"])
+def test_a_drift_that_a_mistake_would_explain_is_not_named(words):
+    """The smallest drift that leaves the points on their lines once the remedy is applied too."""
+    g = np.random.default_rng([2, 77])
+    rig = simulated_rig("narrow", 2, g)
+    points = simulated_matches(rig, "narrow", g, wrong=0.0)
+    remedy = next(r for r in remedies(rig, sizes(rig)) if words in r.words)
+    parameters = free_parameters(rig, rig.names, free=UNCERTAIN)
+
+    def distances(z):
+        return torch.cat(sampson_of_pairs(remedy.repair(apply_change(rig, parameters, z)), points))
+
+    count = sum(len(p.sigma) for p in parameters)
+    z = most_probable(distances, torch.zeros(count).double(), torch.eye(count).double())
+    assert z.abs().max() < 4
+    drifted = apply_change(rig, parameters, z)
+    found = diagnose_matches(drifted, sizes(rig), points)
+    assert found.before.misfit > 3
+    assert found.named.kind == "nothing", found.verdict
 
 
 @pytest.mark.parametrize("lens", [False, True])

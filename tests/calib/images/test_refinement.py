@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Link, Rig, View
+from calib.images.depth_change import relative_change
 from calib.images.held_out import line_distances
 from calib.images.matches import Matches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
@@ -318,3 +319,11 @@ def test_command_line(tmp_path, capsys):
         main([*command, f"--image=left={tmp_path / 'left.png'}", "--out", str(tmp_path / "none.yaml")])
     assert "every camera needs an image of every frame" in capsys.readouterr().err
     assert not (tmp_path / "none.yaml").exists()
+
+
+def test_depth_that_is_lost_counts_as_changed():
+    g = np.random.default_rng(0)
+    rig = simulated_rig("wide", 2, g)
+    points = simulated_matches(rig, "wide", g)
+    reversed_rig = swap(rig, "c0", "c1")
+    assert relative_change(rig, reversed_rig, points) == 1.0
