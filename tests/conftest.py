@@ -4,6 +4,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 from jaxtyping import install_import_hook
 
 if find_spec("beartype"):  # arraygeom's tests run with nothing but its own dependencies, too
@@ -11,7 +12,19 @@ if find_spec("beartype"):  # arraygeom's tests run with nothing but its own depe
 
     install_import_hook(["arraygeom", "pat", "calib"], f"{typecheck.__name__}.checked")
 
+if find_spec("hypothesis"):
+    from hypothesis import HealthCheck, settings
+
+    settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("any machine")
+
 SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Numbers drawn without a seed are the same whichever tests ran before, in whichever process."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")
