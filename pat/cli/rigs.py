@@ -218,7 +218,7 @@ class Doctor:
             options.writable(self.out)
         rig = load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
-            found = diagnose(rig, options.read_images(rig, self.image))
+            found = diagnose(rig, options.read_images(rig, self.image, sized=False))
         if self.json:
             options.print_json(json.loads(found.as_json()))
         else:
