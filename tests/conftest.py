@@ -1,5 +1,6 @@
 """Shapes and types of every public function are checked while testing, and only then."""
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -17,6 +18,8 @@ if find_spec("hypothesis"):
 
     settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
     settings.load_profile("any machine")
+
+os.environ.setdefault("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "300s")  # of workers that start beside other work
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 

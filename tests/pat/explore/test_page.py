@@ -49,6 +49,7 @@ def opened(address):
     for flag in ("--headless=new", "--no-sandbox", "--window-size=1500,1400", "--disable-dev-shm-usage"):
         options.add_argument(flag)
     driver = webdriver.Chrome(options, webdriver.ChromeService(DRIVER))
+    driver.set_script_timeout(PATIENCE)
     try:
         driver.before = slowed_by_others()
         driver.get(address)
