@@ -141,6 +141,8 @@ class Info:
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
         rig = load_rig(self.rig, self.depth)
+        if rig.name:
+            say(rig.name)
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]
