@@ -5,7 +5,7 @@ import torch
 
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.response import Response, fit, stated_response
+from pat.fusion.response import SETTINGS, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import ALPHA, BETA, load_sample
@@ -90,6 +90,21 @@ def test_light_that_differs_by_object_is_not_taken_for_other_weights():
     found = fit(0.6 * truth * light, luminance(truth[:, None])[0, 0] + 0.005 * torch.randn(4000, generator=g))
     assert found.weights.tolist() == list(REC601)
     assert found.gain == pytest.approx(1 / 0.6, rel=0.02)
+
+
+def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone():
+    """Green is darker to an unfiltered sensor than Rec. 601's luma; weights of .7 green would explain it brighter."""
+    g = torch.Generator().manual_seed(0)
+    colours, light = torch.tensor([[0.3, 0.6, 0.2], [0.6, 0.4, 0.25]]).T, torch.tensor([1.08, 1.0])
+    material = torch.randint(2, (4000,), generator=g)
+    x = (
+        colours[:, material]
+        * (0.6 + 0.7 * torch.rand(4000, generator=g))
+        * (1 + 0.03 * torch.randn(3, 4000, generator=g))
+    )
+    alpha = luminance(x[:, None])[0, 0] * light[material] + 0.005 * torch.randn(4000, generator=g)
+    assert fit(x, alpha).is_rec601
+    assert fit(x, alpha, settings=SETTINGS._replace(greenest=1.0)).weights[1] > 0.65
 
 
 def test_a_gamma_needs_a_range_of_brightness():

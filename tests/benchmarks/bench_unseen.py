@@ -1,0 +1,104 @@
+"""Colour where beta does not see: each way to fill alone, the choice of the network, and the best choice there is.
+
+    python -m tests.benchmarks.bench_unseen DATA [--half report] [--out tests/benchmarks/RESULTS_unseen.md]
+
+PSNR (dB) by region, mean over Middlebury's pairs of one half of `pat/evaluation/halves.yaml` in the folder DATA, beta
+reduced 2x. The best choice is made with the ground truth, for each block of 16x16 pixels.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from types import MethodType
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, one_hot
+
+from pat import load_weights
+from pat.data.pairs import PAPER_DISPARITY, StereoPair, middlebury_pairs
+from pat.evaluation.baseline import classical_fusion
+from pat.evaluation.conditions import regions_of
+from pat.evaluation.halves import of_half
+from pat.evaluation.protocols import mono_colour_task, rectified_fusion
+from pat.evaluation.tables import markdown_header, markdown_row
+from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT
+from pat.networks.semi_global import FILLS
+from tests.benchmarks.printed import print_tables
+
+
+REGIONS = ("whole", "seen", "occluded", "beyond")
+BLOCK = 16
+"""Sides of the blocks of the best choice, pixels."""
+FILL_NAMES = ("propagated", "diffused by brightness", "diffused")
+
+
+def filled_by(network: GuidedPAT, fill: int | None) -> None:
+    """Let a network fill in one way, the number of `BetaEstimate.choice`; None: by its own choice."""
+    if fill is None:
+        vars(network).pop("_unseen", None)
+        return
+
+    def alone(self: GuidedPAT, own: Encoded, estimate: BetaEstimate) -> Tensor:
+        chosen = one_hot(torch.tensor(fill), 1 + FILLS).to(estimate.choice)[:, None, None]
+        return GuidedPAT._unseen(self, own, estimate._replace(choice=(1e4 * chosen).expand_as(estimate.choice)))
+
+    vars(network)["_unseen"] = MethodType(alone, network)
+
+
+def images_of(network: GuidedPAT, pair: StereoPair) -> tuple[dict[str, Tensor], Tensor]:
+    """The fused images by the way of filling, with the classical one, and the ground truth; (3, H, W) each."""
+    task = mono_colour_task(pair, 2)
+    given = task.alpha, task.beta, PAPER_DISPARITY
+    found = {"classical": classical_fusion(*given)}
+    for name, fill in (*((name, i) for i, name in enumerate(FILL_NAMES)), ("chosen", None)):
+        filled_by(network, fill)
+        found[name] = rectified_fusion(network)(*given).image
+    found["best choice"] = best([found[name] for name in FILL_NAMES], task.ground_truth)
+    return {name: image.clamp(0, 1) for name, image in found.items()}, task.ground_truth
+
+
+def best(images: list[Tensor], truth: Tensor) -> Tensor:
+    """Of each block that of the images which is nearest to the truth."""
+    h, w = truth.shape[-2:]
+    errors = torch.stack([(image - truth).square().mean(0) for image in images])
+    of_blocks = avg_pool2d(errors, BLOCK, ceil_mode=True).argmin(0)
+    which = of_blocks.repeat_interleave(BLOCK, 0).repeat_interleave(BLOCK, 1)[:h, :w]
+    return torch.stack(images).gather(0, which.expand(1, 3, h, w))[0]
+
+
+def table(pairs: list[StereoPair]) -> Iterator[str]:
+    """A row for each way to fill: means over the pairs that have such pixels."""
+    network = load_weights("mono-colour")
+    assert isinstance(network, GuidedPAT)
+    found: dict[str, list[dict[str, float]]] = {}
+    for pair in pairs:
+        images, truth = images_of(network, pair)
+        regions = regions_of(pair, (truth.shape[-2], truth.shape[-1]))
+        for name, image in images.items():
+            error = (image - truth).square().mean(0)
+            found.setdefault(name, []).append(
+                {n: -10 * math.log10(float(error[at].mean())) for n, at in regions.items() if at.any()}
+            )
+    yield from markdown_header(["unseen colour", *REGIONS]).splitlines()
+    for name, rows in found.items():
+        means = (np.mean([row[region] for row in rows if region in row]) for region in REGIONS)
+        yield markdown_row([name, *(f"{mean:.2f}" for mean in means)])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("data", type=Path)
+    parser.add_argument("--half", choices=["tune", "report"], default="report")
+    parser.add_argument("--out", type=Path)
+    args = parser.parse_args()
+    pairs = list(of_half(middlebury_pairs(args.data / "middlebury"), args.half))
+    print_tables("Colour where beta does not see", [table(pairs)], args.out)
+
+
+if __name__ == "__main__":
+    main()
