@@ -30,7 +30,6 @@ from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT
 from pat.networks.semi_global import FILLS
 from tests.benchmarks.printed import print_tables
 
-
 REGIONS = ("whole", "seen", "occluded", "beyond")
 BLOCK = 16
 """Sides of the blocks of the best choice, pixels."""
