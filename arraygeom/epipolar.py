@@ -91,10 +91,7 @@ class Track(NamedTuple):
 
 
 def track(
-    K_alpha: Float[Tensor, "*b 3 3"],
-    K_beta: Float[Tensor, "*b 3 3"],
-    beta_from_alpha: Pose,
-    x: Real[Tensor, "*n 2"],
+    K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose, x: Real[Tensor, "*n 2"]
 ) -> Track:
     """The track in beta of each alpha pixel. Batched rigs (*b, 3, 3) take pixels (*b, ..., 2).
 

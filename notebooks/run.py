@@ -15,7 +15,8 @@ HERE = Path(__file__).parent
 
 def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookNode:
     """The notebook with its outputs, run in `folder` with this checkout's packages. Raises nbclient's errors."""
-    client = NotebookClient(notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}})
+    patience = {"timeout": 1800, "startup_timeout": 600, "iopub_timeout": 120}  # seconds, for machines with other work
+    client = NotebookClient(notebook, kernel_name="python3", resources={"metadata": {"path": str(folder)}}, **patience)
     client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)

@@ -1,9 +1,11 @@
 """Shapes and types of every public function are checked while testing, and only then."""
 
+import os
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+import torch
 from jaxtyping import install_import_hook
 
 if find_spec("beartype"):  # arraygeom's tests run with nothing but its own dependencies, too
@@ -11,7 +13,21 @@ if find_spec("beartype"):  # arraygeom's tests run with nothing but its own depe
 
     install_import_hook(["arraygeom", "pat", "calib"], f"{typecheck.__name__}.checked")
 
+if find_spec("hypothesis"):
+    from hypothesis import HealthCheck, settings
+
+    settings.register_profile("any machine", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("any machine")
+
+os.environ.setdefault("DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT", "300s")  # of workers that start beside other work
+
 SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup() -> None:
+    """Numbers drawn without a seed are the same whichever tests ran before, in whichever process."""
+    torch.manual_seed(0)
 
 
 @pytest.fixture(scope="session")

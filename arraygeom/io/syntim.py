@@ -41,9 +41,7 @@ def _camera(source: RigSource) -> Camera:
     R, t = source.numbers_in(rotation, (3, 3), "Rotation"), source.numbers_in(translation, (3,), "Translation")
     world_from_cam = source.pose(R, t, "Rotation, Translation:", metres=1e-3)
     return Camera(
-        K=K,
-        cam_from_world=Pose.inverse(world_from_cam),
-        hw=source.size(values["dimx"], values["dimy"], "dimx, dimy"),
+        K=K, cam_from_world=Pose.inverse(world_from_cam), hw=source.size(values["dimx"], values["dimy"], "dimx, dimy")
     )
 
 

@@ -112,8 +112,12 @@ def refined_by_depth(
     return _refined_pair(pair.rig, matches, matches) or pair
 
 
+UNSCALED = "found from images: lengths are multiples of the baseline, not metres"
+"""The name of a rig of unknown scale."""
+
+
 def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig:
-    """One rig of pairs with the same alpha, by beta; each pair's lengths times its scale.
+    """One rig of pairs with the same alpha, by beta; each pair's lengths times its scale. Its name is `UNSCALED`.
 
     The depth range is that of all pairs.
     """
@@ -125,7 +129,7 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
         rig = rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t * scales[name])))
     bounds = [[float(bound) * scales[name] for bound in pair.rig.depth or ()] for name, pair in pairs.items()]
     near, far = zip(*bounds)
-    return rig.replace(depth=(min(near), max(far)))
+    return rig.replace(depth=(min(near), max(far)), name=UNSCALED)
 
 
 def dense_matches(

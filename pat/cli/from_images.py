@@ -148,9 +148,7 @@ def found_rig(
     if rig is None:
         note("\n".join(line for line in found.as_text().splitlines() if line.startswith((f"{alpha} >", "F "))))
         rig = _without(found.rig, images.keys() - {alpha, *betas})
-    for name in rig.names:
-        rig = rig.resize(name, (int(images[name].shape[-2]), int(images[name].shape[-1])))
-    return rig, [alpha, *betas]
+    return _resized(rig, images), [alpha, *betas]
 
 
 def _calibrated(

@@ -276,24 +276,8 @@ class Fuse:
             sweep(self.out)
             if not self.resume:
                 shutil.rmtree(store, ignore_errors=True)
-            frame = fuse_with_progress(
-                self.weights or "mono-colour",
-                rig,
-                images,
-                alpha=alpha,
-                field=options.field_named(self.field),
-                max_memory=self.max_memory,
-                match_levels=self.normalise_radiometry,
-                response=options.response_of(self.response),
-                align=self.align,
-                explain=self._note,
-                noise=options.noise_of(self.noise),
-                keep_alpha=self.keep_alpha,
-                luminance=self.luminance,
-                store=store,
-                device=self.device,
-                precision=self.precision,
-            )
+            further = {**self._options(), "explain": self._note, "store": store, "device": self.device}
+            frame = fuse_with_progress(rig=rig, images=images, alpha=alpha, **further)
             before_writing()
             frame, gain = self._exposed(frame)
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
@@ -306,7 +290,7 @@ class Fuse:
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
-                facts = self._facts(found, time.monotonic() - begin)
+                facts = self._facts(rig, found, time.monotonic() - begin)
                 if self.classical:
                     facts = facts._replace(classical=self._classical(rig, images, alpha, gain))
                 written.append(write_report(self.out / "index.html", frame, images, rig, alpha, facts))
@@ -314,13 +298,26 @@ class Fuse:
         if self.report:
             say(f"to see the result, open {self.out / 'index.html'} in a browser")
 
-    def _facts(self, found: tuple[str, ...] | None, seconds: float) -> Facts:
+    def _options(self) -> dict[str, Any]:
+        """What a frame and many frames have in common."""
+        same = ("align", "keep_alpha", "luminance", "max_memory", "precision")
+        return {name: getattr(self, name) for name in same} | {
+            "weights": self.weights or "mono-colour",
+            "field": options.field_named(self.field),
+            "match_levels": self.normalise_radiometry,
+            "response": options.response_of(self.response),
+            "noise": options.noise_of(self.noise),
+        }
+
+    def _facts(self, rig: Rig, found: tuple[str, ...] | None, seconds: float) -> Facts:
         """What the page says."""
+        from calib.images.self_calibration import UNSCALED
+
         from ..fusion.report import Facts
         from ..support.memory import peak_memory
 
         notes = [f"weights: {self.weights or 'mono-colour'}", *self._notes, *(found or ())]
-        unit = "m" if found is None else "baselines"
+        unit = "baselines" if rig.name == UNSCALED else "m"
         return Facts(notes, self._warnings, seconds, peak_memory(), unit)
 
     def _note(self, line: str) -> None:
@@ -362,22 +359,13 @@ class Fuse:
             files,
             rig.require(alpha),
             self.out,
-            weights=self.weights or "mono-colour",
             sequence=self.sequence,
             speed=self.speed,
-            field=options.field_named(self.field),
-            match_levels=self.normalise_radiometry,
-            response=options.response_of(self.response),
-            align=self.align,
-            noise=options.noise_of(self.noise),
-            keep_alpha=self.keep_alpha,
-            luminance=self.luminance,
-            max_memory=self.max_memory,
             bits=self.bits,
             kind=self.kind,
             alone=not self.propagate,
             strict=self.strict,
-            precision=self.precision,
+            **self._options(),
         )
         several = self.workers > 1 or self.scheduler is not None
         report = batch.run(

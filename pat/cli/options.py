@@ -204,11 +204,15 @@ def numbers_by_name(texts: Iterable[str], option: str) -> dict[str, float]:
     return dict(_once(option, (_named_number(option, text) for text in texts)))
 
 
-def read_images(rig: Rig, texts: Iterable[str]) -> dict[str, Tensor]:
-    """The images of `--image NAME=FILE` by camera. Raises ValueError for a camera given twice, or not of the rig."""
+def read_images(rig: Rig, texts: Iterable[str], *, sized: bool = True) -> dict[str, Tensor]:
+    """The images of `--image NAME=FILE` by camera.
+
+    Raises ValueError for a camera given twice, or not of the rig, and, if `sized`, for an image of another size.
+    """
     from ..media.images import read_image
 
-    return {rig.require(name): read_image(path, name=name) for name, path in files_by_name(texts).items()}
+    files = {rig.require(name): path for name, path in files_by_name(texts).items()}
+    return {name: read_image(path, name=name, hw=rig[name].hw if sized else None) for name, path in files.items()}
 
 
 def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:

@@ -141,6 +141,8 @@ class Info:
         from arraygeom.summary import summarise_cameras, summarise_pairs
 
         rig = load_rig(self.rig, self.depth)
+        if rig.name:
+            say(rig.name)
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]
@@ -218,7 +220,7 @@ class Doctor:
             options.writable(self.out)
         rig = load_rig(self.rig)
         with options.working("matching features and trying mistakes"):
-            found = diagnose(rig, options.read_images(rig, self.image))
+            found = diagnose(rig, options.read_images(rig, self.image, sized=False))
         if self.json:
             options.print_json(json.loads(found.as_json()))
         else:

@@ -97,8 +97,7 @@ def cut(folder: Path, patches: PatchGrid, *, alpha: str) -> PatchStack:
         rgb={name: torch.stack([view.rgb for view in found[name]]) for name in rig.names},
         depth={name: torch.stack([view.depth for view in found[name]]) for name in rig.names},
         rig=rig.replace(
-            cameras={name: stack([view.camera for view in found[name]]) for name in rig.names},
-            depth=(near, far),
+            cameras={name: stack([view.camera for view in found[name]]) for name in rig.names}, depth=(near, far)
         ),
     )
 

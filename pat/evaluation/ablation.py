@@ -220,11 +220,7 @@ def sample_photographs(*, count: int = 12, seed: int = 0) -> PhotoBank:
 
 
 def ablate(
-    network: FusionNetwork,
-    cases: Iterable[AblationCase],
-    *,
-    out: Path,
-    chosen: Mapping[str, FieldFamily] | None = None,
+    network: FusionNetwork, cases: Iterable[AblationCase], *, out: Path, chosen: Mapping[str, FieldFamily] | None = None
 ) -> list[AblationRow]:
     """Every family on every case; ablation.md, ablation.csv and ablation.png (crops of some cases) go to `out`."""
     rows: list[AblationRow] = []

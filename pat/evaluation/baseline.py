@@ -273,13 +273,7 @@ def _disparity(left: NDArray[np.uint8], right: NDArray[np.uint8], max_disparity:
     """Semi-global matching, padded because OpenCV leaves `count` columns at the left without disparity."""
     count = 16 * int(np.ceil((min(max_disparity, left.shape[1]) + 1) / 16))
     matcher = cv2.StereoSGBM.create(
-        0,
-        count,
-        BLOCK,
-        P1=8 * BLOCK**2,
-        P2=32 * BLOCK**2,
-        preFilterCap=31,
-        mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY,
+        0, count, BLOCK, P1=8 * BLOCK**2, P2=32 * BLOCK**2, preFilterCap=31, mode=cv2.STEREO_SGBM_MODE_SGBM_3WAY
     )
     padded = (cv2.copyMakeBorder(x, 0, 0, count, count, cv2.BORDER_REPLICATE) for x in (left, right))
     return matcher.compute(*padded)[:, count:-count].astype(np.float32) / 16

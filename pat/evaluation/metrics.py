@@ -46,13 +46,7 @@ def score(image: Float[Tensor, "_ _ _"], ground_truth: Float[Tensor, "_ _ _"]) -
     with np.errstate(divide="ignore"):
         psnr = peak_signal_noise_ratio(theirs, ours, data_range=1)
     ssim = structural_similarity(
-        theirs,
-        ours,
-        data_range=1,
-        channel_axis=0,
-        gaussian_weights=True,
-        sigma=1.5,
-        use_sample_covariance=False,
+        theirs, ours, data_range=1, channel_axis=0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False
     )
     return Score(float(psnr), float(ssim))
 

@@ -11,15 +11,8 @@ from typing import Any
 from .pixel import FAMILIES, BetaReport, ExplorerScene, ExplorerState, PixelReport, inspect_pixel
 
 __all__ = [
-    "FAMILIES",
-    "BetaReport",
-    "ExplorerScene",
-    "ExplorerState",
-    "PixelReport",
-    "explorer",
-    "inspect_pixel",
-    "serve",
-]
+    "FAMILIES", "BetaReport", "ExplorerScene", "ExplorerState", "PixelReport", "explorer", "inspect_pixel", "serve",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

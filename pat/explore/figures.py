@@ -83,12 +83,7 @@ def patch_data(image: Float[Tensor, "c h w"], middle: tuple[float, float]) -> Co
     """Columns of the part of an image around a point."""
     h, w = image.shape[1:]
     left, top = (round(v) - HALF_PATCH for v in middle)
-    box = (
-        max(top, 0),
-        min(top + 2 * HALF_PATCH + 1, h),
-        max(left, 0),
-        min(left + 2 * HALF_PATCH + 1, w),
-    )
+    box = (max(top, 0), min(top + 2 * HALF_PATCH + 1, h), max(left, 0), min(left + 2 * HALF_PATCH + 1, w))
     if box[0] >= box[1] or box[2] >= box[3]:
         return no_patch()
     part = rgba(image[:, box[0] : box[1], box[2] : box[3]])

@@ -196,18 +196,7 @@ def co_located(rig: Rig, names: Sequence[str], fields: Fields, which: JoinsBands
 
 def _same_view(one: View, other: View) -> bool:
     """Whether two calibrated cameras differ at most in their sensors."""
-    if not (isinstance(one, Camera) and isinstance(other, Camera)) or one.hw != other.hw:
-        return False
-    if (one.distortion is None) != (other.distortion is None):
-        return False
-    if one.distortion and other.distortion and one.distortion.model != other.distortion.model:
-        return False
-    return all(torch.equal(*numbers) for numbers in zip(_calibration(one), _calibration(other)))
-
-
-def _calibration(camera: Camera) -> list[Tensor]:
-    lens = [] if camera.distortion is None else [camera.distortion.coefficients]
-    return [camera.K, camera.R, camera.t, *lens]
+    return isinstance(one, Camera) and one.replace(sensor=other.sensor) == other
 
 
 def _band_order(names: Sequence[str], groups: Sequence[Sequence[str]], bands: Mapping[str, int]) -> list[int]:

@@ -21,9 +21,7 @@ def luminance(
     return (rgb * rgb.new_tensor(weights)[:, None, None]).sum(-3, keepdim=True)
 
 
-def to_luma_chroma(
-    rgb: Float[Tensor, "*b 3 h w"],
-) -> tuple[Float[Tensor, "*b 1 h w"], Float[Tensor, "*b 2 h w"]]:
+def to_luma_chroma(rgb: Float[Tensor, "*b 3 h w"]) -> tuple[Float[Tensor, "*b 1 h w"], Float[Tensor, "*b 2 h w"]]:
     """Luminance Y and the colour differences (R - Y, B - Y), which are zero for grey."""
     luma = luminance(rgb)
     return luma, torch.cat([rgb[..., 0:1, :, :], rgb[..., 2:3, :, :]], -3) - luma

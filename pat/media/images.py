@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import struct
 import warnings
-from collections.abc import ItemsView, Iterator, KeysView
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -36,29 +36,11 @@ _LZW = [cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_LZW]
 _HEIF = tuple(b"ftyp" + brand for brand in (b"heic", b"heix", b"mif1", b"msf1", b"heim", b"heis"))
 
 
-@runtime_checkable
-class Images(Protocol):
-    """Images (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`)."""
+Images = Mapping[str, Any]
+"""Images (C, H, W) by camera: a dict, or what reads them when asked for (`pat.fusion.views.ViewFiles`).
 
-    def __getitem__(self, name: str, /) -> Tensor:
-        """One of them."""
-        ...
-
-    def __contains__(self, name: object, /) -> bool:
-        """Whether there is one."""
-        ...
-
-    def __iter__(self) -> Iterator[str]:
-        """The cameras."""
-        ...
-
-    def keys(self) -> KeysView[str]:
-        """The same."""
-        ...
-
-    def items(self) -> ItemsView[str, Tensor]:
-        """Cameras with their images."""
-        ...
+Not `Mapping[str, Tensor]`: what checks types would read one.
+"""
 
 
 def read_image(

@@ -303,17 +303,10 @@ def _sequence(job: SystemRun) -> tuple[list[str], Panels]:
         "fusion, each frame alone": [f.image for f in alone],
         "fusion": [f.image for f in fused],
     }
-    lines = [
-        *_sequence_table(methods, ground_truth, greys),
-        *_confidence_line(fused[2], ground_truth[2]),
-    ]
+    lines = [*_sequence_table(methods, ground_truth, greys), *_confidence_line(fused[2], ground_truth[2])]
     i = next(i for i in range(len(fused)) if i not in colours)
     first = next(name for name in rig.betas(alpha))
-    panels = {
-        f"alpha, frame {i}": greys[i],
-        f"beta {first}": frames[first][0],
-        "ground truth": ground_truth[i],
-    }
+    panels = {f"alpha, frame {i}": greys[i], f"beta {first}": frames[first][0], "ground truth": ground_truth[i]}
     panels |= {n: p[i] for n, p in methods.items() if n != "alpha alone"}
     panels |= {"confidence": fused[i].confidence[None], "confidence, frame alone": alone[i].confidence[None]}
     return lines, panels

@@ -96,7 +96,7 @@ def test_unproject_is_undistort_ahead(d):
     assert bool((d.distort(xy)[0] - xy_d)[both].abs().max() < 1e-12)
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=150, derandomize=True)
 @given(st.integers(0, 10**6), st.sampled_from(COUNTS), st.sampled_from([torch.float32, torch.float64]))
 def test_any_brown_conrady_lens(seed, n, dtype):
     """Whatever the radial coefficients: nothing wild, and what is valid comes back."""

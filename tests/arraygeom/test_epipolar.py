@@ -35,7 +35,7 @@ def normalised(F: torch.Tensor) -> torch.Tensor:
     return F / F.norm()
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=50)
 @given(seeds)
 def test_real_points_satisfy_the_epipolar_constraint(seed):
     rig = random_rig(seed)
@@ -178,7 +178,7 @@ def sampled_visible(pair, x: torch.Tensor, depths: tuple[torch.Tensor, torch.Ten
     return xy, (z > 2e-3) & pair.beta.contains(xy)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(seeds, st.sampled_from([0.1, 1.0, 3.0]))
 def test_clipped_segments_hold_all_that_is_visible_and_no_more(seed, turn):
     rig = random_rig(seed, near=0.3, far=50.0, turn=turn, baseline=1.0)

@@ -454,7 +454,7 @@ def not_grazing(exact: Segments, hw: tuple[int, int]) -> torch.Tensor:
     return ~grazing.any(-1)
 
 
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10)
 @given(st.integers(0, 10**9), st.sampled_from([0.2, 1.0, 3.0]))
 def test_float32_agrees_with_float64_on_a_thousand_rigs(seed, turn):
     """10 times 100 rigs: no NaN, and no other `valid` than rounding at the image's edge explains."""

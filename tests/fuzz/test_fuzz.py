@@ -52,7 +52,8 @@ def test_damaged_files_are_read_or_refused(kind, count, tmp_path, monkeypatch):
 )
 def test_the_sandbox_sees(case, verdict, tmp_path, monkeypatch):
     monkeypatch.setattr(sandbox, "SECONDS", 1)
-    monkeypatch.setattr(sandbox, "WAITING", 3)
+    if verdict == "hang":
+        monkeypatch.setattr(sandbox, "WAITING", 3)
     assert sandbox.ended(case, tmp_path / "log").verdict == verdict
 
 
@@ -83,7 +84,7 @@ def test_a_photograph_that_claims_too_much_is_passed_over(tmp_path):
 
     outcome = sandbox.ended(case, tmp_path / "log")
     assert outcome.verdict == "read"
-    assert outcome.seconds < 2
+    assert outcome.seconds < 5
 
 
 @pytest.mark.parametrize(

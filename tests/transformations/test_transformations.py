@@ -31,7 +31,7 @@ def test_whole_graphs():
     """In a process without the tests' own checks of shapes, which Dynamo cannot trace."""
     operators = ["Epipolar", "undistort, brown-conrady", "Rectified"]
     text = f"from tests.transformations.run import verdict; print(*(verdict(o, 'compile') for o in {operators}))"
-    found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True, timeout=300)
+    found = subprocess.run([sys.executable, "-c", text], capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["right"] * 3
 
 

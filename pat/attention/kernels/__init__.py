@@ -24,21 +24,9 @@ from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
 
 __all__ = [
-    "LANES",
-    "Call",
-    "Geometry",
-    "Gradients",
-    "Outputs",
-    "Saved",
-    "Share",
-    "TapList",
-    "backward",
-    "block_scratch",
-    "compiled",
-    "forward",
-    "scatter",
-    "separate_cache",
-]
+    "LANES", "Call", "Geometry", "Gradients", "Outputs", "Saved", "Share", "TapList", "backward", "block_scratch",
+    "compiled", "forward", "scatter", "separate_cache",
+]  # fmt: skip
 
 
 def _watch_all_sources() -> None:

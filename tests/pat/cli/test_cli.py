@@ -154,6 +154,12 @@ def test_show_draws_the_rig_and_its_fields(small):
     assert (small / "again" / "fields.png").is_file()
 
 
+def test_show_refuses_images_of_other_sizes_than_the_rigs(small, capsys):
+    write_image(small / "larger.png", torch.zeros(1, 100, 130))
+    said = fails(["show", str(small / "rig.yaml"), "--image", f"mono={small / 'larger.png'}"], capsys)
+    assert "larger.png: is 130x100, the rig says 128x96" in said
+
+
 def test_rig_info_prints_the_numbers(small, capsys):
     main(["rig", "info", str(small / "rig.yaml"), "--depth", "2", "8"])
     text = " ".join(capsys.readouterr().out.split())
@@ -402,7 +408,7 @@ def wrong(small) -> None:
 
 def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(small, capsys):
     wrong(small)
-    for extra, written in (([], True), (["--strict"], False)):
+    for extra, written in ((["--no-report"], True), (["--strict"], False)):
         shutil.rmtree(small / "out", ignore_errors=True)
         with pytest.raises(SystemExit) as stop:
             main(arguments(small, extra=extra))
@@ -410,6 +416,7 @@ def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(sm
         text = " ".join(capsys.readouterr().err.split())
         assert re.search(r"pat: .*mean confidence 0\.[01]\d where the views overlap: .*`pat rig doctor`", text)
         assert (small / "out" / "fused.png").exists() == written
+        assert not (small / "out" / "index.html").exists()
     assert not (small / "out").exists()
 
 

@@ -1,8 +1,8 @@
 """A worker without a renderer: `python fake_worker.py ROOT TAG BEHAVIOUR`, for the tests of what watches workers.
 
 BEHAVIOUR is JSON: {"13": "segfault"} says what befalls a scene: "segfault", "once" (segfault at the first try),
-"hang", "refuse", "refuse twice", "error", "full"; {"start": "die"} what befalls the process. "pause" is a time in
-seconds that each half of a scene takes.
+"hang", "hang once", "refuse", "refuse twice", "error", "full"; {"start": "die"} what befalls the process. "pause" is a
+time in seconds that each half of a scene takes.
 """
 
 import ctypes
@@ -37,7 +37,8 @@ def answer(folder: JobFolder, tag: str, behaves: dict, index: int, attempt: int)
         sys.stderr.write("about to fall\n")
         sys.stderr.flush()
         os.kill(os.getpid(), signal.SIGSEGV)
-    if kind == "hang":
+    if kind == "hang" or (kind == "hang once" and not mark.exists()):
+        mark.touch()
         time.sleep(1000)
     if kind == "refuse" or (kind == "refuse twice" and attempt < 2):
         return {"answer": "refused", "reason": "black"}

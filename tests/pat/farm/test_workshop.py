@@ -194,11 +194,17 @@ def wait_for_the_end_of(pids: list[int]) -> None:
 
 
 def test_a_worker_killed_from_outside_is_replaced(tmp_path):
-    with Workshop(order(tmp_path, {"pause": 0.2})) as workshop:
+    def kill_once_at_work(pid: int) -> None:
+        while not (tmp_path / ".work" / "tried-1").exists():
+            time.sleep(0.01)
+        os.kill(pid, signal.SIGKILL)
+
+    with Workshop(order(tmp_path, {"1": "hang once"})) as workshop:
         workshop.make(0)
-        pid = workshop._process.pid
-        threading.Timer(0.1, os.kill, (pid, signal.SIGKILL)).start()
+        killer = threading.Thread(target=kill_once_at_work, args=(workshop._process.pid,))
+        killer.start()
         outcome = workshop.make(1)
+        killer.join()
     assert (outcome.state, outcome.crashes) == ("done", 1)
 
 

@@ -46,9 +46,9 @@ def test_bytes_are_read():
 @pytest.mark.skipif(sys.platform != "linux", reason="read from /proc")
 def test_the_peak_of_a_process_is_its_own_not_that_of_its_parent():
     held = np.ones(2**26)  # 512 MiB resident here while the other starts
-    code = "import time; held = bytearray(100 << 20); del held; time.sleep(1)"
+    code = "import time; held = bytearray(100 << 20); del held; time.sleep(2)"
     process = subprocess.Popen([sys.executable, "-I", "-S", "-c", code])
-    peak = watch_peak(process.pid)()
+    peak = watch_peak(process.pid, every=0.01)()
     assert process.wait() == 0
     assert held.nbytes == 2**29
     assert 100 * 2**20 < peak < 200 * 2**20

@@ -104,7 +104,9 @@ def test_a_stopped_run_goes_on_bit_for_bit(step, what, folder, whole, monkeypatc
 
 
 def command(*arguments, processes=1):
-    torchrun = ["-m", "torch.distributed.run", "--nproc_per_node", str(processes)] if processes > 1 else []
+    torchrun = (
+        ["-m", "torch.distributed.run", "--standalone", "--nproc_per_node", str(processes)] if processes > 1 else []
+    )
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT)}
     return subprocess.Popen(
         [sys.executable, *torchrun, "-m", "pat", "train", *map(str, arguments)],

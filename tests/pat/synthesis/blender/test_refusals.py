@@ -79,11 +79,11 @@ def test_a_crash_is_an_error_and_the_next_scene_has_a_new_process(monkeypatch, t
 
 
 def test_a_hanging_process_is_ended(monkeypatch, tmp_path):
-    served_by(monkeypatch, "import time; time.sleep(60)")
+    served_by(monkeypatch, "import time; time.sleep(600)")
     started = time.monotonic()
     with Worker() as worker, pytest.raises(RenderError, match=r"longer than 0.2 s"):
         worker.render(room_scene(), RIG, tmp_path / "x", settings=SETTINGS, timeout=0.2)
-    assert time.monotonic() - started < 30
+    assert time.monotonic() - started < 300
 
 
 def test_errors_of_the_process_come_back_as_they_are(monkeypatch, tmp_path):
