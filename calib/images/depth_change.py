@@ -84,6 +84,13 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     return torch.cat(parts)
 
 
+def share_behind(rig: Rig, pairs: Pairs) -> float:
+    """The share of points behind a camera, of those whose rays meet anywhere; 0 for too few."""
+    found = [match_depths(rig.pair(*names), matches) for names, matches in pairs.items()]
+    front = torch.cat([torch.ones(0, dtype=torch.bool), *(f.front[f.observable] for f in found if f is not None)])
+    return float((~front).double().mean()) if len(front) >= FEW else 0.0
+
+
 def log_depths(after: Callable[[Tensor], Rig], rigs: Sequence[Rig], pairs: Pairs) -> Callable[[Tensor], Tensor] | None:
     """The logarithm of depth as a function of the parameters, of points observable in all these rigs.
 

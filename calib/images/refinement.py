@@ -28,7 +28,16 @@ from torch import Tensor
 from arraygeom import Camera, Rig
 from arraygeom.progress import log_step, part, stage
 
-from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, rms_deviation
+from .depth_change import (
+    LARGE_CHANGE,
+    NEGLIGIBLE,
+    DepthChange,
+    depth_modes,
+    log_depths,
+    relative_change,
+    rms_deviation,
+    share_behind,
+)
 from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, nearer, split
 from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
@@ -281,7 +290,7 @@ class RefinementProblem:
         objections = [] if moved and nearer(*distances[1]) else [NO_NEARER]
         objections += _contradictions(self.parameters, solution.z)
         objections += _remaining(refined, self.held_out, held_out[1]) if moved else []
-        objections += _uncertain_depth(depth)
+        objections += [*_uncertain_depth(depth), *_behind(refined, self.used)]
         accepted = moved and (force or not objections)
         return Refinement(
             rig=_with_maps(refined, self.used) if accepted else self.rig,
@@ -305,6 +314,8 @@ class RefinementProblem:
 
 
 NO_NEARER = "held-out points are no nearer to their lines"
+MOST_BEHIND = 0.5
+"""Share of the points that may lie behind a camera: some wrong matches always do."""
 
 
 def _contradictions(parameters: Sequence[FreeParameter], z: Tensor) -> list[str]:
@@ -331,6 +342,13 @@ def _remaining(refined: Rig, held_out: Pairs, after: LineStatistics) -> list[str
             f"points still lie {after.median:.1f} px from their lines: the rig has not drifted, see `pat rig doctor`"
         ]
     return []
+
+
+def _behind(refined: Rig, used: Pairs) -> list[str]:
+    """An objection if most points would be behind a camera, however near their lines."""
+    if (share := share_behind(refined, used)) <= MOST_BEHIND:
+        return []
+    return [f"{share:.0%} of the points lie behind a camera: is it swapped, or turned round? See `pat rig doctor`"]
 
 
 def _uncertain_depth(depth: DepthChange | None) -> list[str]:

@@ -101,6 +101,20 @@ def test_swapped_cameras_are_not_accepted():
     assert refine_matches(swap(rig, "c0", "c1"), [points], force=True).accepted
 
 
+def test_points_behind_the_cameras_are_not_accepted():
+    """Parallel cameras of the same K that are swapped have the right lines: only the side of the points tells."""
+    g = np.random.default_rng(9)
+    rig = simulated_rig("wide", 2, g)
+    alpha, pose = rig["c0"], rig["c1"].cam_from_world
+    parallel = rig.replace(cameras={"c0": alpha, "c1": alpha.replace(cam_from_world=pose.replace(R=alpha.R))})
+    points = simulated_matches(parallel, "wide", g)
+    drift = swap(parallel, "c0", "c1").perturbed({"c1.rotation": vector(0.004, 0, 0)})
+    found = refine_matches(drift, [points])
+    assert found.held_out[1].median < 0.3
+    assert not found.accepted
+    assert any("100% of the points lie behind a camera" in text for text in found.objections)
+
+
 def test_a_prior_binds():
     """A change of many prior deviations is refused, with the parameter's name and what to do."""
     rig = simulated_rig("wide", 2, np.random.default_rng(11))
