@@ -138,6 +138,11 @@ class Pair(Batched):
         """The pair whose beta records images of another size."""
         return self.transform_beta(resize_matrix(self.beta.hw, hw), hw)
 
+    def rot90_beta(self, quarter_turns: int) -> Pair:
+        """The pair whose beta has its image rotated; see `Camera.rot90`."""
+        h, w = self.beta.hw
+        return self.transform_beta(rot90_matrix((h, w), quarter_turns), (w, h) if quarter_turns % 2 else (h, w))
+
     def transform_beta(self, A: Float[Tensor, "3 3"], hw: HW) -> Pair:
         """The pair in which beta's pixels are x' ~ A x and its image's size is `hw`."""
         eye = torch.eye(3, dtype=A.dtype)

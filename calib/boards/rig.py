@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -30,7 +30,7 @@ SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, 
 INCONSISTENT, REJECTED = 3.0, 20.0
 """Ratios of joint to single RMS from which a camera is inconsistent with the others, or refused."""
 MANY_WRONG = 0.34
-"""The share of a camera's images that may be left out because they contradict the others."""
+"""The share of a camera's images that may be left out, in all, because they contradict the others."""
 FEWEST_TO_JACKKNIFE = 6
 CONSIDERABLE = 1.3
 """Standard deviations are raised if the jackknife's are larger by this."""
@@ -295,8 +295,15 @@ def _wrong_images(
     for m in misfits(fit):
         if m.rms > _refused_from(single[m.camera]):
             found.setdefault(frames[m.block], m.camera)
-    shares = (list(found.values()).count(name) / len(v.seen) for name, v in initial.views.items())
-    return [] if max(shares) > MANY_WRONG else [(camera, frame) for frame, camera in found.items()]
+    seen = {name: len(v.seen) for name, v in initial.views.items()}
+    many = many_wrong(list(found.values()), [name for name, _ in initial.left_out], seen)
+    return [] if many else [(camera, frame) for frame, camera in found.items()]
+
+
+def many_wrong(found: Sequence[str], before: Sequence[str], seen: Mapping[str, int]) -> bool:
+    """Whether images found wrong, and those left out before (the camera of each), are more than `MANY_WRONG` of all of
+    a camera's; `seen` are those that are left of it."""
+    return any(found.count(n) + before.count(n) > MANY_WRONG * (seen[n] + before.count(n)) for n in set(found))
 
 
 def _refused_from(single: SingleCalibration) -> float:

@@ -348,7 +348,8 @@ def _behind(refined: Rig, used: Pairs) -> list[str]:
     """An objection if most points would be behind a camera, however near their lines."""
     if (share := share_behind(refined, used)) <= MOST_BEHIND:
         return []
-    return [f"{share:.0%} of the points lie behind a camera: is it swapped, or turned round? See `pat rig doctor`"]
+    mistake = "is it swapped, or does it face the other way? See `pat rig doctor`"
+    return [f"{share:.0%} of the points lie behind a camera: {mistake}"]
 
 
 def _uncertain_depth(depth: DepthChange | None) -> list[str]:

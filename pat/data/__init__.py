@@ -7,7 +7,20 @@ from pat.data.scenes import Patch, ScenePatches, SceneShuffle, collate, default_
 from pat.data.windows import scene_folders
 
 __all__ = [
-    "PAPER_DISPARITY", "Disparity", "Patch", "PatchGrid", "ScenePatches", "SceneShuffle", "StereoPair", "agreement",
-    "collate", "default_chains", "folder_pairs", "index_files", "middlebury_pairs", "read_indices", "scene_folders",
+    "PAPER_DISPARITY",
+    "Disparity",
+    "Patch",
+    "PatchGrid",
+    "ScenePatches",
+    "SceneShuffle",
+    "StereoPair",
+    "agreement",
+    "collate",
+    "default_chains",
+    "folder_pairs",
+    "index_files",
+    "middlebury_pairs",
+    "read_indices",
+    "scene_folders",
     "write_indices",
-]  # fmt: skip
+]

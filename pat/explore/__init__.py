@@ -11,8 +11,15 @@ from typing import Any
 from .pixel import FAMILIES, BetaReport, ExplorerScene, ExplorerState, PixelReport, inspect_pixel
 
 __all__ = [
-    "FAMILIES", "BetaReport", "ExplorerScene", "ExplorerState", "PixelReport", "explorer", "inspect_pixel", "serve",
-]  # fmt: skip
+    "FAMILIES",
+    "BetaReport",
+    "ExplorerScene",
+    "ExplorerState",
+    "PixelReport",
+    "explorer",
+    "inspect_pixel",
+    "serve",
+]
 
 
 def __getattr__(name: str) -> Any:

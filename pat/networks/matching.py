@@ -46,7 +46,7 @@ NEIGHBOURHOOD = 5
 MARGIN = 48
 """What is matched around a block, pixels."""
 BLOCK_BYTES = 120.0 * (BLOCK + 2 * MARGIN) ** 2
-"""What a block takes."""
+"""What a block takes with its margin."""
 
 
 @torch.no_grad()

@@ -37,7 +37,7 @@ BLOCK = 320
 LONG_BLOCK = 640
 """The longer side of the blocks of large images, along the segments."""
 LEAST_MARGIN, MOST_MARGIN = 64, 192
-BLOCK_BYTES, COST_BYTES = 128, 3
+PIXEL_BYTES, LABEL_BYTES = 128, 3
 """What a block takes for each pixel, and for each label of each pixel: cost, and sum of costs."""
 MOST_COSTS = 2**25
 """Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
@@ -241,7 +241,7 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
         boxes = list(inner_and_outer(a.shape, margin, a.shape[0]) if small else large)
         tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in boxes]
         largest = max(_pixels_in(outer, a.shape) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (BLOCK_BYTES + COST_BYTES * labels))
+        nbytes = max(nbytes, largest * (PIXEL_BYTES + LABEL_BYTES * labels))
     in_parallel(tasks, most=how_many_fit(nbytes))
     return disparity, facts
 

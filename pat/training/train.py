@@ -14,6 +14,19 @@ from .losses import image_loss, match_loss, validation
 from .samples import Sample, degraded, pair_of, photographs, scenes, transfer
 
 __all__ = [
-    "RecordingConfig", "Sample", "TrainConfig", "degraded", "image_loss", "load_config", "match_loss", "pair_of",
-    "photographs", "recipes", "save_config", "scenes", "train", "transfer", "validation",
-]  # fmt: skip
+    "RecordingConfig",
+    "Sample",
+    "TrainConfig",
+    "degraded",
+    "image_loss",
+    "load_config",
+    "match_loss",
+    "pair_of",
+    "photographs",
+    "recipes",
+    "save_config",
+    "scenes",
+    "train",
+    "transfer",
+    "validation",
+]

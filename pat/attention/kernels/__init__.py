@@ -24,9 +24,21 @@ from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
 
 __all__ = [
-    "LANES", "Call", "Geometry", "Gradients", "Outputs", "Saved", "Share", "TapList", "backward", "block_scratch",
-    "compiled", "forward", "scatter", "separate_cache",
-]  # fmt: skip
+    "LANES",
+    "Call",
+    "Geometry",
+    "Gradients",
+    "Outputs",
+    "Saved",
+    "Share",
+    "TapList",
+    "backward",
+    "block_scratch",
+    "compiled",
+    "forward",
+    "scatter",
+    "separate_cache",
+]
 
 
 def _watch_all_sources() -> None:

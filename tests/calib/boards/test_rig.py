@@ -16,7 +16,7 @@ from calib.boards.intrinsics import BoardViews
 from calib.boards.jackknife import jackknife
 from calib.boards.poses import symmetry_poses
 from calib.boards.report import report_html, rig_covariance
-from calib.boards.rig import calibrate, calibrate_single
+from calib.boards.rig import calibrate, calibrate_single, many_wrong
 from calib.boards.target import parse_board
 from tests.benchmarks.bench_robust import drawn
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see, tensor
@@ -137,6 +137,11 @@ def test_a_chessboard_detected_a_square_off_is_left_out(pair):
     assert result.rms < 0.2
     assert any(f": left out {key}: " in note and "contradict" in note for note in result.notes), result.notes
     assert float((result.rig["colour"].centre - rig["colour"].centre).norm()) < 2e-3
+
+
+@pytest.mark.parametrize(("before", "many"), [(0, False), (5, True)])
+def test_no_more_than_a_third_of_a_cameras_images_are_left_out_however_often_the_rest_is_fitted(before, many):
+    assert many_wrong(["a"] * 3, ["a"] * before + ["b"] * 9, {"a": 10, "b": 0}) is many
 
 
 def test_symmetry_poses_move_points_to_their_images():

@@ -223,8 +223,8 @@ def test_a_slider_moves_the_segment(page):
     torch.testing.assert_close(ends(page), segment(pair, (pixel["x"][0], pixel["y"][0]), near=4.0), atol=1e-6, rtol=0)
 
 
-def test_a_response_takes_less_than_a_tenth_of_a_second(page, record_property):
-    """From a slider's move until the page is painted: the quickest of 15, on a machine with nothing else to do."""
+def test_a_slider_is_answered_at_once(page, record_property):
+    """From a slider's move until the page is painted: the quickest of 15."""
     slower = slowed_by_others()
     times = page.execute_async_script(
         SCRIPT
