@@ -14,8 +14,8 @@ from typing import Any, get_type_hints
 import jaxtyping
 from beartype import BeartypeConf, beartype
 
-of_types = beartype(conf=BeartypeConf(is_pep484_tower=True))
-"""beartype, taking an int where a float is asked for, as PEP 484 does."""
+of_types = beartype(conf=BeartypeConf(is_pep484_tower=True, violation_type=TypeError))
+"""beartype, taking an int where a float is asked for, as PEP 484 does; as jaxtyping's, its errors are TypeErrors."""
 WITH_ARGUMENTS = jaxtyping.jaxtyped
 """jaxtyping's own, which also knows axes named after arguments, as "h*{factor}"."""
 
