@@ -44,8 +44,10 @@ LEAST_WEIGHT = 1e-3
 CONFIDENCE_OFFSETS = 0.2, 2.0
 """Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's, and where
 it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
-EXACT_OFFSET = 1.0
+EXACT_OFFSET = 2.0
 """Added to the logit of taking the semi-global match's colour instead of the attended one, for the same reason."""
+HEAD_SHARE = 0.5
+"""How much of what the head adds is added: it was trained to mend more than is left to be mended."""
 LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
 NOWHERE = -10.0
@@ -200,7 +202,7 @@ class GuidedPAT(nn.Module):
             return blend
         rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), COARSE)
         context = self.propagate(stacked(own.quarter, rough))
-        return blend + self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
+        return blend + HEAD_SHARE * self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are similar in
