@@ -6,12 +6,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from jaxtyping import install_import_hook
 
 if find_spec("beartype"):  # arraygeom's tests run with nothing but its own dependencies, too
     from tests import typecheck
 
-    install_import_hook(["arraygeom", "pat", "calib"], f"{typecheck.__name__}.checked")
+    typecheck.install()
 
 if find_spec("hypothesis"):
     from hypothesis import HealthCheck, settings

@@ -49,7 +49,7 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
 def _map(axes: Any, figure: Figure, hw: tuple[int, int], x: np.ndarray, value: np.ndarray, title: str) -> None:
     drawn = axes.tripcolor(*x.T, np.maximum(value, 1e-4), shading="gouraud", cmap="viridis", norm=LogNorm())
     axes.set(xlim=(0, hw[1]), ylim=(hw[0], 0), aspect="equal", xticks=[], yticks=[])
-    axes.set_title(_escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9, loc="left")
+    axes.set_title(escaped(f"{title}: median {np.median(value):.2g} px"), fontsize=9, loc="left")
     figure.colorbar(drawn, ax=axes, shrink=0.8)
 
 
@@ -103,7 +103,7 @@ def _draw_image(
         at = calibration.fit.problem.seen[name].x[mine]
         axes.quiver(*at.T, *(enlarge * r).T, angles="xy", scale_units="xy", scale=1, width=0.004, color="orange")
         text += f", {frame_rms(calibration.fit.problem)[name][block]:.2f} px"
-    axes.set_title(_escaped(text), fontsize=9)
+    axes.set_title(escaped(text), fontsize=9)
 
 
 def _photo(photos: Mapping[FrameKey, Any], key: FrameKey) -> Any | None:
@@ -112,6 +112,6 @@ def _photo(photos: Mapping[FrameKey, Any], key: FrameKey) -> Any | None:
     return by_text.get(str(key).split(" board ")[0])
 
 
-def _escaped(text: str) -> str:
+def escaped(text: str) -> str:
     """Text that matplotlib does not parse as formulas."""
     return text.replace("$", r"\$")

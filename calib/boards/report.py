@@ -20,7 +20,7 @@ from arraygeom import Camera, Rig
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
 from .adequacy import intrinsics_of, next_views
-from .adequacy_figures import draw_adequacy, draw_worst_images
+from .adequacy_figures import draw_adequacy, draw_worst_images, escaped
 from .covariance import RigCovariance, baseline_deviation, beta_covariance
 from .coverage import CELLS, Coverage, coverage
 from .intrinsics import BoardViews
@@ -253,7 +253,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def draw_scene(calibration: Calibration) -> Figure:
     """The rig alone, and the rig with the boards from above."""
-    figure = draw_rig(Rig({_escaped(n): c for n, c in calibration.rig.cameras.items()}))
+    figure = draw_rig(Rig({escaped(n): c for n, c in calibration.rig.cameras.items()}))
     figure.set_size_inches(10.4, 4.6)
     axes: Any = figure.axes[0]
     axes.set_position((0.0, 0.02, 0.46, 0.94))
@@ -268,7 +268,7 @@ def draw_scene(calibration: Calibration) -> Figure:
         dx, _, dz = camera.R[2].tolist()
         above.plot(x, z, "o", ms=4, color=colour)
         above.annotate(
-            _escaped(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
+            escaped(name), (x, z), (0, -4), textcoords="offset points", fontsize=8, color=colour, va="top", ha="center"
         )
         above.quiver(x, z, dx, dz, color=colour, width=0.004, scale=12)
     above.set(aspect="equal", xlabel="x (m)", ylabel="z (m)")
@@ -283,9 +283,9 @@ def draw_by_image(calibration: Calibration) -> Figure:
     figure = Figure(figsize=(10.4, 2.8), layout="constrained")
     axes = figure.subplots()
     for colour, (name, rms) in zip(cycle(COLOURS), frame_rms(calibration.fit.problem).items()):
-        axes.plot(list(rms), list(rms.values()), "o", ms=4, color=colour, label=_escaped(name))
+        axes.plot(list(rms), list(rms.values()), "o", ms=4, color=colour, label=escaped(name))
     step = max(1, len(frames) // 30)
-    axes.set_xticks(range(0, len(frames), step), [_escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
+    axes.set_xticks(range(0, len(frames), step), [escaped(str(f)) for f in frames[::step]], fontsize=7, rotation=60)
     axes.set(ylim=(0, None), xlabel="frame", ylabel="RMS residual (px)")
     axes.spines[["top", "right"]].set_visible(False)
     figure.legend(fontsize=8, frameon=False, loc="outside right upper")
@@ -350,7 +350,7 @@ def draw_uncertainty(calibration: Calibration, at: tuple[float, float]) -> Figur
             )
             axes.set(xticks=[], yticks=[])
             median = float(np.median(deviation[usable])) if usable.any() else float("nan")
-            axes.set_title(f"{_escaped(beta)} of {_escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
+            axes.set_title(f"{escaped(beta)} of {escaped(alpha)}, {depth:.3g} m: median {median:.2f} px", fontsize=9)
             figure.colorbar(shown, ax=axes, shrink=0.9)
     return figure
 
@@ -371,8 +371,3 @@ def _outline(calibration: Calibration) -> Tensor:
 
 def _extent(hw: tuple[int, int]) -> tuple[float, float, float, float]:
     return (-0.5, hw[1] - 0.5, hw[0] - 0.5, -0.5)
-
-
-def _escaped(text: str) -> str:
-    """Text that matplotlib does not parse as formulas."""
-    return text.replace("$", r"\$")

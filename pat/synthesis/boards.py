@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import UInt8
 from numpy.typing import NDArray
 
 from .scene import BoardObject
@@ -20,13 +20,6 @@ def opencv_board(board: BoardObject) -> cv2.aruco.CharucoBoard:
         raise ValueError(f"unknown marker dictionary '{board.dictionary}': OpenCV has DICT_4X4_50, DICT_5X5_250, ...")
     dictionary = cv2.aruco.getPredefinedDictionary(code)
     return cv2.aruco.CharucoBoard(board.squares, board.square, board.marker, dictionary)
-
-
-def inner_corners(board: BoardObject) -> Float[NDArray, "n 3"]:
-    """The corners between squares in the board's frame, metres, row by row (as OpenCV numbers ChArUco's)."""
-    columns, rows = board.squares
-    y, x = np.mgrid[1:rows, 1:columns] * board.square
-    return np.stack([x, y, np.zeros_like(x)], -1).reshape(-1, 3)
 
 
 def draw_board(board: BoardObject) -> UInt8[NDArray, "h w"]:

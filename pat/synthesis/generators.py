@@ -93,15 +93,6 @@ GENERATORS: dict[str, Callable[..., Scene]] = {
 """By name. All take a seed; "abstract" and "photographs" a rig."""
 
 
-def random_board_poses(rig: Rig, spec: BoardObject, count: int, *, seed: int = 0) -> list[Pose]:
-    """Poses (world_from_board) in front of all cameras at once: near and far, to all sides, tilted up to 40 degrees.
-
-    The board is from 0.6 to 1.1 times as long as the narrowest view is wide, and its middle is in every image.
-    """
-    setting = Setting(rig, seeded("poses", seed))
-    return [_board_pose(setting, spec) for _ in range(count)]
-
-
 # Surfaces -------------------------------------------------------------------------------------------------------
 
 
@@ -166,28 +157,8 @@ def _blackness(file: str) -> float:
     return 1.0 if small is None else float((small < 24).mean())
 
 
-# Boards -----------------------------------------------------------------------------------------------------------
-
-
 def _board_key(pose: Pose, middle: NDArray, extent: Vec3, time: float) -> Key:
     R, t = (np.asarray(v.detach().cpu().double()) for v in (pose.R, pose.t))
     return Key(
         position=vec(R @ middle + t), rotation=vec(Rotation.from_matrix(R).as_rotvec()), extent=extent, time=time
     )
-
-
-def _board_pose(setting: Setting, spec: BoardObject) -> Pose:
-    """The board faces the cameras' middle, rotated and tilted; its middle is visible to every camera."""
-    rng = setting.rng
-    narrow = max(float((c.K[:2, :2].abs().amax(1) / torch.tensor([c.hw[1], c.hw[0]])).max()) for c in setting.cameras)
-    for _ in range(200):
-        camera = setting.camera()
-        depth = max(spec.wh) * narrow / float(rng.uniform(0.6, 1.1))
-        middle = setting.ahead(camera, rng.uniform(-0.6, 0.6, 2), depth)
-        seen = [(c, c.project(torch.from_numpy(middle))) for c in setting.cameras]
-        if all(bool(p.valid) and bool(c.contains(p.x)) for c, p in seen):
-            break
-    tilt = Rotation.from_rotvec([*np.radians(rng.uniform(-40, 40, 2)), math.radians(rng.uniform(-25, 25))])
-    R = camera.R.double().numpy().T @ tilt.as_matrix()
-    sheet = np.array([spec.wh[0] / 2 - spec.margin, spec.wh[1] / 2 - spec.margin, 0])
-    return Pose(torch.from_numpy(R), torch.from_numpy(middle - R @ sheet))

@@ -19,9 +19,9 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, rotation_from_vector
 from arraygeom.sensor import Sensor
-from pat.synthesis.boards import inner_corners
 from pat.synthesis.scene import BoardObject
 from tests.calib.board_scenes import camera, tensor
+from tests.pat.synthesis.scenes import inner_corners
 
 SHEET = BoardObject(squares=(12, 9), square=0.06, marker=0.045, dictionary="DICT_5X5_250", margin=0.03)
 BOARD = "charuco:12x9:60mm:45mm:5x5_250"

@@ -1,5 +1,7 @@
 """Corners by how they look: where they are, whatever gamma, noise and what hides them."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -16,12 +18,18 @@ CLEAR = {"chessboard:9x6:25mm": 0.5, "charuco:9x7:25mm": 0.125}
 RANDOM = np.random.default_rng(0)
 
 
-def seen(text, *, noise=1.5):
-    """An image of a board, its true corners, and their positions in squares."""
+@cache
+def rendered(text):
+    """A board, its pose, and an image of it without noise."""
     board = parse_board(text)
     R = rotation_from_vector(torch.deg2rad(tensor(24.0, -28.0, 9.0)))
     pose = Pose(R, tensor(0.01, -0.005, 0.34) - R @ tensor(*board.points.mean(0)))
-    image = photograph(CAMERA, pose, board, dpi=240).astype(float)
+    return board, pose, photograph(CAMERA, pose, board, dpi=240).astype(float)
+
+
+def seen(text, *, noise=1.5):
+    """An image of a board, its true corners, and their positions in squares."""
+    board, pose, image = rendered(text)
     grey = (image + RANDOM.normal(0, noise, image.shape)).round().clip(0, 255).astype(np.uint8)
     ground_truth = CAMERA.project(pose.apply(torch.from_numpy(board.points))).x.numpy()
     inside = ((ground_truth > 12) & (ground_truth < np.array(grey.shape)[::-1] - 13)).all(1)

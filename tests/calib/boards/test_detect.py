@@ -1,5 +1,7 @@
 """Finding boards: exact under perspective and lens, in dim, inverted and 16-bit images; why they are not found."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -7,7 +9,7 @@ import torch
 
 from arraygeom import Pose, rotation_from_vector
 from calib.boards.detect import detect, explain, other_size, to_grey
-from calib.boards.simulation import photograph
+from calib.boards.simulation import fine_rays, photograph
 from calib.boards.target import parse_board
 from tests.calib.board_scenes import camera, tensor
 
@@ -19,9 +21,18 @@ def pose(board, turn=(18.0, -22.0, 7.0), depth=0.5):
     return Pose(R, tensor(0.01, -0.01, depth) - R @ tensor(*board.points.mean(0)))
 
 
+@cache
 def image(text, **changes):
+    """The photograph, not to be changed, and the board."""
     board = parse_board(text)
-    return photograph(CAMERA, pose(board, **changes), board), board
+    grey = photograph(CAMERA, pose(board, **changes), board, rays=rays())
+    grey.flags.writeable = False
+    return grey, board
+
+
+@cache
+def rays():
+    return fine_rays(CAMERA)
 
 
 @pytest.mark.parametrize(

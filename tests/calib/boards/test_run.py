@@ -29,10 +29,18 @@ def photos(tmp_path_factory):
     boards = board_poses(6, depth=(0.8, 1.2), spread=0.1)
     for name, c in cameras.items():
         (folder / name).mkdir()
+        rays = fine_rays(c)
         for i in range(6):
-            image = photograph(c, c.cam_from_world @ Pose(boards.R[i], boards.t[i]), parse_board(BOARD), dpi=60)
+            pose = c.cam_from_world @ Pose(boards.R[i], boards.t[i])
+            image = photograph(c, pose, parse_board(BOARD), dpi=60, rays=rays)
             cv2.imwrite(str(folder / name / f"shot_{i:02d}.png"), image)
     return folder
+
+
+@pytest.fixture
+def without_report(monkeypatch):
+    """Figures take as long as all else."""
+    monkeypatch.setattr("calib.boards.run.report_html", lambda *_, **__: "")
 
 
 def run(folder, *more, board=BOARD):
@@ -67,7 +75,7 @@ def test_photographs_become_a_rig_with_report_and_covariance(mine, capsys):
     assert float(said.split("reprojection error ")[1].split()[0]) < 0.3
 
 
-def test_one_camera_is_enough_for_intrinsics(mine):
+def test_one_camera_is_enough_for_intrinsics(mine, without_report):
     shutil.rmtree(mine / "b")
     run(mine)
     assert abs(float(Rig.load(mine / "out" / "rig.yaml")["a"].K[0, 0]) - 330) < 2
@@ -108,7 +116,7 @@ def test_one_image(mine, capsys):
     assert "a: the board is found in 1 of its images and 3 is the least" in fails(mine, capsys)
 
 
-def test_a_few_bad_images_are_named_and_left_out(mine, capsys):
+def test_a_few_bad_images_are_named_and_left_out(mine, without_report, capsys):
     cv2.imwrite(str(mine / "a" / "shot_02.png"), np.full((240, 320), 90, np.uint8))
     run(mine)
     assert "a: no board in 1 of 6 images (shot_02.png): the images have hardly any contrast" in capsys.readouterr().out
@@ -121,7 +129,7 @@ def test_other_mistakes(mine, capsys):
     assert "is not recognised: write it like" in fails(mine, capsys, board="charuko:8x6:30mm")
 
 
-def test_videos(mine):
+def test_videos(mine, without_report):
     for name in ("a", "b"):
         images = [cv2.imread(str(p)) for p in sorted((mine / name).iterdir())]
         shutil.rmtree(mine / name)

@@ -2,6 +2,7 @@
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -18,7 +19,7 @@ from calib.boards.target import parse_board
 from calib.boards.validation import without_blocks
 from tests.calib.board_scenes import BOARD, board_poses, camera, errors_of, four_cameras, see
 
-CYLINDER = [0.0, 0.5, 0.0, 0.0]
+CYLINDER = (0.0, 0.5, 0.0, 0.0)
 """A radius of 2 m."""
 
 
@@ -39,6 +40,15 @@ def seen_of(values, *, count=14, seed=3, noise=0.1):
     return see(pair_rig(), board_poses(count, seed=seed), Bent, noise=noise)
 
 
+FLAT = (0.0, 0.0, 0.0, 0.0)
+
+
+@cache
+def calibrated(values, **options):
+    """What is found of boards of a shape, `seen_of` them."""
+    return calibrate(seen_of(values, **options), BOARD)
+
+
 def test_a_cylinder_keeps_the_lengths_on_it():
     """The third-order formula against the exact cylinder."""
     p = BOARD.points
@@ -54,13 +64,13 @@ def test_a_cylinder_keeps_the_lengths_on_it():
     ("values", "said"),
     [
         (CYLINDER, r"the board is bent: its middle lies 1\d\.\d+ ± .* mm in front of its edges \(radius 2.0\d m\)"),
-        ([0.003, 0.0, 0.0, 0.0], r"the board is stretched: squares are 0\.[23]\d ± .* % longer down than across"),
-        ([0.0, -0.1, 0.0, 0.0], r"the board is bent: its middle lies [23]\.\d+ ± .* mm behind"),
-        ([0.25, 0.0, 0.0, 0.0], r"the board is stretched: squares are 2[45]\.\d+ ± .* % longer down than across"),
+        ((0.003, 0.0, 0.0, 0.0), r"the board is stretched: squares are 0\.[23]\d ± .* % longer down than across"),
+        ((0.0, -0.1, 0.0, 0.0), r"the board is bent: its middle lies [23]\.\d+ ± .* mm behind"),
+        ((0.25, 0.0, 0.0, 0.0), r"the board is stretched: squares are 2[45]\.\d+ ± .* % longer down than across"),
     ],
 )
 def test_shapes_are_found_modelled_and_said(values, said):
-    found = calibrate(seen_of(values), BOARD)
+    found = calibrated(values)
     estimate = found.fit.problem.shape.values[0]
     assert np.abs(estimate - values)[0] < 0.001
     assert np.abs(estimate - values)[1:].max() < 0.02
@@ -74,11 +84,11 @@ def test_six_frames_of_a_board_with_oblong_squares():
     found = calibrate(seen_of([0.05, 0.0, 0.0, 0.0], count=6), BOARD)
     assert found.fit.problem.shape.values[0, 0] == pytest.approx(0.05, abs=1e-3)
     assert found.rms < 0.15
-    assert calibrate(seen_of([0.0] * 4, count=6), BOARD).fit.problem.shape is None
+    assert calibrate(seen_of(FLAT, count=6), BOARD).fit.problem.shape is None
 
 
 def test_flat_boards_stay_flat():
-    found = calibrate(seen_of([0.0] * 4), BOARD)
+    found = calibrated(FLAT)
     assert found.fit.problem.shape is None
     assert not any("board is" in note for note in found.notes)
 
@@ -96,7 +106,7 @@ def test_a_rendered_cylinder_projects_where_it_should():
 
 
 def test_frames_that_do_not_fit_are_named():
-    views = seen_of([0.0] * 4)
+    views = seen_of(FLAT)
     d = views["mono"].seen[5]
     torn = d.x + np.random.default_rng(0).normal(0, 0.35, d.x.shape)
     views["mono"] = BoardViews(views["mono"].hw, {**views["mono"].seen, 5: Detection(d.ids, torn)})
@@ -106,15 +116,14 @@ def test_frames_that_do_not_fit_are_named():
 
 
 def test_every_frame_is_held_out_once():
-    found = calibrate(seen_of([0.0] * 4), BOARD)
+    found = calibrated(FLAT)
     assert len(found.held_out["mono", "colour"]) == len(found.epipolar["mono", "colour"])
 
 
 def test_the_covariance_over_frames_is_that_of_the_noise_where_nothing_else_is():
     """A plain jackknife is too large by a fifth and more; the stated one is corrected for it."""
     factors, plain = [], []
-    for seed in range(4):
-        fit = calibrate(seen_of([0.0] * 4, seed=seed), BOARD).fit
+    for fit in (calibrated(FLAT).fit, *(calibrated(FLAT, seed=seed).fit for seed in range(3))):
         found = jackknife(fit.problem, fit.free(), fit.sigma)
         for part, into in ((found.covariance, factors), (found.left_out, plain)):
             into.append(np.sqrt(np.trace(np.linalg.solve(fit.covariance, part)) / len(part)))
@@ -122,7 +131,7 @@ def test_the_covariance_over_frames_is_that_of_the_noise_where_nothing_else_is()
 
 
 def test_leaving_a_frame_out_keeps_the_others():
-    problem = calibrate(seen_of(CYLINDER, count=12), BOARD).fit.problem
+    problem = calibrated(CYLINDER).fit.problem
     kept = np.arange(len(problem.structure)) != 3
     part = without_blocks(problem, kept)
     assert len(part.structure) == len(problem.structure) - 1 == len(part.shape.part)

@@ -8,6 +8,7 @@ cluster to compare. The slow tests run the same.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import signal
 import subprocess
@@ -25,6 +26,7 @@ import yaml
 from pat.farm.folders import JobFolder
 from pat.farm.job import RenderConfig
 from pat.farm.run import render
+from pat.farm.worker import FACTS
 from pat.synthesis.rendered import Rendered
 from tests.pat.farm.journals import started_after_done
 from tests.pat.farm.test_workshop import ROOT, children, wait_for_the_end_of
@@ -59,21 +61,24 @@ def write_config(folder: Path, backend: str) -> Path:
 
 
 def killed_again_and_again(config: Path, out: Path, *, scenes: int, kills: int, seed: int = 0) -> Survived:
-    """Render with two workers; in each run kill a worker and then the command, at random moments, `kills` in all."""
+    """Render with two workers; in each run kill a worker and then the command, at random moments, `kills` in all.
+
+    The moments are counted in what a scene takes, so that some are left to render however fast the machine is.
+    """
     rng, command, begin = np.random.default_rng(seed), _command(config, out, scenes), time.monotonic()
     workers = commands = runs = 0
     while workers + commands < kills:
         runs += 1
         with killed_in_the_end(command) as parent:
             _wait_for_progress(out, parent, 1 + runs % 2)
-            time.sleep(rng.uniform(0, 3))
+            time.sleep(rng.uniform(0, _pace(out)))
             alive = children(parent.pid)
             if parent.poll() is None and alive:
                 os.kill(int(rng.choice(alive)), signal.SIGKILL)
                 workers += 1
             if workers + commands == kills:
                 break
-            time.sleep(rng.uniform(0, 6 if runs % 2 else 1))
+            time.sleep(rng.uniform(0, 2 if runs % 2 else 0.5) * _pace(out))
             commands += parent.poll() is None
         if len(JobFolder(out).done()) == scenes:
             raise ValueError(f"all {scenes} scenes were there after {workers + commands} kills: ask for more scenes")
@@ -89,6 +94,13 @@ def _command(config: Path, out: Path, scenes: int) -> list[str]:
 def _wait_for_progress(out: Path, parent: subprocess.Popen, more: int) -> None:
     wanted = len(JobFolder(out).done()) + more
     wait_until(lambda: len(JobFolder(out).done()) >= wanted or parent.poll() is not None)
+
+
+def _pace(out: Path) -> float:
+    """Seconds that the scenes that are there took, on average."""
+    folder = JobFolder(out)
+    took = [json.loads((folder.scene(i) / FACTS).read_text())["seconds"] for i in folder.done()]
+    return float(np.mean(took)) if took else 0.0
 
 
 @contextmanager

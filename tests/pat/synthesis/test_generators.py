@@ -3,14 +3,15 @@ import pytest
 import torch
 
 from arraygeom.camera import Camera, View, intrinsics
+from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 from pat.media.images import write_image
-from pat.synthesis.boards import PIXELS, draw_board, inner_corners, opencv_board
+from pat.synthesis.boards import PIXELS, draw_board, opencv_board
 from pat.synthesis.furnish import Setting
-from pat.synthesis.generators import GENERATORS, abstract, board, photographs, random_board_poses
+from pat.synthesis.generators import GENERATORS, abstract, board, photographs
 from pat.synthesis.scene import BoardObject, Key, Motion, Object, Scene
 from pat.synthesis.shapes import inside, mesh
-from tests.pat.synthesis.scenes import posed, unlike_cameras
+from tests.pat.synthesis.scenes import inner_corners, posed, unlike_cameras
 
 ENDS = ("armchair seat", "rug", "window panes", "chair seat")
 BOARD = BoardObject(squares=(7, 5), square=0.05, marker=0.04, dictionary="DICT_4X4_50")
@@ -143,19 +144,14 @@ def test_the_drawn_board_is_the_one_opencv_knows():
 
 
 def test_a_board_is_where_its_poses_say():
-    rig = unlike_cameras(640)
-    poses = random_board_poses(rig, BOARD, 5, seed=2)
-    scene = board(poses, BOARD)
-    sheet = scene.objects[0]
+    shifts = torch.rand(5, 3, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
+    poses = [Pose(posed((10 * k, -20, 5)).R, shift) for k, shift in enumerate(shifts)]
+    sheet = board(poses, BOARD).objects[0]
     for k, pose in enumerate(poses):
         place = sheet.motion.at(float(k))
         local = torch.tensor([-BOARD.margin, -BOARD.margin, 0.0], dtype=torch.float64)
         corner = place.R @ (np.array([-0.5, -0.5, 0]) * place.extent) + place.position
         np.testing.assert_allclose(pose.apply(local[None])[0], corner, atol=1e-12)
-        middle = pose.apply(torch.tensor([[3.5 * 0.05, 2.5 * 0.05, 0.0]], dtype=torch.float64))
-        for camera in rig.cameras.values():
-            x, _, valid = camera.project(middle)
-            assert bool(valid.all() & camera.contains(x).all())
 
 
 def test_a_setting_measures_pixels_in_the_finest_camera():

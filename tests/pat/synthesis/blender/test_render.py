@@ -17,13 +17,12 @@ from arraygeom.rig import Rig
 from arraygeom.sensor import Sensor
 from pat.media.images import read_image
 from pat.synthesis.blender import Optics, RenderSettings
-from pat.synthesis.boards import inner_corners
 from pat.synthesis.generators import abstract, board, photographs
 from pat.synthesis.image_files import export, export_video
 from pat.synthesis.rendered import is_rendered
 from pat.synthesis.scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture
 from pat.synthesis.shapes import inside
-from tests.pat.synthesis.scenes import posed, room_scene, unlike_cameras
+from tests.pat.synthesis.scenes import inner_corners, posed, room_scene, unlike_cameras
 
 QUICK = RenderSettings(samples=1, threads=1)
 CLEAN = RenderSettings(samples=64, threads=1, denoise="none", fast_light=False, bounces=0)
