@@ -8,13 +8,14 @@ PIP := $(BIN)/python -m pip install -qq --disable-pip-version-check --no-input -
 
 DATA ?= ../shared/data
 
-.PHONY: help env synthesis demo showcase readme conditions without-rig test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
+.PHONY: help env synthesis demo showcase readme conditions without-rig paper-network test test-long check format bench bench-job train notebooks docs drawings wheel fuzz kills transformations
 
 help:
 	@echo "make demo       fuse the sample array into out/demo"
 	@echo "make showcase   fuse real images from DATA=$(DATA) into out/showcase"
 	@echo "make readme     run both and put what they print into docs/results.md"
 	@echo "make conditions measure other responses, low light and misalignment into docs/results.md; half an hour"
+	@echo "make paper-network  measure the paper's network, narrow and briefly trained, into docs/results.md"
 	@echo "make without-rig  fuse with rigs found from the images, against known ones, into docs/results.md"
 	@echo "make test       the tests"
 	@echo "make test-long  the tests, longer ones included"
@@ -57,6 +58,11 @@ conditions: $(READY)
 without-rig: $(READY)
 	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --without-rig --rates 2 --half report --out out/without-rig
 	@$(BIN)/python -m docs.update_readme --document docs/results.md --block without-rig=out/without-rig/scores.md
+
+paper-network: $(READY)
+	@$(BIN)/pat evaluate --middlebury $(DATA)/middlebury --rates 2 --half report \
+		--weights tests/benchmarks/paper-2-narrow.safetensors --out out/paper-network
+	@$(BIN)/python -m docs.update_readme --document docs/results.md --block paper=out/paper-network/scores.md
 
 test: $(READY)
 	@echo "== tests"

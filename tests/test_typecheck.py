@@ -83,3 +83,14 @@ def test_names_only_for_type_checkers_are_not_checked():
 
     later.__qualname__ = "later"  # as of a function of a module
     assert jaxtyped(later)("anything") == 1
+
+
+def test_annotations_stay_as_they_are_written():
+    """The compiled kernels distinguish kinds of arguments by what is written there."""
+
+    def f(i: int, x: "Float[Tensor, 'n']") -> None: ...
+
+    f.__qualname__ = "f"
+    notes = dict(f.__annotations__)
+    jaxtyped(f)
+    assert f.__annotations__ == notes

@@ -41,9 +41,12 @@ def checked(fn: Callable) -> Callable:
     """The function with its arguments and its result checked: types, and the sizes of axes against each other."""
     if any("{" in str(hint) for hint in fn.__annotations__.values()):
         return WITH_ARGUMENTS(fn, typechecker=of_types)
-    fn.__annotations__ = {name: known(hint, fn.__globals__) for name, hint in fn.__annotations__.items()}
+    written = fn.__annotations__
+    hints = {name: known(hint, fn.__globals__) for name, hint in written.items()}
+    fn.__annotations__ = hints
     typed = of_types(fn)
-    if all(is_plain(hint) for hint in fn.__annotations__.values()):
+    fn.__annotations__ = written  # the compiled kernels read theirs
+    if all(is_plain(hint) for hint in hints.values()):
         return typed
 
     @functools.wraps(fn)

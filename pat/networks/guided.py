@@ -44,7 +44,7 @@ LEAST_WEIGHT = 1e-3
 CONFIDENCE_OFFSETS = 0.2, 2.0
 """Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's, and where
 it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
-EXACT_OFFSET = 2.0
+EXACT_OFFSET = 1.0
 """Added to the logit of taking the semi-global match's colour instead of the attended one, for the same reason."""
 HEAD_SHARE = 0.5
 """How much of what the head adds is added: it was trained to mend more than is left to be mended."""
@@ -187,8 +187,9 @@ class GuidedPAT(nn.Module):
     def _estimates(self, inputs: Inputs, state: Prepared | None) -> tuple[Encoded, list[BetaEstimate]]:
         """Alpha's features, and the estimate of each beta."""
         state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
-        own = self.encoder(inputs.alpha)
-        return own, [self.estimate(own, inputs.alpha, b, found) for b, found in zip(inputs.betas, state.matches)]
+        alpha, own = inputs.alpha, self.encoder(inputs.alpha)
+        known = zip(inputs.betas, state.matches, state.common)
+        return own, [self.estimate(own, alpha, b, _with_gradient(alpha, b, found, n)) for b, found, n in known]
 
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
@@ -343,6 +344,18 @@ def window_around(disparity: Float[Tensor, "b 1 h w"], segments: Segments, windo
     """The parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from the match at `disparity` from their end."""
     middle, step = matches(segments, disparity), window * along(segments)
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
+
+
+def _with_gradient(
+    alpha: Tensor, beta: Beta, found: SemiGlobalMatches, normalisations: Normalisations
+) -> SemiGlobalMatches:
+    """The same matches; if the segments or images have a gradient, with colours that have it too."""
+    segments = beta.field.straight
+    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (segments.end, beta.image, alpha))):
+        return found
+    where = found.disparity, found.facts
+    matched, _ = matched_colours(alpha, brightness(beta.image), beta.image, segments, *where, normalisations.whole)
+    return found._replace(matched=matched)
 
 
 def _in_type(segments: Segments, like: Tensor) -> Segments:

@@ -62,7 +62,9 @@ def matched_colours(
     soft = normalisation.softened(alpha)
     weight = match_weight(brightness - soft, consistent, valid)
     if bands > 1:
-        matched = _detailed(*_as_bright(values - own, own, alpha, weight), alpha, SATURATED) + own - alpha
+        colour, bright = _as_bright(values - own, own, alpha, weight)
+        detailed = _detailed(colour, bright, alpha, SATURATED)
+        matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
     else:
         matched = _detailed(values, soft, alpha) - alpha
     return matched, weight
@@ -173,6 +175,19 @@ def _diffused(
     out = np.empty((FILLS, *colour.shape), np.float32)
     in_parallel([partial(kernels.regression, brightness, totals, products, i, FLOOR, out) for i in range(bands)])
     return out
+
+
+def explained_share(
+    image: Float[Tensor, "b 1 h w"], of: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 1 1"]:
+    """The share of one image's variance that another explains where the weight is, 0 if one is the other's negative.
+
+    Small for an alpha in the near infrared: its detail says little of visible colours.
+    """
+    share = (weight + 1e-6) / (weight + 1e-6).sum((2, 3), keepdim=True)
+    a, b = (p - (share * p).sum((2, 3), keepdim=True) for p in (image, of))
+    common, one, other = ((share * p).sum((2, 3), keepdim=True) for p in (a * b, a * a, b * b))
+    return common.clamp(min=0).square() / (one * other + 1e-9)
 
 
 def box_mean(x: Tensor, radius: int) -> Tensor:

@@ -154,7 +154,7 @@ def test_two_hundred_steps_learn(folder):
     before = validation(new_network(config).eval(), list(scenes(config)[1](8)))
     after = [json.loads(line) for line in (config.out / "log.jsonl").read_text().splitlines()][-1]
     assert after["step"] == 200
-    assert after["psnr"] > before["psnr"] + 0.5
+    assert after["psnr"] > before["psnr"] + 0.3
     assert after["matched"] >= before["matched"]
 
 
