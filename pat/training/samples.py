@@ -27,7 +27,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
-from pat.networks.protocol import FusionNetwork, Inputs, State
+from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
@@ -55,7 +55,7 @@ class Sample(NamedTuple):
     ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
-    state: State | None = None
+    state: Any = None
     """What the network finds out before it computes anything with its weights (`FusionNetwork.prepare`), if known."""
 
     @property
