@@ -15,7 +15,8 @@ from torch import Tensor
 from ..media.colour import luminance
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
-from ..networks.semi_global import MOST_DETAIL, Normalisation, local_slope
+from ..networks.semi_global import Normalisation
+from ..networks.warped import MOST_DETAIL, local_slope
 from .results import Frame
 
 Luminance = Literal["alpha", "mix", "beta"]

@@ -27,26 +27,27 @@ from .matching import semi_global_matching
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import (
-    FILLS,
     FINE,
     HalfSizeMatches,
     Normalisations,
     SemiGlobalMatches,
     along,
-    diffused_from,
-    likeness,
-    matched_colours,
     matches,
 )
 from .several import agreed, can_agree
+from .warped import FILLS, diffused_from, likeness, matched_colours
 
 COARSE = 4
 """Context is computed at a quarter of the size."""
 LEAST_WEIGHT = 1e-3
 """The least weight of a pixel in propagation."""
-CONFIDENCE_OFFSETS = 0.3, 1.5
+CONFIDENCE_OFFSETS = 0.2, 2.0
 """Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's, and where
 it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
+EXACT_OFFSET = 2.0
+"""Added to the logit of taking the semi-global match's colour instead of the attended one, for the same reason."""
+HEAD_SHARE = 0.5
+"""How much of what the head adds is added: it was trained to mend more than is left to be mended."""
 LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
 NOWHERE = -10.0
@@ -201,7 +202,7 @@ class GuidedPAT(nn.Module):
             return blend
         rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), COARSE)
         context = self.propagate(stacked(own.quarter, rough))
-        return blend + self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
+        return blend + HEAD_SHARE * self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are similar in
@@ -232,7 +233,7 @@ class GuidedPAT(nn.Module):
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, found.matched, exact.sigmoid())
+        colour = torch.lerp(value - alpha, found.matched, (exact + EXACT_OFFSET).sigmoid())
         position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
         alike = likeness(facts[0], LIKENESS)
         return BetaEstimate(attended, colour, found.colour, logit, choice, position, alike)

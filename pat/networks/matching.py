@@ -22,6 +22,7 @@ from arraygeom.threads import in_parallel
 from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
 from . import band_kernels as kernels
+from .blocks import enlarge
 from .semi_global import (
     BLOCK,
     CONSISTENT,
@@ -31,18 +32,22 @@ from .semi_global import (
     Normalisation,
     Normalisations,
     SemiGlobalMatches,
-    diffused_from,
+    along,
     filled,
     geometry_of,
     inner_and_outer,
     matched_at_half_size,
-    matched_colours,
     numpy_of,
 )
 from .semi_global_kernels import census
+from .warped import at_matches, box_mean, diffused_from, matched_colours
 
 NEIGHBOURHOOD = 5
 """Side of the neighbourhood at half the size, pixels."""
+SAME = 1.0
+"""Matches at half and at full size that are less than this many pixels apart are of the same surface."""
+STEP_RADIUS, STEP_FLOOR, MOST_STEP = 3, 2e-4, 0.25
+"""Window and regulariser (variance of brightness) of the step to a fraction of a pixel, and its most pixels."""
 MARGIN = 48
 """What is matched around a block, pixels."""
 BLOCK_BYTES = 120.0 * (BLOCK + 2 * MARGIN) ** 2
@@ -87,6 +92,7 @@ def matched(
         half = matched_at_half_size(alpha, guide, blocks, normalisations.half)
     rough, facts = half
     disparity, unlike = matched_at_full_size(alpha, guide, segments, rough, normalisations.whole)
+    disparity = precise(alpha, guide, segments, disparity, unlike, enlarge(rough), normalisations.whole)
     return disparity, torch.cat([avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
 
 
@@ -114,6 +120,31 @@ def matched_at_full_size(
     in_parallel(tasks, most=how_many_fit(BLOCK_BYTES))
     smooth = np.stack([_smoothed(*one) for one in zip(found, unlike, to_bytes(alpha[:, 0]))])
     return torch.from_numpy(smooth)[:, None].to(alpha), torch.from_numpy(unlike)[:, None].to(alpha)
+
+
+def precise(
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    segments: Segments,
+    disparity: Float[Tensor, "b 1 h w"],
+    unlike: Float[Tensor, "b 1 h w"],
+    rough: Float[Tensor, "b 1 h w"],
+    normalisation: Normalisation,
+) -> Float[Tensor, "b 1 h w"]:
+    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both; from there
+    a step of least squares of the brightness around each pixel (Lucas and Kanade 1981)."""
+    own, other = normalisation.equally_sharp(alpha, normalisation.normalised(guide))
+    sure = (unlike < CONSISTENT) & ((disparity - rough).abs() < SAME)
+    start = torch.where(sure, (disparity + rough) / 2, disparity)
+    across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
+    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start)[0].split(1, 1)
+    towards = along(segments).movedim(-1, 1).to(other)
+    mean = partial(box_mean, radius=2 * STEP_RADIUS)
+    rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
+    rise, rest = rise - mean(rise), rest - mean(rest)
+    products = box_mean(torch.cat([rise * rest, rise.square()], 1), STEP_RADIUS)
+    step = products[:, :1] / (products[:, 1:] + STEP_FLOOR)
+    return torch.where(sure, start + step.clamp(-MOST_STEP, MOST_STEP), start)
 
 
 def _runs(half: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:

@@ -16,14 +16,14 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
 from arraygeom.fields.protocol import compilable
-from arraygeom.sampling import on_image, sample
+from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
@@ -43,22 +43,8 @@ MOST_COSTS = 2**25
 """Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
 CONSISTENT = 0.2
 """A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
-LIKENESS = 0.08
-"""Difference of brightness at which the weight of a match falls to 1 / e."""
-INCONSISTENT = 0.25
-"""Weight of a match that is not consistent, before the likeness."""
 DISPARITY_FILL = (50.0, 4.0)
 """Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
-COLOUR_FILL = (300.0, 3.0)
-"""The same of colour."""
-FLOOR = 1e-3
-"""Regulariser (variance of brightness) of the regression of colour on brightness where colour is diffused."""
-FILLS = 2
-"""Ways in which colour is diffused: along its regression on brightness, and as it is."""
-DETAIL_RADIUS, DETAIL_FLOOR = 2, 1e-3
-"""Window and regulariser of the regression that gives matched colour the detail that beta lost."""
-MOST_DETAIL = 0.2
-"""Differences of brightness beyond this are no detail that beta lost."""
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other."""
 
@@ -176,42 +162,6 @@ def matched_at_half_size(
     return HalfSizeMatches(disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha))
 
 
-def normalised_at_matches(
-    image: Float[Tensor, "b 1 h w"], like: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
-) -> Float[Tensor, "b 1 h w"]:
-    """The image with another's mean and standard deviation, where the weight is; both show the same point at a pixel.
-
-    Statistics of whole images mean little where these show different parts of a scene.
-    """
-    weight = (weight + 1e-6) / (weight + 1e-6).sum((2, 3), keepdim=True)
-    means = [(weight * p).sum((2, 3), keepdim=True) for p in (image, like)]
-    deviation, wanted = (
-        (weight * (p - m).square()).sum((2, 3), keepdim=True).sqrt() for p, m in zip((image, like), means)
-    )
-    return (image - means[0]) * (wanted / deviation.clamp(min=1e-3)).clamp(max=4) + means[1]
-
-
-def box_mean(x: Tensor, radius: int) -> Tensor:
-    """Over squares around each pixel, as far as these are on the image."""
-    side = 2 * radius + 1
-    if compilable(x) and not x.requires_grad:
-        return _box_mean_of_numbers(x, radius)
-    rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
-    return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
-
-
-def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
-    """The same by OpenCV's running sums: a third of the time."""
-    planes = x.detach().contiguous().flatten(0, -3).numpy()
-    counts = [np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1 for n in planes.shape[1:]]
-    share = (1 / (counts[0][:, None] * counts[1])).astype(planes.dtype)
-    out = np.empty_like(planes)
-    for plane, target in zip(planes, out):
-        sums = cv2.boxFilter(plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
-        np.multiply(sums, share, out=target)
-    return torch.from_numpy(out).view(x.shape)
-
-
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
     """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no pixel.
 
@@ -324,105 +274,6 @@ def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[T
 
 def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
     return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
-
-
-def matched_colours(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 h w"],
-    facts: Float[Tensor, "b 3 h2 w2"],
-    normalisation: Normalisation,
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """Beta's bands minus alpha at the matches, with the detail that alpha has and beta has not; their weight."""
-    bands = beta.shape[1]
-    seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
-    values, own, brightness = seen.split([bands, 1, 1], 1)
-    consistent = is_consistent(facts)
-    brightness = normalised_at_matches(brightness, alpha, valid * consistent)
-    soft = normalisation.softened(alpha)
-    if bands > 1:
-        matched = _detailed(values - own, brightness, alpha) + own - alpha
-    else:
-        matched = _detailed(values, soft, alpha) - alpha
-    return matched, match_weight(brightness - soft, consistent, valid)
-
-
-def at_matches(
-    beta: Float[Tensor, "b c hb wb"], segments: Segments, disparity: Float[Tensor, "b 1 _ _"]
-) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
-    """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity).to(beta)
-    position = middle.reshape(len(beta), -1, 2)
-    inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
-    values = sample(beta, inside, interpolation="bicubic").values
-    return values.reshape(*beta.shape[:2], *middle.shape[1:3]), on_image(middle, hw)[:, None]
-
-
-def is_consistent(facts: Float[Tensor, "b 3 h2 w2"]) -> Float[Tensor, "b 1 h w"]:
-    """1 where the match is consistent."""
-    return enlarged((facts[:, :1] < CONSISTENT).to(facts))
-
-
-def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Tensor) -> Float[Tensor, "b 1 h w"]:
-    """The weight of a match whose brightness differs from alpha's by `unlike`; always more than 0."""
-    return (INCONSISTENT + (1 - INCONSISTENT) * consistent) * valid * likeness(unlike, LIKENESS) + 1e-4
-
-
-def likeness(unlike: Float[Tensor, "b 1 h w"], scale: float) -> Float[Tensor, "b 1 h w"]:
-    """1 where two images have the same brightness around a pixel, 1 / e where they differ by `scale` there."""
-    unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
-    return torch.exp(-(unlike / scale).square())
-
-
-def diffused_from(
-    matched: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
-) -> Float[Tensor, "b fills c h w"]:
-    """Bands diffused by weight over what is connected in alpha, in each of the `FILLS` ways."""
-    planes = zip(numpy_of(matched), numpy_of(alpha[:, 0]), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
-    return torch.from_numpy(np.stack([_diffused(*one) for one in planes])).to(alpha)
-
-
-def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor) -> Tensor:
-    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it."""
-    return colour + local_slope(colour, brightness) * (alpha - brightness).clamp(-MOST_DETAIL, MOST_DETAIL)
-
-
-def local_slope(colour: Float[Tensor, "b c h w"], brightness: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
-    """The slope of the regression of colour on brightness around each pixel.
-
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
-    slope is reduced to the share of colour's variance that the regression explains.
-    """
-    mean = partial(box_mean, radius=DETAIL_RADIUS)
-    middle, centre = mean(brightness), mean(colour)
-    variance = (mean(brightness.square()) - middle.square()).clamp(min=0)
-    variation = (mean(colour.square()) - centre.square()).clamp(min=0)
-    common = mean(colour * brightness) - centre * middle
-    explained = common.square() / ((variance + 1e-6) * (variation + 1e-6))
-    return common / (variance + DETAIL_FLOOR) * explained.clamp(max=1)
-
-
-def _diffused(
-    colour: NDArray,
-    brightness: NDArray,
-    weight: NDArray,
-    guide: NDArray[np.uint8],
-    how: tuple[float, float] = COLOUR_FILL,
-) -> NDArray[np.float32]:
-    """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on brightness
-    (h, w), and as it is.
-
-    The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no beta sees
-    has colour that varies with brightness as it does nearby.
-    """
-    bands = len(colour)
-    totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, how)
-    products = smoothed([weight * brightness * p for p in colour], guide, how)
-    out = np.empty((FILLS, *colour.shape), np.float32)
-    in_parallel([partial(kernels.regression, brightness, totals, products, i, FLOOR, out) for i in range(bands)])
-    return out
 
 
 def matches(

@@ -19,19 +19,21 @@ from arraygeom import Segments
 
 from .matching import matched
 from .semi_global import (
-    MOST_DETAIL,
     HalfSizeMatches,
     Normalisation,
     Normalisations,
     SemiGlobalMatches,
+    matched_at_half_size,
+    reduced,
+)
+from .warped import (
+    MOST_DETAIL,
     at_matches,
     box_mean,
     diffused_from,
     is_consistent,
     local_slope,
     match_weight,
-    matched_at_half_size,
-    reduced,
 )
 
 OUTLIER = 0.06

@@ -27,7 +27,7 @@ from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT
-from pat.networks.semi_global import FILLS
+from pat.networks.warped import FILLS
 from tests.benchmarks.printed import print_tables
 
 REGIONS = ("whole", "seen", "occluded", "beyond")

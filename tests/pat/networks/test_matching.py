@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, pixel_grid
 from pat.networks import band_kernels, semi_global_kernels
 from pat.networks.band_kernels import LABELS, RUN
 from pat.networks.matching import _runs, matched
 from pat.networks.semi_global import Normalisations, matched_at_half_size
+from tests.pat.networks.matched_scenes import beside, blurred
 
 H, W, NEAREST = 96, 160, 30
 FAR, NEAR = 6, 21
@@ -98,3 +100,17 @@ def test_an_edge_is_found_to_the_pixel():
     assert wrong[1] < 0.5 * wrong[0]
     occluded = facts[0, 0, 14:32, 24:26]
     assert (occluded > 0.2).float().mean() > 0.8
+
+
+@pytest.mark.parametrize("disparity", [9.25, 9.6])
+def test_a_match_is_found_to_a_tenth_of_a_pixel(disparity):
+    """A plane at a fraction of a pixel, in images of one scene at eight times their size."""
+    scene = blurred(torch.rand(1, 1, 8 * 64, 8 * 192, generator=torch.Generator().manual_seed(3)), 12.0)
+    scene = 0.5 + 0.15 * (scene - scene.mean()) / scene.std()
+    shift = round(8 * disparity)
+    alpha, beta = (avg_pool2d(scene[..., x : x + 8 * 160], 8) for x in (0, shift))
+    _, _, segments = beside(alpha, 0, 160)
+    found, _ = matched(alpha, beta, *segments, Normalisations.of(alpha, beta))
+    error = (found - shift / 8)[..., 8:-8, 40:-8]
+    assert abs(float(error.mean())) < 0.05
+    assert float(error.abs().mean()) < 0.1

@@ -3,7 +3,6 @@
 import threading
 import time
 
-import cv2
 import numpy as np
 import pytest
 import torch
@@ -14,28 +13,24 @@ from arraygeom import (
     Epipolar,
     Pair,
     Pose,
-    Rectified,
     Segments,
-    View,
     intrinsics,
     lazily,
     pixel_grid,
     rotation_from_vector,
 )
-from pat.media.colour import luminance
 from pat.networks import semi_global_kernels as kernels
 from pat.networks.matching import semi_global_matching
 from pat.networks.semi_global import (
-    LIKENESS,
     Normalisation,
     SemiGlobalMatches,
     equalising_blurs,
     length_of,
-    match_weight,
     matched_at_half_size,
     matches,
 )
 from pat.support.memory import limited
+from tests.pat.networks.matched_scenes import beside, blurred, faint
 
 HW = (64, 96)
 
@@ -223,22 +218,6 @@ def test_a_cut_is_where_it_says():
     assert torch.equal(cut.matched, whole[..., 4:10, 2:16] + 1)
 
 
-def test_what_nothing_sees_varies_with_brightness_as_nearby():
-    rng = np.random.default_rng(0)
-    brightness = (0.4 + 0.2 * rng.random((24, 32))).astype(np.float32)
-    colour = (0.8 * brightness - 0.3)[None]
-    weight = np.full(brightness.shape, 1e-4, np.float32)
-    weight[:, :16] = 1
-    guide = np.full(brightness.shape, 100, np.uint8)
-    unseen = np.where(weight < 1, 0, colour).astype(np.float32)
-    found = pat.networks.semi_global._diffused(unseen, brightness, weight, guide, (1000.0, 20.0))[0]
-    assert np.abs(found - colour)[:, :, 16:].mean() < 0.6 * np.abs(colour - colour.mean()).mean()
-
-
-def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
-    return torch.from_numpy(cv2.GaussianBlur(image[0, 0].numpy(), (0, 0), blur))[None, None]
-
-
 def test_the_sharper_of_two_images_is_blurred_whichever_it_is():
     sharp = torch.rand(1, 1, 60, 80, generator=torch.Generator().manual_seed(0))
     soft = blurred(sharp, 1.25)
@@ -267,62 +246,6 @@ def test_parts_are_balanced_as_the_whole_is():
     assert Normalisation.of(alpha[..., 40:], beta[..., 40:]).blurs != normalisation.blurs
 
 
-def test_a_match_has_the_detail_that_beta_lost():
-    """One view for both cameras: a quarter or more of the error of colour that beta's blur made is gone."""
-    coarse = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(2))
-    alpha = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
-    ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor([0.0, 0.1, 0.2]).view(
-        1, 3, 1, 1
-    )
-    beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
-    fine, coarse = (pixel_grid((48 // s, 64 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
-    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in (fine, coarse)]
-    found = semi_global_matching(alpha, luminance(beta), beta, *here)
-    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
-    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].abs().mean() for c in chroma[:2])
-    assert left < 0.75 * lost
-
-
-def test_colour_that_does_not_follow_brightness_is_left_alone():
-    """Red and green change places where brightness does not show it, beside edges of brightness."""
-    g = torch.Generator().manual_seed(5)
-    fine, other = (
-        torch.rand(1, 1, 24, 32, generator=g).round().repeat_interleave(4, -1).repeat_interleave(4, -2) for _ in "ab"
-    )
-    alpha = 0.35 + 0.3 * fine
-    other = other.roll((2, 2), (-1, -2)) - 0.5
-    ground_truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
-    beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
-    places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
-    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
-    found = semi_global_matching(alpha, luminance(beta), beta, *here)
-    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
-    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].square().mean() for c in chroma[:2])
-    assert left < 1.05 * lost
-
-
-def beside(scene: torch.Tensor, disparity: int, width: int = 192) -> tuple[torch.Tensor, torch.Tensor, list[Segments]]:
-    """Two images of a flat scene (1, 1, H, W), `disparity` pixels apart, and the segments of alpha, on the left."""
-    alpha, beta = scene[..., :width], scene[..., disparity : disparity + width]
-    view = View(hw=(alpha.shape[-2], width))
-    look = lazily(Rectified(64.0), Pair(view, view))
-    found = []
-    for step in (1, 2):
-        x = (pixel_grid((view.hw[0] // step, width // step), dtype=torch.float64) + 0.5) * step - 0.5
-        segments = look(x.reshape(-1, 2))
-        shape = (1, *x.shape[:-1])
-        found.append(
-            Segments(segments.start.reshape(*shape, 2), segments.end.reshape(*shape, 2), segments.valid.reshape(shape))
-        )
-    return alpha, beta, found
-
-
-def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
-    """A scene with little to hold on to, 64 x 256."""
-    soft = blurred(torch.rand(1, 1, 64, 256, generator=torch.Generator().manual_seed(seed)), blur)
-    return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
-
-
 def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
     """Where beta ends, 40 columns of alpha are unseen: most are known as such, and matches beside them are right."""
     alpha, beta, segments = beside(faint(0, contrast=0.03, blur=4.0), 40)
@@ -346,39 +269,3 @@ def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut
     kernels.winners(kernels.PARTS * cost.astype(np.int16), ends, along, length, edge, 1, 9, disparity, facts)
     assert (disparity[0, 0] > 2) == (cut == 1)
     assert (facts[0, 0, 0] == 1) == (cut == 1)
-
-
-def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere():
-    """Alpha alone sees something dark on the left: whole images have other levels, what both see has the same."""
-    scene = faint(1, contrast=0.1, blur=3.0)
-    scene[..., :48] -= 0.35
-    tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
-    alpha, beta, segments = beside(scene, 48)
-    found = semi_global_matching(alpha, beta, beta * tint, *segments)
-    assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
-
-
-def test_a_match_of_other_brightness_has_less_weight():
-    unlike = torch.zeros(1, 1, 5, 12)
-    unlike[..., 6:] = -LIKENESS
-    weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
-    torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
-    torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))
-
-
-def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
-    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is blurred."""
-    g = torch.Generator().manual_seed(2)
-    coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
-    alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)
-    ground_truth = 0.8 - 0.6 * alpha
-    beta = blurred(ground_truth, 1.5)
-    places = (pixel_grid((96 // s, 128 // s))[None] * s + (s - 1) / 2 for s in (1, 2))
-    here = [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
-    found = semi_global_matching(alpha, beta, beta, *here).matched + alpha
-    left, lost = ((p - ground_truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
-    assert left < 0.7 * lost
-
-
-def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
-    return image.repeat_interleave(times, -1).repeat_interleave(times, -2)

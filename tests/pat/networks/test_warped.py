@@ -1,0 +1,107 @@
+"""Beta's bands at alpha's view: detail, brightness, weight, and what is diffused."""
+
+import numpy as np
+import torch
+
+from arraygeom import Segments, pixel_grid
+from pat.media.colour import luminance
+from pat.networks.matching import semi_global_matching
+from pat.networks.warped import LIKENESS, _diffused, match_weight
+from tests.pat.networks.matched_scenes import beside, blurred, faint
+
+
+def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
+    return image.repeat_interleave(times, -1).repeat_interleave(times, -2)
+
+
+def in_place(hw: tuple[int, int]) -> list[Segments]:
+    """One view for both cameras: each pixel of alpha, and each block of 2x2, is found where it is."""
+    places = (pixel_grid((hw[0] // s, hw[1] // s))[None] * s + (s - 1) / 2 for s in (1, 2))
+    return [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
+
+
+def test_what_nothing_sees_varies_with_brightness_as_nearby():
+    rng = np.random.default_rng(0)
+    brightness = (0.4 + 0.2 * rng.random((24, 32))).astype(np.float32)
+    colour = (0.8 * brightness - 0.3)[None]
+    weight = np.full(brightness.shape, 1e-4, np.float32)
+    weight[:, :16] = 1
+    guide = np.full(brightness.shape, 100, np.uint8)
+    unseen = np.where(weight < 1, 0, colour).astype(np.float32)
+    found = _diffused(unseen, brightness, weight, guide, (1000.0, 20.0))[0]
+    assert np.abs(found - colour)[:, :, 16:].mean() < 0.6 * np.abs(colour - colour.mean()).mean()
+
+
+def test_a_match_has_the_detail_that_beta_lost():
+    """One view for both cameras: a fifth or more of the error of colour that beta's blur made is gone."""
+    coarse = torch.rand(1, 1, 12, 16, generator=torch.Generator().manual_seed(2))
+    alpha = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
+    ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1) - torch.tensor([0.0, 0.1, 0.2]).view(
+        1, 3, 1, 1
+    )
+    beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
+    here = in_place((48, 64))
+    found = semi_global_matching(alpha, luminance(beta), beta, *here)
+    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
+    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].abs().mean() for c in chroma[:2])
+    assert left < 0.8 * lost
+
+
+def test_colour_that_does_not_follow_brightness_is_left_alone():
+    """Red and green change places where brightness does not show it, beside edges of brightness."""
+    g = torch.Generator().manual_seed(5)
+    fine, other = (
+        torch.rand(1, 1, 24, 32, generator=g).round().repeat_interleave(4, -1).repeat_interleave(4, -2) for _ in "ab"
+    )
+    alpha = 0.35 + 0.3 * fine
+    other = other.roll((2, 2), (-1, -2)) - 0.5
+    ground_truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
+    beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
+    here = in_place((96, 128))
+    found = semi_global_matching(alpha, luminance(beta), beta, *here)
+    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
+    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].square().mean() for c in chroma[:2])
+    assert left < 1.05 * lost
+
+
+def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere():
+    """Alpha alone sees something dark on the left: whole images have other levels, what both see has the same."""
+    scene = faint(1, contrast=0.1, blur=3.0)
+    scene[..., :48] -= 0.35
+    tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
+    alpha, beta, segments = beside(scene, 48)
+    found = semi_global_matching(alpha, beta, beta * tint, *segments)
+    assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
+
+
+def test_a_match_of_other_brightness_has_less_weight():
+    unlike = torch.zeros(1, 1, 5, 12)
+    unlike[..., 6:] = -LIKENESS
+    weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
+    torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
+    torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))
+
+
+def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
+    """One view for both cameras: what alpha sees bright the band sees dark, and without alpha it is blurred."""
+    g = torch.Generator().manual_seed(2)
+    coarse, fine = (torch.rand(1, 1, 96 // s, 128 // s, generator=g) for s in (32, 4))
+    alpha = 0.7 * enlarged(coarse, 32) + 0.3 * enlarged(fine, 4)
+    ground_truth = 0.8 - 0.6 * alpha
+    beta = blurred(ground_truth, 1.5)
+    here = in_place((96, 128))
+    found = semi_global_matching(alpha, beta, beta, *here).matched + alpha
+    left, lost = ((p - ground_truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
+    assert left < 0.7 * lost
+
+
+def test_colour_is_as_bright_as_alpha_where_betas_lens_is_dark():
+    """Beta has half the light on its right: with alpha's light its colours are alpha's but for a third."""
+    tint = torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
+    alpha = faint(2, contrast=0.1, blur=2.0)[..., :128]
+    ground_truth = alpha * tint
+    beta = ground_truth * torch.linspace(1, 0.5, 128)
+    found = semi_global_matching(alpha, luminance(beta), beta, *in_place((64, 128)))
+    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
+    wrong, darker = ((c - chroma[2])[..., 64:].abs().mean() for c in chroma[:2])
+    assert wrong < 0.5 * darker
