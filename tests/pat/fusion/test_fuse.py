@@ -196,7 +196,7 @@ def test_the_plan_is_announced_before_the_work():
     plans, rig = [], rig_of((50, 70), (40, 60))
     images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
     fuse(network_of("PAT"), rig, images, alpha="mono", announce=plans.append)
-    assert str(plans[0]).startswith("1 piece, 0.5")
+    assert str(plans[0]).startswith("1 piece, 0.4")
     assert plans[0].seconds is None
 
 
