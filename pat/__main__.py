@@ -1,10 +1,15 @@
 """`python -m pat` is `pat`: torchrun starts it so."""
 
+import os
 import sys
 
 
 def main() -> None:
-    """Run `pat`; an interruption while it is still being imported is one line, too."""
+    """Run `pat`; an interruption while it is still being imported is one line, too.
+
+    Torch's threads sleep while they wait: spinning, they took the cores from each other and from other processes.
+    """
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         from .cli.main import main as command
         from .support.memory import keep_freed

@@ -122,19 +122,18 @@ class Fuse:
     """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
-        from ..support.memory import parse_bytes
+        from ..support.memory import limited, parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
-        if self.max_memory is not None:
-            parse_bytes(self.max_memory)
+        limit = None if self.max_memory is None else parse_bytes(self.max_memory)
         options.response_of(self.response)
         options.noise_of(self.noise)
         options.device_of(self.device)
         if self.classical and not self.report:
             raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
-        with self._judged() as self._warnings:
+        with limited(limit), self._judged() as self._warnings:
             self._with_rig() if self._rig_given() else self._without_rig()
 
     def _rig_given(self) -> bool:

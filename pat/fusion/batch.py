@@ -38,6 +38,7 @@ from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
 from ..support.jobs import HERE, JobReport, OnError, Task, Workers, run_tasks
 from ..support.locks import folder_lock
+from ..support.memory import limited, parse_bytes
 from ..support.tensor_files import write_tensors
 from .checks import confidence_checked
 from .frames import ImageFiles
@@ -266,10 +267,11 @@ class Batch:
 
     def fuse_one(self, i: int) -> None:
         """Write a frame."""
-        with confidence_checked(strict=self.strict):
-            frame = self._frame(i)
-        view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
-        save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])
+        with limited(None if self.max_memory is None else parse_bytes(self.max_memory)):
+            with confidence_checked(strict=self.strict):
+                frame = self._frame(i)
+            view = view_of(self.rig, self.alpha, bits=self.bits, bands=len(frame.image))
+            save_frame(frame, self.out, bits=self.bits, kind=self.kind, view=view, name=self.names[i])
 
     def _frame(self, i: int) -> Frame:
         if not self.sequence:

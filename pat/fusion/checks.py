@@ -99,4 +99,4 @@ def overlap_confidence(frame: Frame, inputs: FrameInputs) -> float:
     for beta in inputs.inputs.betas:
         if beta.field.pixels is not None:
             overlap &= beta.field.pixels.valid.reshape(beta.field.pixels.valid.shape[-2:])[:h, :w]
-    return float(frame.confidence[overlap].detach().mean())
+    return float((frame.confidence.detach() * overlap).sum(dtype=torch.float64) / overlap.sum())

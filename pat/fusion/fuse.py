@@ -58,7 +58,7 @@ def fuse(
     """Fuse one frame at the view of camera `alpha`.
 
     Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every beta that its
-    segments touch, and a halo: equal to the whole to 1e-5. Distorted images are first resampled to pinhole views
+    segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled to pinhole views
     (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's angular resolution; the
     result is at alpha's own pixels all the same. Where alpha is known to measure the luminance of linear light and one
     beta the colours, the result is as bright in that sense (`pat.media.raw.as_bright`).

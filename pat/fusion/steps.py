@@ -38,7 +38,7 @@ from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between, sampled_between
 
 from ..media.images import Images
-from ..media.raw import as_bright
+from ..media.raw import LIGHT, as_bright
 from ..networks.protocol import FusionNetwork, JoinsBands, box_around, ends_of
 from .results import Frame
 from .views import Fields, Views
@@ -101,9 +101,9 @@ class LinearLuminance:
 
     def do(self, views: Views) -> Done:
         """Leave the views as they are; undone, a frame in the colours of RGB betas is made as bright as alpha."""
-        if 3 not in [views.images[name].shape[0] for name in views.betas]:
-            return Done(views, _as_it_is)
         own, sensor = views.own, views.rig[views.alpha].sensor
+        if sensor.response != LIGHT or 3 not in [views.images[name].shape[0] for name in views.betas]:
+            return Done(views, _as_it_is)
         return Done(views, lambda frame: frame._replace(image=as_bright(frame.image, own, sensor)))
 
 

@@ -30,8 +30,8 @@ MAX_HALO = 224
 3e-5, at 160 2e-4; measured on three scenes), however far their convolutions reach."""
 LIBRARIES = 0.46 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
-SLACK = 1.16
-"""What a process takes over what is counted here: 14 % were seen, in many tiles of a frame of 12 megapixels."""
+SLACK = 1.05
+"""What a process may take over what is counted here: blocks too small to be returned at once leave gaps."""
 MATCHING_BYTES = 330.0
 """Working memory of matching for each pixel of alpha, measured."""
 FRAME_BYTES = 20.0

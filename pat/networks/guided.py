@@ -112,7 +112,7 @@ class GuidedPAT(nn.Module):
     halo = 640
     """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
     beta_halo = 96
-    bytes_per_pixel = 280.0
+    bytes_per_pixel = 190.0
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
@@ -226,13 +226,11 @@ class GuidedPAT(nn.Module):
         guide: Callable[[Tensor], Tensor] | None = None,
     ) -> BetaEstimate:
         """The estimate of one beta of any bands; `guide` is what of these is compared with alpha."""
-        of = guide or brightness
-        segments = _in_type(beta.field.straight, self._exact(alpha))
-        window = window_around(found.disparity, segments, self.config.window)
-        query, key = self._key(own), self._key(self.encoder(of(beta.image)))
-        attended = attend_with_statistics(query, key, self._exact(beta.image), window, samples=self.config.taps)
-        value = attended.value.to(alpha)
-        facts = [of(value) - alpha, attended.peak[:, None].to(alpha), attended.deviation[:, None].to(alpha)]
+        of, exactly = guide or brightness, alpha.dtype if self.training else torch.float64
+        segments = _in_type(beta.field.straight, exactly)
+        attended = self._attended(own, self.encoder(of(beta.image)), beta.image, segments, found)
+        value = attended.value
+        facts = [of(value) - alpha, attended.peak[:, None], attended.deviation[:, None]]
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
@@ -240,6 +238,13 @@ class GuidedPAT(nn.Module):
         position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
         alike = likeness(facts[0], LIKENESS)
         return BetaEstimate(attended, colour, found.colour, logit, choice, position, alike)
+
+    def _attended(
+        self, own: Encoded, other: Encoded, bands: Tensor, segments: Segments, found: SemiGlobalMatches
+    ) -> Attended:
+        """Beta's bands around the matches."""
+        window = window_around(found.disparity, segments, self.config.window)
+        return attend_with_statistics(self._key(own), self._key(other), bands, window, samples=self.config.taps)
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -250,19 +255,11 @@ class GuidedPAT(nn.Module):
         return self.confidence(stacked(enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)))
 
     def _key(self, features: Encoded) -> Tensor:
-        """What queries and keys are at full size."""
+        """What queries and keys are at full size; the channels are beside each other, as attention wants them."""
         x = self.fine_key(features.half)
-        if self.training:
-            return pixel_shuffle(x, 2)
-        b, c, h, w = x.shape  # shuffled and made exact in one copy
+        b, c, h, w = x.shape
         pixels = x.view(b, c // 4, 2, 2, h, w).permute(0, 4, 2, 5, 3, 1)
-        exact = pixels.to(torch.float64, memory_format=torch.contiguous_format)
-        return exact.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
-
-    def _exact(self, x: Tensor) -> Tensor:
-        """Float64 in use: rounded in float32, positions far to the right would differ from those of a tile there. The
-        channels are beside each other, as attention wants them: else it makes a copy."""
-        return x if self.training else x.to(torch.float64, memory_format=torch.channels_last)
+        return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
 
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
@@ -358,9 +355,9 @@ def _with_gradient(
     return found._replace(matched=matched)
 
 
-def _in_type(segments: Segments, like: Tensor) -> Segments:
-    """Segments in the type of a tensor."""
-    return Segments(segments.start.to(like), segments.end.to(like), segments.valid)
+def _in_type(segments: Segments, kind: torch.dtype) -> Segments:
+    """Segments as numbers of another type."""
+    return Segments(segments.start.to(kind), segments.end.to(kind), segments.valid)
 
 
 def _normalisations(inputs: Inputs) -> Normalisations:

@@ -12,8 +12,10 @@ from contextvars import ContextVar
 from pathlib import Path
 from threading import Thread
 
-M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -3, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
+LARGE = 2**22
+"""Bytes of a block that is returned to the system when it is freed."""
 
 
 def parse_bytes(amount: float | str) -> float:
@@ -32,10 +34,22 @@ def parse_bytes(amount: float | str) -> float:
 def keep_freed() -> None:
     """Keep freed memory for later use: glibc returns large blocks at once, and an eighth of the time of fusing a frame
     goes into getting them again. Of the whole process: for commands and workers, which are ours."""
-    if sys.platform == "linux":
-        options = getattr(ctypes.CDLL(None), "mallopt", None)
-        for option, value in ((M_MMAP_MAX, 0), (M_TRIM_THRESHOLD, 2**31 - 1), (M_ARENA_MAX, 1)) if options else ():
+    global _KEEPS
+    _KEEPS = _keeping(keep=True)
+
+
+_KEEPS = False
+"""Whether `keep_freed` was called."""
+
+
+def _keeping(*, keep: bool) -> bool:
+    """Set glibc's options so that large freed blocks are kept or returned; whether it has such options."""
+    options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
+    if options is not None:
+        kept, returned = ((M_MMAP_MAX, 0), (M_ARENA_MAX, 1)), ((M_MMAP_MAX, 2**16), (M_MMAP_THRESHOLD, LARGE))
+        for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), *(kept if keep else returned)):
             options(option, value)
+    return options is not None
 
 
 def give_back() -> None:
@@ -53,12 +67,22 @@ _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
 
 @contextmanager
 def limited(limit: float | None) -> Iterator[None]:
-    """Within this, `how_many_fit` knows how many bytes the process may take in all; None: as many as it likes."""
+    """Within this, `how_many_fit` knows how many bytes the process may take in all, and large freed blocks are
+    returned to the system at once; None: no limit."""
     token = _LIMIT.set(limit)
+    _adapt()
     try:
         yield
     finally:
         _LIMIT.reset(token)
+        _adapt()
+
+
+def _adapt() -> None:
+    """Keep freed memory, if `keep_freed` was called, where there is no limit."""
+    if _KEEPS:
+        _keeping(keep=_LIMIT.get() is None)
+        give_back()
 
 
 def how_many_fit(nbytes: float) -> int | None:

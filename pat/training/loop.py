@@ -26,7 +26,7 @@ from .checkpoints import Checkpoint, collect, newest_checkpoint, restore, write_
 from .config import TrainConfig, config_text, difference, parse_config, save_config
 from .losses import Objective, validation
 from .processes import Process, process
-from .samples import Sample, SampleSource, alone, scenes
+from .samples import Sample, SampleSource, alone, made_ahead, scenes
 from .watch import Watch
 
 BEST, CHECKPOINTS = "best.safetensors", "checkpoints"
@@ -103,7 +103,7 @@ class Run:
 
     def work(self) -> None:
         """Step until done."""
-        for given in self.learn.steps(self.groups, start=self.step):
+        for given in made_ahead(self.learn.steps(self.groups, start=self.step), self.network):
             self.step += 1
             done = self.here.agreed(self.done)
             self._advance(given, done)

@@ -65,7 +65,7 @@ class Objective(nn.Module):
 def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
     """The network's output, and its match in each beta if it reports it."""
     if isinstance(network, (GuidedPAT, BandwisePAT)):
-        return network.explain(given.inputs)
+        return network.explain(given.inputs, given.state)
     return network(given.inputs), []
 
 

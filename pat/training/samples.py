@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from itertools import islice
 from typing import Any, NamedTuple
@@ -26,7 +27,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
 from pat.media.colour import luminance
-from pat.networks.protocol import Inputs
+from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
@@ -54,6 +55,8 @@ class Sample(NamedTuple):
     ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
+    state: Any = None
+    """What the network finds out before it computes anything with its weights (`FusionNetwork.prepare`), if known."""
 
     @property
     def inputs(self) -> Inputs:
@@ -150,6 +153,23 @@ class SampleSource:
     def _forget(self, scenes: int | None) -> None:
         for key in [key for key in self.cache if key[0] == scenes]:
             del self.cache[key]
+
+
+def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
+    """The samples, with their state: those of the next step are made, and matched, while a step is computed.
+
+    They do not depend on the network's weights, so that results are the same.
+    """
+
+    def following() -> list[Sample]:
+        return [part._replace(state=network.prepare(part.inputs)) for part in next(samples)]
+
+    with ThreadPoolExecutor(1) as beside:
+        coming = beside.submit(following)
+        while True:
+            given = coming.result()
+            coming = beside.submit(following)
+            yield given
 
 
 def scenes(

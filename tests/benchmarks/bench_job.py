@@ -4,7 +4,8 @@
 caps of memory; with kernels compiled before (warm), and with an empty cache (cold). Beside it, in turn in the same run,
 processes that read the same files and write an image by the classical baseline, and by OpenCV's SGBM, WLS and warp;
 and `pat fuse` of another checkout, such as that of an older commit. Then the first second (`pat --help`, `pat warm-up`
-with an empty cache, `pat demo` after it), and forty frames from folders. The images are the sample array's, enlarged.
+with an empty cache, `pat demo` after it), and forty frames from folders, by
+local workers and by a Dask cluster. The images are the sample array's, enlarged.
 Prints figures, and puts them into tests/benchmarks/RESULTS_job.md; some 15 minutes on two cores, twice that with
 another checkout. `--quick`: 1280x800 with one beta only, cold once and warm once, nothing written.
 """
@@ -20,6 +21,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from statistics import median
@@ -145,9 +147,9 @@ def first_second(work: Path, runs: int, root: Path) -> list[list[str]]:
     ]
 
 
-def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) -> list[str]:
-    """A line of the table of `FRAMES` frames from folders by as many workers as there are cores; `one` is the seconds
-    of a process that fuses one of them."""
+def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) -> Iterator[list[str]]:
+    """Lines of the table of `FRAMES` frames from folders by as many workers as there are cores, and by a Dask cluster
+    of as many; `one` is the seconds of a process that fuses one of them."""
     names = ["mono", *(f"colour{i + 1}" for i in range(case.betas))]
     for name in names:
         frames = work / f"frames{case.wh[0]}" / name
@@ -157,16 +159,36 @@ def many_frames(case: Case, folder: Path, work: Path, one: float, root: Path) ->
                 (frames / f"{i:03d}.png").symlink_to(folder / f"{name}.png")
     images = [word for name in names for word in ("--image", f"{name}={work / f'frames{case.wh[0]}' / name}")]
     workers = len(os.sched_getaffinity(0))
-    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--workers", str(workers)]
-    found = run([*command, "--out", tempfile.mkdtemp(dir=work)], work / ("warm" if root == ROOT else "old"), root)
-    busy = found.cores / found.wall / workers
-    return [
-        case.name,
-        f"{60 * FRAMES / found.wall:.1f}",
-        f"{60 / one:.1f}",
-        f"{found.cores / FRAMES:.2f}",
-        f"{busy:.0%}",
-    ]
+    command = [*PAT, "fuse", str(folder / "rig.yaml"), "--alpha", "mono", *images, "--out", tempfile.mkdtemp(dir=work)]
+    cache = work / ("warm" if root == ROOT else "old")
+    found = run([*command, "--workers", str(workers)], cache, root)
+    same = f"{60 / one:.1f}"
+    busy = f"{found.cores / found.wall / workers:.0%}"
+    yield [case.name, f"{60 * FRAMES / found.wall:.1f}", same, f"{found.cores / FRAMES:.2f}", busy]
+    with cluster(work, workers, cache, root) as address:
+        there = run([*command, "--scheduler", address], cache, root)
+    yield [f"{case.name}, Dask", f"{60 * FRAMES / there.wall:.1f}", same, "", ""]
+
+
+@contextmanager
+def cluster(work: Path, workers: int, cache: Path, root: Path) -> Iterator[str]:
+    """The address of a Dask scheduler on this machine with workers of one thread, which are processes."""
+    file, dask = work / "scheduler.json", [sys.executable, "-m", "dask"]
+    quiet: dict[str, Any] = {"cwd": root, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    quiet["env"] = {**os.environ, "NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(root)}
+    given = ["--scheduler-file", str(file)]
+    scheduler = subprocess.Popen([*dask, "scheduler", "--port", "0", "--dashboard-address", ":0", *given], **quiet)
+    many = ["--nworkers", str(workers), "--nthreads", "1", "--memory-limit", "0", "--no-dashboard"]
+    both = [scheduler, subprocess.Popen([*dask, "worker", *many, *given], **quiet)]
+    try:
+        while not file.exists() and scheduler.poll() is None:
+            time.sleep(0.1)
+        yield json.loads(file.read_text())["address"]
+    finally:
+        for process in reversed(both):
+            process.terminate()
+            process.wait()
+        file.unlink(missing_ok=True)
 
 
 def row(case: Case, found: dict[str, list[Run]]) -> list[str]:
@@ -240,7 +262,7 @@ def main() -> None:
                 stages.append(shown(("", *STAGE_NAMES), stages_row(case, found)))
             if case.name == MANY and not given.quick:
                 one = median(r.wall for r in found["pat fuse"])
-                many += [shown(MANY_COLUMNS, many_frames(case, images, work, one, ROOT))]
+                many += [shown(MANY_COLUMNS, line) for line in many_frames(case, images, work, one, ROOT)]
         for root in () if given.quick else (ROOT, old) if old else (ROOT,):
             note = "" if root == ROOT else ", other checkout"
             lines = first_second(work, min(runs, 3), root)

@@ -4,6 +4,7 @@ import contextlib
 import dataclasses
 import functools
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -487,3 +488,13 @@ def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkey
         main([*command, "--out", out])
     assert ended.value.code == 2
     assert text in " ".join(capsys.readouterr().err.split())
+
+
+def test_threads_that_wait_sleep():
+    """Spinning, two threads took twice the core seconds beside another process; what the user sets is kept."""
+    code = "import os\nfrom pat.__main__ import main\ntry: main()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
+    for given, wanted in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
+        others = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+        line = [sys.executable, "-c", code, "--help"]
+        done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env=others | given)
+        assert done.stdout.split()[-1] == wanted

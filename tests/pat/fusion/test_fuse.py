@@ -1,6 +1,7 @@
 """fuse: tiles equal the whole, sizes and pitches are followed, mistakes are named."""
 
 import math
+import weakref
 
 import pytest
 import torch
@@ -26,7 +27,7 @@ from arraygeom import (
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
 from pat.evaluation.metrics import score
-from pat.fusion.fuse import fuse
+from pat.fusion.fuse import _prepared, fuse
 from pat.fusion.inputs import FrameInputs
 from pat.fusion.steps import quarter_turns, resolution_ratio, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
@@ -126,7 +127,7 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
 @pytest.mark.slow
 @pytest.mark.parametrize("folder", ["kitti", "flickr1024/train"])
 def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
-    """Tiles of real images equal the whole with the weights that are shipped."""
+    """Tiles of real images equal the whole with the weights that are shipped, but for the rounding of positions."""
     pair, network = next(folder_pairs(shared_data / folder)), load_weights("mono-colour")
     images = {"left": luminance(pair.left), "right": pair.right}
     rig = Rig({name: View(hw=image.shape[1:]) for name, image in images.items()})
@@ -140,8 +141,8 @@ def test_halos_are_wide_enough_for_the_weights(folder, shared_data):
             lambda *_: list(tiles_of((h, w), (-(-h // 32) * 16, -(-w // 64) * 16), MAX_HALO)),
         )
         tiled = fuse(network, rig, images, alpha="left", field=field)
-    assert (tiled.image - whole.image).abs().max() < 1e-5
-    assert (tiled.confidence - whole.confidence).abs().max() < 1e-5
+    assert (tiled.image - whole.image).abs().max() < 3e-5
+    assert (tiled.confidence - whole.confidence).abs().max() < 3e-5
 
 
 def test_images_are_asked_for_once_and_only_when_they_are_needed():
@@ -173,7 +174,7 @@ def test_memory_decides_the_tiles():
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
     assert area * network.bytes_per_pixel <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
-    with pytest.raises(ValueError, match="need at least 89 MiB"):
+    with pytest.raises(ValueError, match="need at least 80 MiB"):
         tiles_within(network, frame, 2.0**20)
 
 
@@ -195,7 +196,7 @@ def test_the_plan_is_announced_before_the_work():
     plans, rig = [], rig_of((50, 70), (40, 60))
     images = {"mono": torch.rand(1, 50, 70), "colour": torch.rand(3, 40, 60)}
     fuse(network_of("PAT"), rig, images, alpha="mono", announce=plans.append)
-    assert str(plans[0]).startswith("1 piece, 0.5")
+    assert str(plans[0]).startswith("1 piece, 0.4")
     assert plans[0].seconds is None
 
 
@@ -441,3 +442,16 @@ def test_real_lenses(shared_data):
     )
     assert seen > grey + 4
     assert seen > blind + 0.8
+
+
+def test_an_image_that_is_not_needed_again_is_not_kept():
+    """Alpha's own, whose padded copy the network has, where nothing is undone with it."""
+    hw, beta_hw = (40, 60), (40, 60)
+    images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
+    views = Views.of(rig_of(hw, beta_hw), images, alpha="mono")
+    kept = weakref.ref(images["mono"])
+    inputs, undo = _prepared(network_of("GuidedPAT"), views, False)
+    del views, images
+    assert undo
+    assert inputs.hw == hw
+    assert kept() is None

@@ -6,6 +6,7 @@ import torch
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
 from pat.media.colour import luminance
+from pat.networks import guided
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT, window_around
 from pat.networks.protocol import Inputs
@@ -111,3 +112,18 @@ def test_colour_counts_more_where_brightness_is_alike():
     assert (unlike.likeness[inside] < 0.01).all()
     same = unlike._replace(logit=alike.logit)
     assert ((alike.blending - same.blending)[inside] > 0.05).all()
+
+
+def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
+    """Features in float64 took a sixth of the time of a tile, and a sixth of its memory, for 2e-6 of the image."""
+    asked, attend = [], guided.attend_with_statistics
+
+    def noted(query, key, value, window, **options):
+        asked.append({t.dtype for t in (query, key, value)} | {window.start.dtype})
+        return attend(query, key, value, window, **options)
+
+    monkeypatch.setattr(guided, "attend_with_statistics", noted)
+    images = torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)]
+    found = lively(GuidedPAT(SMALL)).eval()(Inputs.of(*images, [rectified()]))
+    assert asked == [{torch.float32, torch.float64}]
+    assert found.position[0].dtype == torch.float64

@@ -53,3 +53,29 @@ def test_the_peak_of_a_process_is_its_own_not_that_of_its_parent():
     assert held.nbytes == 2**29
     assert 100 * 2**20 < peak < 200 * 2**20
     assert watch_peak(process.pid)() == 0
+
+
+KEPT = """
+import numpy as np
+from pat.support.memory import keep_freed, limited
+from tests.pat.support.test_memory import resident
+
+def kept():
+    # Every other block is freed: those that stay keep the C library from returning the top of its heap.
+    blocks = [np.ones(2**20) for _ in range(40)]
+    before, blocks = resident(), blocks[::2]
+    return 1 - (before - resident()) / (len(blocks) * 2**23)
+
+keep_freed()
+first = kept()
+with limited(2**32):
+    within = kept()
+print(round(first), round(within), round(kept()))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_freed_memory_is_kept_but_under_a_limit():
+    """In a process of its own, as the options are of a whole process."""
+    done = subprocess.run([sys.executable, "-c", KEPT], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["1", "0", "1"]

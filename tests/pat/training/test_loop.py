@@ -6,6 +6,7 @@ import resource
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -20,9 +21,9 @@ from pat.support.locks import folder_lock
 from pat.training import loop
 from pat.training.checkpoints import newest_checkpoint
 from pat.training.loop import new_network, shape
-from pat.training.losses import validation
+from pat.training.losses import Objective, validation
 from pat.training.processes import Process
-from pat.training.samples import scenes
+from pat.training.samples import made_ahead, scenes
 from pat.training.train import save_config, train
 
 from .runs import SMALL, losses, short_run
@@ -50,6 +51,25 @@ def whole(folder):
     config = short_run(folder, out=folder / "whole")
     train(config)
     return config
+
+
+def test_samples_are_made_and_matched_ahead(folder):
+    """The second while the first is in use; a network that is given their state computes the same."""
+    config, asked = short_run(folder), threading.Event()
+    network = new_network(config)
+
+    def source():
+        for number, group in enumerate(scenes(config)[0].steps([0])):
+            if number == 1:
+                asked.set()
+            yield group
+
+    given = next(made := made_ahead(source(), network))[0]
+    assert asked.wait(60)
+    made.close()
+    objective = Objective(network, config.loss)
+    assert given.state is not None
+    assert torch.equal(objective(given), objective(given._replace(state=None)))
 
 
 class Stopped(Exception):
