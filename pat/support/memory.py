@@ -14,8 +14,10 @@ from threading import Thread
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -3, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
-LARGE = 2**22
-"""Bytes of a block that is returned to the system when it is freed."""
+LARGE, SHARE = 2**22, 1 / 256
+"""A block is returned to the system when it is freed if it has this many bytes and this share of the limit."""
+LARGEST = 2**25
+"""What glibc takes at most for M_MMAP_THRESHOLD."""
 
 
 def parse_bytes(amount: float | str) -> float:
@@ -42,11 +44,11 @@ _KEEPS = False
 """Whether `keep_freed` was called."""
 
 
-def _keeping(*, keep: bool) -> bool:
+def _keeping(*, keep: bool, large: float = LARGE) -> bool:
     """Set glibc's options so that large freed blocks are kept or returned; whether it has such options."""
     options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if options is not None:
-        kept, returned = ((M_MMAP_MAX, 0), (M_ARENA_MAX, 1)), ((M_MMAP_MAX, 2**16), (M_MMAP_THRESHOLD, LARGE))
+        kept, returned = ((M_MMAP_MAX, 0), (M_ARENA_MAX, 1)), ((M_MMAP_MAX, 2**16), (M_MMAP_THRESHOLD, int(min(large, LARGEST))))
         for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), *(kept if keep else returned)):
             options(option, value)
     return options is not None
@@ -80,8 +82,9 @@ def limited(limit: float | None) -> Iterator[None]:
 
 def _adapt() -> None:
     """Keep freed memory, if `keep_freed` was called, where there is no limit."""
+    limit = _LIMIT.get()
     if _KEEPS:
-        _keeping(keep=_LIMIT.get() is None)
+        _keeping(keep=limit is None, large=max(LARGE, SHARE * (limit or 0)))
         give_back()
 
 

@@ -68,7 +68,7 @@ def kept():
 
 keep_freed()
 first = kept()
-with limited(2**32):
+with limited(2**30):
     within = kept()
 print(round(first), round(within), round(kept()))
 """
