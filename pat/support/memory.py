@@ -48,7 +48,8 @@ def _keeping(*, keep: bool, large: float = LARGE) -> bool:
     """Set glibc's options so that large freed blocks are kept or returned; whether it has such options."""
     options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if options is not None:
-        kept, returned = ((M_MMAP_MAX, 0), (M_ARENA_MAX, 1)), ((M_MMAP_MAX, 2**16), (M_MMAP_THRESHOLD, int(min(large, LARGEST))))
+        kept = (M_MMAP_MAX, 0), (M_ARENA_MAX, 1)
+        returned = (M_MMAP_MAX, 2**16), (M_MMAP_THRESHOLD, int(min(large, LARGEST)))
         for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), *(kept if keep else returned)):
             options(option, value)
     return options is not None
