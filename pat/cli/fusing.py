@@ -122,6 +122,7 @@ class Fuse:
     """Where a single frame is fused: auto takes CUDA where there is such a GPU."""
 
     def run(self) -> None:
+        """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
         from ..support.memory import limited, parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:

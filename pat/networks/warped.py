@@ -53,7 +53,8 @@ def matched_colours(
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """Beta's bands minus alpha at the matches, with the detail that alpha has and beta has not; their weight."""
+    """Beta's bands minus alpha at the matches, colour as in alpha's light and with the detail that alpha has and beta has
+    not; their weight, 0 to 1."""
     bands = beta.shape[1]
     seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
     values, own, brightness = seen.split([bands, 1, 1], 1)
@@ -62,7 +63,7 @@ def matched_colours(
     soft = normalisation.softened(alpha)
     weight = match_weight(brightness - soft, consistent, valid)
     if bands > 1:
-        colour, bright = _as_bright(values - own, own, alpha, weight)
+        colour, bright = _scaled_to_alpha(values - own, own, alpha, weight)
         detailed = _detailed(colour, bright, alpha, SATURATED)
         matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
     else:
@@ -70,7 +71,7 @@ def matched_colours(
     return matched, weight
 
 
-def _as_bright(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
+def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
     What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in between.

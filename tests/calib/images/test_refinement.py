@@ -102,7 +102,7 @@ def test_swapped_cameras_are_not_accepted():
 
 
 def test_points_behind_the_cameras_are_not_accepted():
-    """Parallel cameras of the same K that are swapped have the right lines: only the side of the points tells."""
+    """Parallel cameras of the same K, swapped, have the right lines: only the side of the points shows it."""
     g = np.random.default_rng(9)
     rig = simulated_rig("wide", 2, g)
     alpha, pose = rig["c0"], rig["c1"].cam_from_world

@@ -20,6 +20,15 @@ def in_place(hw: tuple[int, int]) -> list[Segments]:
     return [Segments(x, x, torch.ones(x.shape[:-1], dtype=torch.bool)) for x in places]
 
 
+def chroma_errors(
+    alpha: torch.Tensor, beta: torch.Tensor, ground_truth: torch.Tensor, segments: list[Segments]
+) -> list[torch.Tensor]:
+    """How far colour differences are from the true ones: those at the matches, and beta's where it is."""
+    matched = semi_global_matching(alpha, luminance(beta), beta, *segments).matched
+    found, given, true = (image - luminance(image) for image in (matched, beta, ground_truth))
+    return [found - true, given - true]
+
+
 def test_what_nothing_sees_varies_with_brightness_as_nearby():
     rng = np.random.default_rng(0)
     brightness = (0.4 + 0.2 * rng.random((24, 32))).astype(np.float32)
@@ -41,9 +50,7 @@ def test_a_match_has_the_detail_that_beta_lost():
     )
     beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
     here = in_place((48, 64))
-    found = semi_global_matching(alpha, luminance(beta), beta, *here)
-    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
-    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].abs().mean() for c in chroma[:2])
+    left, lost = (e[..., 6:-6, 6:-6].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, here))
     assert left < 0.8 * lost
 
 
@@ -58,9 +65,7 @@ def test_colour_that_does_not_follow_brightness_is_left_alone():
     ground_truth = alpha + 0.25 * other * torch.tensor([1.0, -0.299 / 0.587, 0.0]).view(1, 3, 1, 1)
     beta = torch.cat([blurred(band, 1.0) for band in ground_truth.split(1, 1)], 1)
     here = in_place((96, 128))
-    found = semi_global_matching(alpha, luminance(beta), beta, *here)
-    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
-    left, lost = ((c - chroma[2])[..., 6:-6, 6:-6].square().mean() for c in chroma[:2])
+    left, lost = (e[..., 6:-6, 6:-6].square().mean() for e in chroma_errors(alpha, beta, ground_truth, here))
     assert left < 1.05 * lost
 
 
@@ -101,9 +106,7 @@ def test_colour_is_as_bright_as_alpha_where_betas_lens_is_dark():
     alpha = faint(2, contrast=0.1, blur=2.0)[..., :128]
     ground_truth = alpha * tint
     beta = ground_truth * torch.linspace(1, 0.5, 128)
-    found = semi_global_matching(alpha, luminance(beta), beta, *in_place((64, 128)))
-    chroma = [image - luminance(image) for image in (found.matched, beta, ground_truth)]
-    wrong, darker = ((c - chroma[2])[..., 64:].abs().mean() for c in chroma[:2])
+    wrong, darker = (e[..., 64:].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, in_place((64, 128))))
     assert wrong < 0.6 * darker
 
 
