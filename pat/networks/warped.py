@@ -53,7 +53,7 @@ def matched_colours(
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """Beta's bands minus alpha at the matches, colour as in alpha's light and with the detail that alpha has and beta has
+    """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and beta has
     not; their weight, 0 to 1."""
     bands = beta.shape[1]
     seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
