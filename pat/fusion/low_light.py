@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
 import torch
@@ -13,12 +13,13 @@ from torch import Tensor, nn
 
 from arraygeom import sample
 
-from ..media.colour import from_luma_chroma, luminance
+from ..media.colour import luminance
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
 from ..networks.pieces import tiles_of
 from ..networks.protocol import FusionNetwork, FusionOutput, Inputs
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
+from .averaging import Noises, averaged_with_alike
 from .results import Frame
 from .steps import FusionStep, Radiometry
 from .views import Views
@@ -30,11 +31,6 @@ LEAST_DEVIATION = 1.5 / 255
 """Images whose noise has a smaller standard deviation, in the mean, are left as they are."""
 PIECE, HALO = 1024, 128
 """Sides of the pieces in which an image is denoised, and of what is seen around them, pixels."""
-PATCH, SEARCH = 3, 6
-"""Side of the patches that are compared where colour is averaged, and how far away they are looked for, pixels."""
-ALIKE, DETAILED = 0.09, 2.0
-"""Distance of alike patches over the root of the noise's standard deviation; luma counts this many times as much as a
-colour difference, since there is less noise in it. Chosen on Middlebury's pairs of the tune half."""
 
 
 @cache
@@ -156,9 +152,9 @@ def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"
     """An image without noise of this standard deviation; bands other than three are denoised one by one."""
     network = shipped_denoiser()
     if image.shape[1] == 3:
-        return _in_pieces(network.colour, image, deviation)
+        return _in_pieces(partial(over_flips, network.colour), image, deviation)
     bands = zip(image.split(1, 1), deviation.split(1, 1))
-    return torch.cat([_in_pieces(network.band, *band) for band in bands], 1)
+    return torch.cat([_in_pieces(partial(over_flips, network.band), *band) for band in bands], 1)
 
 
 @torch.no_grad()
@@ -169,26 +165,17 @@ def jointly_denoised(
     beta, confidence = warped(betas, found)
     network = shipped_denoiser()
 
-    def work(part: Tensor, *seen: Tensor) -> Tensor:
-        return network(part, NoisyView(*seen[:3]), NoisyView(*seen[3:6]), seen[6])
+    def joint(part: Tensor, *seen: Tensor) -> Tensor:
+        return over_flips(lambda x, *s: network(x, NoisyView(*s[:3]), NoisyView(*s[3:6]), s[6]), part, *seen)
 
-    fused = _in_pieces(work, image[None], *alpha, *beta, confidence)[0]
-    return colour_averaged(fused, float(beta.deviation.mean()))
+    noise = Noises(float(alpha.deviation.mean()), float(beta.deviation.mean()))
 
+    def averaged(part: Tensor, *seen: Tensor) -> Tensor:
+        own, other, counts = (image[0] for image in seen)
+        return averaged_with_alike(part[0], own, other, counts, noise)[None]
 
-def colour_averaged(image: Float[Tensor, "3 h w"], deviation: float) -> Float[Tensor, "3 h w"]:
-    """The image with the mean colour differences of similar patches nearby, and its own luma.
-
-    By non-local means (Buades et al. 2005): colour has the noise of one camera, luma that of all. `deviation` is the
-    standard deviation of beta's noise before it was denoised.
-    """
-    from skimage.restoration import denoise_nl_means
-
-    luma = luminance(image)
-    given = torch.cat([image[[0, 2]] - luma, DETAILED * luma]).movedim(0, -1).cpu().numpy()
-    h = ALIKE * deviation**0.5
-    means = denoise_nl_means(given, patch_size=PATCH, patch_distance=SEARCH, h=h, channel_axis=-1)
-    return from_luma_chroma(luma, torch.from_numpy(means[..., :2]).movedim(-1, 0).to(luma))
+    fused = _in_pieces(joint, image[None], *alpha, *beta, confidence)
+    return _in_pieces(averaged, fused, alpha.recorded, beta.recorded, confidence)[0]
 
 
 def warped(betas: Sequence[NoisyView], found: Sequence[Found]) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
@@ -201,11 +188,11 @@ def warped(betas: Sequence[NoisyView], found: Sequence[Found]) -> tuple[NoisyVie
 
 
 def _in_pieces(work: Callable[..., Tensor], *images: Tensor) -> Tensor:
-    """A network on images of one size, computed piece by piece."""
+    """What is made of images of one size, computed piece by piece."""
     whole = torch.empty_like(images[0])
     h, w = whole.shape[-2:]
     for (top, bottom, left, right), (y0, y1, x0, x1) in tiles_of((h, w), PIECE, HALO):
-        part = over_flips(work, *(image[..., y0:y1, x0:x1] for image in images))
+        part = work(*(image[..., y0:y1, x0:x1] for image in images))
         whole[..., top:bottom, left:right] = part[..., top - y0 : bottom - y0, left - x0 : right - x0]
     return whole
 

@@ -11,9 +11,9 @@ from arraygeom.fields.grid import FieldOnGrid
 from pat.evaluation.baseline import classical, non_local_means
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.low_light import Found, WithPositions, colour_averaged, denoised, denoised_views, warped
+from pat.fusion.low_light import Found, WithPositions, denoised, denoised_views, warped
 from pat.fusion.views import Views
-from pat.media.colour import from_luma_chroma, luminance
+from pat.media.colour import luminance
 from pat.networks import denoiser
 from pat.networks.denoiser import NoisyView
 from pat.networks.protocol import Beta, FusionOutput, Inputs
@@ -160,15 +160,3 @@ def test_positions_are_those_of_the_matched_colours(network):
     monkey.undo()
     high = (seen["confidence"] > 0.8).expand_as(seen["image"])
     assert float((seen["beta"].denoised - seen["image"])[high].abs().mean()) < 0.02
-
-
-def test_colour_noise_is_averaged_within_what_is_alike():
-    """Two colours of one luma beside each other: noise of colour goes, the edge stays, and so does luma."""
-    red = torch.where(torch.arange(64) < 32, 0.1, -0.1)
-    chroma = torch.stack([red, -red])[:, None].expand(2, 48, 64)
-    luma = 0.5 + 0.02 * torch.rand(1, 48, 64, generator=generator_for(0))
-    clean = from_luma_chroma(luma, chroma)
-    noisy = from_luma_chroma(luma, chroma + 0.02 * torch.randn(chroma.shape, generator=generator_for(1)))
-    quiet = colour_averaged(noisy, 0.05)
-    assert (quiet - clean).square().mean() < 0.1 * (noisy - clean).square().mean()
-    torch.testing.assert_close(luminance(quiet), luminance(noisy))
