@@ -155,6 +155,8 @@ class Fuse:
         return False
 
     def _with_rig(self) -> None:
+        from arraygeom.compiled import numba_loaded
+
         from ..fusion.batch import find_images
         from ..fusion.views import ViewFiles
 
@@ -168,7 +170,8 @@ class Fuse:
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
         if self.sequence:
             return self._many(rig, found, self.alpha)
-        with ThreadPoolExecutor(1) as beside:
+        with ThreadPoolExecutor(2) as beside:
+            beside.submit(numba_loaded)
             compared = beside.submit(warn_of_wrong_rig, views)
             several = max(map(len, found.values())) > 1
             if several or self.strict or self.max_memory is not None:
