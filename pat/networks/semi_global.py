@@ -302,7 +302,12 @@ def length_of(segments: Segments) -> Float[Tensor, "*n"]:
 def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
     """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is known."""
     length = length_of(segments) if length is None else length
-    return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+    step, divisor = segments.start - segments.end, torch.where(length > 0, length, 1.0)
+    if step.requires_grad or not compilable(step):
+        return step / divisor[..., None]
+    for part in step.unbind(-1):
+        part.div_(divisor)
+    return step
 
 
 def reduced(segments: Segments, factor: int) -> Segments:
