@@ -203,9 +203,9 @@ def _add(total, a, b, c, d, first):
 
 
 @compiled(nogil=True, cache=True)
-def winners(total, end, along, length, cut, rows, columns, top, left, claims, disparity, facts, labels, places):
+def winners(total, end, along, length, cut, rows, columns, top, left, claims, disparity, facts, labels, positions):
     """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity) and whole
-    (labels); where it is in beta, pixels counted row by row (places; rows * columns: not on it); its margin to the
+    (labels); where it is in beta, pixels counted row by row (positions; rows * columns: not on it); its margin to the
     second best, and its cost (the last of facts (h, w, 3)). `total` is in parts.
 
     `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it, and that
@@ -226,7 +226,7 @@ def winners(total, end, along, length, cut, rows, columns, top, left, claims, di
             best, second = _two_best(sums, last)
             lowest = sums[best]
             disparity[y, x] = np.float32(best) + _between(sums, best, last)
-            labels[y, x], places[y, x] = best, at[best] if best < count and at[best] >= 0 else nowhere
+            labels[y, x], positions[y, x] = best, at[best] if best < count and at[best] >= 0 else nowhere
             facts[y, x, 1] = min(np.float32(second - lowest) / (8 * PARTS * LARGE), ONE)
             facts[y, x, 2] = np.float32(lowest) / (8 * PARTS * LARGE)
 
