@@ -192,6 +192,22 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
     assert len(most) == 4 * 6
 
 
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_know_what_others_claim(monkeypatch, threads):
+    """Blocks whose margins hold the whole image find what a single one does."""
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    given = alpha, beta, sampled_at(pair, 2), Normalisation.of(alpha, beta)
+    whole = matched_at_half_size(*given)
+    for name, value in {"BLOCK": 12, "LONG_BLOCK": 20, "MARGIN": 1000, "MOST_COSTS": 0}.items():
+        monkeypatch.setattr(pat.networks.semi_global, name, value)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    blocks = matched_at_half_size(*given)
+    assert (whole.facts[:, 0] > pat.networks.semi_global.CONSISTENT).any()
+    for one, other in zip(whole, blocks):
+        assert torch.equal(one, other)
+
+
 def test_a_batch_is_its_images_one_by_one():
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
