@@ -12,7 +12,17 @@ from torch import Tensor
 
 from .batching import Batched
 from .distortion import Distortion
-from .pixels import HW, floating, map_homogeneous, product, resize_matrix, rot90_matrix, shift_matrix, to_homogeneous
+from .pixels import (
+    HW,
+    floating,
+    map_homogeneous,
+    product,
+    resize_matrix,
+    rot90_matrix,
+    shift_matrix,
+    to_homogeneous,
+    within,
+)
 from .pose import Pose
 from .sensor import Sensor
 from .text import view_text
@@ -66,8 +76,7 @@ class View(Batched):
 
     def contains(self, x: Real[Tensor, "*n 2"]) -> Bool[Tensor, "*n"]:
         """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5]."""
-        h, w = self.hw
-        return ((x >= -0.5) & (x <= x.new_tensor([w - 0.5, h - 0.5]))).all(-1)
+        return within(x, self.hw)
 
     def _text(self) -> str:
         return view_text(self)

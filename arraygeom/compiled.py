@@ -36,6 +36,16 @@ def _warn_of_no_folder() -> None:
     )
 
 
+def numba_loaded() -> None:
+    """Let numba load what it needs before the first compiled function, which takes it half a second: in a thread beside
+    other work."""
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.registry import cpu_target
+
+    with global_compiler_lock:
+        cpu_target.target_context.refresh()
+
+
 def cache_file(entry: Any) -> Any:
     """numba's description of the files in which an entry point is kept; None where it is not."""
     return getattr(entry._cache, "_cache_file", None)

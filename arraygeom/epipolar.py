@@ -208,15 +208,15 @@ def depth_from_track(track: Track, x: Real[Tensor, "*n 2"], deviation: Float[Ten
     """
     a, b = track
     x = floating(x)
-    c, e = (v[..., :2] - x * v[..., 2:] for v in (a, b))
-    along = b[..., :2] * a[..., 2:] - a[..., :2] * b[..., 2:]
-    slope = (e * along).sum(-1)
+    (X, Y, Z), (DX, DY, DZ), (column, row) = a.unbind(-1), b.unbind(-1), x.unbind(-1)  # faster than axes of length 2
+    along_x, along_y = DX * Z - X * DZ, DY * Z - Y * DZ
+    slope = (DX - column * DZ) * along_x + (DY - row * DZ) * along_y
     moves = slope.abs() > FLAT * FLAT
-    w = -(c * along).sum(-1) / torch.where(moves, slope, 1.0)
-    z_ratio = a[..., 2] + w * b[..., 2]
+    w = ((column * Z - X) * along_x + (row * Z - Y) * along_y) / torch.where(moves, slope, 1.0)
+    z_ratio = Z + w * DZ
     valid = moves & (w > 0) & (z_ratio > FRONT)
     depth = torch.where(valid, 1 / torch.where(valid, w, 1.0), 0.0)
-    length = torch.where(valid, along.square().sum(-1), 1.0).sqrt()
+    length = torch.where(valid, along_x.square() + along_y.square(), 1.0).sqrt()
     pixels_per_w = torch.where(valid, slope.abs() / (length * torch.where(valid, z_ratio, 1.0)), 1.0)
     sigma = torch.zeros_like(w) if deviation is None else deviation
     return Depth(depth, torch.where(valid, sigma / pixels_per_w, 0.0) * depth.square(), valid)

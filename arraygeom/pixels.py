@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from jaxtyping import Float, Real
+from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 HW = tuple[int, int]
@@ -58,6 +58,12 @@ def rot90_matrix(hw: HW, quarter_turns: int) -> Float[Tensor, "3 3"]:
 def floating(x: Real[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Pixels in float32 or float64: integers and half precision, which holds no pixel position, become float32."""
     return x.to(torch.promote_types(x.dtype, torch.float32))
+
+
+def within(x: Real[Tensor, "*n 2"], hw: HW, slack: float = 0.0) -> Bool[Tensor, "*n"]:
+    """Whether points lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to so many pixels."""
+    (column, row), (h, w), low = x.unbind(-1), hw, -0.5 - slack  # faster than an axis of length 2
+    return (column >= low) & (column <= w + slack - 0.5) & (row >= low) & (row <= h + slack - 0.5)
 
 
 def product(A: Float[Tensor, "*b i j"], B: Float[Tensor, "*c j k"]) -> Float[Tensor, "*d i k"]:

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from .pixels import HW, floating
+from .pixels import HW, floating, within
 
 Interpolation = Literal["bilinear", "nearest", "bicubic"]
 
@@ -34,10 +34,7 @@ def to_grid(x: Real[Tensor, "*n 2"], hw: HW) -> Float[Tensor, "*n 2"]:
 
 def on_image(x: Real[Tensor, "*n 2"], hw: HW) -> Bool[Tensor, "*n"]:
     """Whether positions lie on the image's area, [-0.5, W - 0.5] x [-0.5, H - 0.5], to 1e-3 pixels."""
-    h, w = hw
-    x = floating(x)
-    limits = x.new_tensor([w, h]) - 0.5 + SLACK
-    return ((x >= -0.5 - SLACK) & (x <= limits)).all(-1)
+    return within(x, hw, SLACK)
 
 
 SLACK = 1e-3

@@ -14,7 +14,7 @@ from functools import lru_cache
 import torch
 
 
-def in_parallel(tasks: Sequence[Callable[[], None]], *, most: int | None = None) -> None:
+def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = None) -> None:
     """Run tasks on the threads that torch may use, or `most` of them, this one included; an error of any is raised."""
     left = iter(tasks)
 

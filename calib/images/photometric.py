@@ -14,7 +14,6 @@ from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
-from kornia.color import rgb_to_grayscale
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 
@@ -130,6 +129,8 @@ def _local_mean(grey: Tensor) -> Tensor:
 
 
 def _reduced(image: Tensor) -> Tensor:
+    from kornia.color import rgb_to_grayscale  # here, as it takes .3 s to import
+
     grey = (rgb_to_grayscale(image) if image.shape[0] == 3 else image)[None].float()
     h, w = grey.shape[-2:]
     factor = LARGEST / max(h, w)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 
     from arraygeom import Rig
 
+    from ..evaluation.metrics import Score
     from ..fusion.report import Facts
     from ..fusion.results import Frame
     from ..fusion.views import ViewFiles
@@ -154,6 +155,8 @@ class Fuse:
         return False
 
     def _with_rig(self) -> None:
+        from arraygeom.compiled import numba_loaded
+
         from ..fusion.batch import find_images
         from ..fusion.views import ViewFiles
 
@@ -167,7 +170,8 @@ class Fuse:
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
         if self.sequence:
             return self._many(rig, found, self.alpha)
-        with ThreadPoolExecutor(1) as beside:
+        with ThreadPoolExecutor(2) as beside:
+            beside.submit(numba_loaded)
             compared = beside.submit(warn_of_wrong_rig, views)
             several = max(map(len, found.values())) > 1
             if several or self.strict or self.max_memory is not None:
@@ -392,24 +396,29 @@ class Demo:
     def run(self) -> None:
         """Write the images, and print the scores of alpha alone, the baseline and the fusion."""
         from arraygeom.atomic import write_text
+        from arraygeom.compiled import numba_loaded
 
         from ..data.sample_array import ALPHA, BETA, load_sample
         from ..evaluation.baseline import classical
-        from ..evaluation.metrics import score
         from ..fusion.results import save_frame
         from ..systems.demo import save_demo_figure
 
         options.writable(self.out, folder=True)
         sample = load_sample()
-        say("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
-        baseline = classical(sample.rig, sample.images, ALPHA, BETA)
-        say(f"fusion with the weights '{self.weights}'")
-        frame = fuse_with_progress(self.weights, sample.rig, sample.images, alpha=ALPHA)
-        written = save_frame(frame, self.out)
-        save_demo_figure(sample, baseline, frame, self.out / "demo.png")
-        rows = {"alpha alone": sample.images[ALPHA].expand(3, -1, -1), "classical": baseline, "fusion": frame.image}
-        scores = {name: score(image.clamp(0, 1), sample.ground_truth) for name, image in rows.items()}
-        lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in scores.items()]
+        with ThreadPoolExecutor(1) as beside:
+            beside.submit(numba_loaded)
+            say("classical baseline: semi-global matching, warped colour, edge-aware smoothing")
+            baseline = classical(sample.rig, sample.images, ALPHA, BETA)
+            scores = {"alpha alone": beside.submit(_score, sample.images[ALPHA].expand(3, -1, -1), sample.ground_truth)}
+            scores["classical"] = beside.submit(_score, baseline, sample.ground_truth)
+            say(f"fusion with the weights '{self.weights}'")
+            frame = fuse_with_progress(self.weights, sample.rig, sample.images, alpha=ALPHA)
+            scores["fusion"] = beside.submit(_score, frame.image, sample.ground_truth)
+            drawn = beside.submit(save_demo_figure, sample, baseline, frame, self.out / "demo.png")
+            written = save_frame(frame, self.out)
+            drawn.result()
+            rows = {name: found.result() for name, found in scores.items()}
+        lines = [f"{name:12s} {psnr:6.2f} dB  {ssim:.4f}" for name, (psnr, ssim) in rows.items()]
         table = "\n".join(["                 PSNR    SSIM", *lines, ""])
         print(table, end="")
         write_text(self.out / "demo.md", f"```\n{table}```\n")
@@ -435,6 +444,12 @@ class WarmUp:
         folder = cache_folder(forward)
         kept = "" if folder is None else f", kept in {folder}"
         say(f"kernels are ready: {time.monotonic() - begin:.0f} s{kept}")
+
+
+def _score(image: Tensor, ground_truth: Tensor) -> Score:
+    from ..evaluation.metrics import score
+
+    return score(image.clamp(0, 1), ground_truth)
 
 
 def is_rig_file(path: Path) -> bool:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import base64
 import html
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,10 +17,12 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
+from arraygeom.threads import in_parallel
 from arraygeom.viz import COLOURS, frustum, frustum_size
 
 from ..media.colour import to_bytes
 from ..media.figures import colour_depth, reduced
+from ..support.memory import how_many_fit
 from .results import Frame
 
 LONGEST = 1600
@@ -64,17 +67,19 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
     if facts.classical is not None:
         shown["classical"] = _shown(facts.classical)
     shown["fused"] = _shown(frame.image)
-    overlays = {"confidence": _confidence_layer(frame.confidence)}
+    overlays = {"confidence": lambda: _confidence_layer(frame.confidence)}
     known = frame.depth[frame.depth.isfinite()]
     if len(known):
-        overlays["depth"] = _data_url(reduced(colour_depth(frame.depth), LONGEST))
+        overlays["depth"] = lambda: _data_url(reduced(colour_depth(frame.depth), LONGEST))
+    layers = {name: partial(lambda image: _data_url(reduced(_shown(image), LONGEST)), x) for name, x in shown.items()}
+    urls = _all_of({**layers, **overlays})
     h, w = frame.depth.shape
     parts = {
         "TITLE": html.escape(f"{' + '.join(name for name in rig.names if name in images)}, fused"),
         "RATIO": f"{w} / {h}",
-        "LAYERS": "\n".join(_layer(name, _data_url(reduced(_shown(image), LONGEST))) for name, image in shown.items()),
+        "LAYERS": "\n".join(_layer(name, urls[name]) for name in layers),
         "OVERLAYS": "\n".join(
-            f'<img class="overlay" id="{name}" alt="{name}" src="{url}" hidden>' for name, url in overlays.items()
+            f'<img class="overlay" id="{name}" alt="{name}" src="{urls[name]}" hidden>' for name in overlays
         ),
         "SWITCHES": "\n".join(_switch(name) for name in overlays),
         "FACTS": "\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
@@ -87,6 +92,17 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
     for name, text in parts.items():
         page = page.replace(f"{{{{{name}}}}}", text)
     return page
+
+
+def _all_of(texts: Mapping[str, Callable[[], str]]) -> dict[str, str]:
+    """Texts by name, made on several threads."""
+    made = {}
+
+    def make(name: str) -> None:
+        made[name] = texts[name]()
+
+    in_parallel([partial(make, name) for name in texts], most=how_many_fit(100 * LONGEST**2))
+    return made
 
 
 def rig_drawing(rig: Rig, alpha: str) -> str:

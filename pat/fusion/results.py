@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -15,12 +17,14 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_together
+from arraygeom.threads import in_parallel
 
 from ..media.colour import linear_from_srgb
 from ..media.figures import colour_depth
 from ..media.images import write_image
 from ..media.points import write_points
 from ..media.raw import developed
+from ..support.memory import how_many_fit
 
 MOST = 65535
 """The largest count of 16 bits."""
@@ -57,12 +61,14 @@ def save_frame(
     depths = {f"{prefix}depth{part}" for part in (".tif", ".png", "_16.png")}
     stale = depths | (set() if name else {"points.ply", "index.html"})
     with write_together(out, last=last, stale=stale) as folder:
-        write_image(folder / f"{prefix}confidence.png", frame.confidence[None])
+        tasks: list[Callable[[], object]] = [
+            partial(write_image, folder / f"{prefix}confidence.png", frame.confidence[None])
+        ]
         if frame.depth.isfinite().any():
-            write_image(folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True)
+            tasks.append(partial(write_image, folder / f"{prefix}depth.tif", frame.depth[None], bits=32, unknown=True))
             near = view.depth[0] if view is not None and view.depth else None
-            write_depth(folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near))
-            write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth))
+            tasks.append(partial(write_depth, folder / f"{prefix}depth_16.png", frame.depth, near=near and float(near)))
+            tasks.append(lambda: write_image(folder / f"{prefix}depth.png", colour_depth(frame.depth)))
         if view is not None:
             view.save(folder / "view.yaml")
         if rig is not None:
@@ -74,7 +80,8 @@ def save_frame(
             for i, band in enumerate(image, 1):
                 write_image(folder / f"{prefix}fused_{i}.{kind}", band[None], bits=bits)
             image = image.mean(0, keepdim=True)
-        write_image(folder / last, image, bits=bits, profile=bits != 32)
+        tasks.insert(0, partial(write_image, folder / last, image, bits=bits, profile=bits != 32))
+        in_parallel(tasks, most=how_many_fit(4 * image.nbytes))
         names = {file.name for file in folder.iterdir()} - {last}
     return [out / last, *(out / file for file in sorted(names, key=lambda name: ("fused" not in name, name)))]
 

@@ -31,7 +31,7 @@ MAX_HALO = 224
 LIBRARIES = 0.46 * 2**30
 """What Python, torch and the compiled loops take, bytes (430 MiB were measured)."""
 SLACK = 1.05
-"""What a process may take over what is counted here: blocks too small to be returned at once leave gaps."""
+"""What a process may take over what is counted here: freed blocks smaller than a page cannot be returned."""
 MATCHING_BYTES = 330.0
 """Working memory of matching for each pixel of alpha, measured."""
 FRAME_BYTES = 20.0

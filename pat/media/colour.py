@@ -18,7 +18,8 @@ def luminance(
     rgb: Float[Tensor, "*b 3 h w"], weights: tuple[float, float, float] = REC601
 ) -> Float[Tensor, "*b 1 h w"]:
     """Rec. 601 luma of sRGB values, 0.299 R + 0.587 G + 0.114 B, as MATLAB's rgb2gray and OpenCV; or other weights."""
-    return (rgb * rgb.new_tensor(weights)[:, None, None]).sum(-3, keepdim=True)
+    red, green, blue = (weight * plane for weight, plane in zip(weights, rgb.split(1, -3)))
+    return red + green + blue
 
 
 def to_luma_chroma(rgb: Float[Tensor, "*b 3 h w"]) -> tuple[Float[Tensor, "*b 1 h w"], Float[Tensor, "*b 2 h w"]]:

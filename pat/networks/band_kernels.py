@@ -7,8 +7,12 @@ thread, without Python's lock.
 from __future__ import annotations
 
 import numpy as np
+from llvmlite import ir
+from numba import types
 
-from pat.attention.kernels import compiled, separate_cache
+from pat.attention.kernels.emit import LANES, Vector, compiled, instruction, separate_cache
+from pat.attention.kernels.layout import pointers
+from pat.attention.kernels.vectors import add, from_index, load, splat, store
 
 from .semi_global_kernels import (
     FARTHEST,
@@ -20,130 +24,161 @@ from .semi_global_kernels import (
     UNSEEN,
     _between,
     _jump,
-    _pixel,
     dissimilarity,
 )
 
 RUN = 5
 """Labels in a run."""
-LABELS = 2 * RUN
+HIGH = 8
+"""Lane of the second run's first label, of the `LANES` that a pixel's costs are in; those that stand for no label are
+computed, but never the least."""
+
+NOTHING = np.int64(2**63 - 1)
+"""More than any cost and label together."""
 
 
 @compiled(inline="always")
-def _label(low, high, k):
-    return low + k if k < RUN else high + k - RUN
+def _label(low, high, lane):
+    return low + lane if lane < HIGH else high + lane - HIGH
+
+
+@compiled(inline="always")
+def _positions(end, along, low, high, last, rows, columns, out):
+    """Where the lanes' labels are in beta, pixels counted row by row; rows * columns for those that are not on it or
+    beyond the last."""
+    for lane in range(LANES):
+        label = np.float32(low + lane if lane < HIGH else high + lane - HIGH)
+        column = np.int32(np.floor(end[0] + label * along[0] + HALF))
+        row = np.int32(np.floor(end[1] + label * along[1] + HALF))
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows) & (label <= last)
+        out[lane] = np.int32(row * columns + column) if inside else np.int32(rows * columns)
 
 
 @compiled(nogil=True, cache=True)
 def band_costs(own, own_bits, other, other_bits, end, along, length, cut, low, high, out):
-    """Dissimilarity of alpha's pixel (own) and beta's (other) at each label of the runs: out (h, w, LABELS)."""
+    """Dissimilarity of alpha's pixel (own) and beta's (other) at each label of the runs: out (h, w, LANES)."""
     height, width = own.shape
     rows, columns = other.shape
+    values, bits, at = other.ravel(), other_bits.ravel(), np.empty(LANES, np.int32)
+    nowhere = rows * columns
     for y in range(height):
         for x in range(width):
-            last = length[y, x] + HALF
+            last, found = length[y, x] + HALF, out[y, x]
+            _positions(end[y, x], along[y, x], low[y, x], high[y, x], last, rows, columns, at)
             beyond = UNSEEN if cut[y, x] else NOWHERE
-            for k in range(LABELS):
-                label = _label(low[y, x], high[y, x], k)
-                column, row = _pixel(end[y, x], along[y, x], label)
-                if label > last:
-                    out[y, x, k] = beyond
-                elif column < 0 or row < 0 or column >= columns or row >= rows:
-                    out[y, x, k] = NOWHERE
-                else:
-                    place = row, column
-                    out[y, x, k] = dissimilarity(own[y, x], own_bits[y, x], other[place], other_bits[place])
+            for lane in range(LANES):
+                if lane % HIGH < RUN:
+                    place = at[lane]
+                    if place < nowhere:
+                        cost = dissimilarity(own[y, x], own_bits[y, x], values[place], bits[place])
+                    else:
+                        cost = beyond if _label(low[y, x], high[y, x], lane) > last else NOWHERE
+                    found[lane] = cost
 
 
-@compiled(inline="always")
-def _aligned(before, origin_low, origin_high, first, out):
-    """The neighbour's path costs at labels first - 1 to first + RUN, `MOST` where it has no such label."""
-    for i in range(RUN + 2):
-        label = first - 1 + i
-        out[i] = MOST
-        if origin_low <= label < origin_low + RUN:
-            out[i] = before[label - origin_low]
-        elif origin_high <= label < origin_high + RUN:
-            out[i] = before[RUN + label - origin_high]
+@instruction(lambda cost, i: Vector(types.float32))
+def _costs_at(code, cost, i: index):
+    """The costs of all lanes of a pixel."""
+    return code.uitofp(code.get(code.kinds[0], cost, i), ir.VectorType(ir.FloatType(), LANES))
 
 
-@compiled(inline="always")
-def _advance(before, there, least, cost, here, total, now, jump, at):
-    """One step of a path, between pixels whose runs begin at `there` and `here`: its costs `now`, added to `total`; the
-    least."""
-    fewest = MOST
+@instruction(lambda path, *_: path)
+def _one_step(code, path, least, jump, cost):
+    """The costs of a path at the next pixel, whose runs are the same; those of lanes without a label mean nothing."""
+
+    def less(a, b):
+        return code.select(code.fcmp_ordered("<", a, b), a, b)
+
+    before, after = (code.shuffle(path, None, [(k + i) % LANES for k in range(LANES)]) for i in (-1, 1))
+    step = code.fadd(less(before, after), ir.Constant(path.type, [float(SMALL)] * LANES))
+    stay = less(path, code.repeat(code.fadd(least, jump)))
+    return code.fsub(code.fadd(cost, less(step, stay)), code.repeat(least))
+
+
+@instruction(lambda path, beside: path)
+def _walled(code, path, beside):
+    """The path with `MOST` in lanes without a label; but if the second run is `beside` the first, each goes on into the
+    other."""
+    most = ir.Constant(path.type, [float(MOST)] * LANES)
+    wall, runs = LANES, [k if k % HIGH < RUN else LANES for k in range(LANES)]
+    apart = code.shuffle(path, most, runs)
+    joined = code.shuffle(path, most, [*runs[:RUN], HIGH, wall, RUN - 1, *runs[HIGH:]])
+    return code.select(beside, joined, apart)
+
+
+@instruction(lambda path: path.scalar)
+def _least(code, path):
+    """The least of a path's costs."""
+    return code.intrinsic("llvm.vector.reduce.fmin.%", path.type.element, [path], fastmath=["nnan"])
+
+
+@instruction(lambda *_: Vector(types.float32))
+def _aligned(code, path, there, here):
+    """The neighbour's path, whose runs begin at `there`, at the labels of the runs that begin at `here`, and at those
+    beside them; `MOST` where it has no such label. All are pointers; memory `LANES` around the path can be read."""
+    count = ir.IntType(32)
+    lanes, most = (
+        ir.VectorType(count, HIGH)([*range(-1, HIGH - 1)]),
+        ir.VectorType(ir.FloatType(), HIGH)([float(MOST)] * HIGH),
+    )
+    first, second = (code.load(code.gep(there, [count(run)])) for run in range(2))
+    runs = []
     for run in range(2):
-        _aligned(before, there[0], there[1], here[run], at)
-        for i in range(RUN):
-            k = run * RUN + i
-            step = min(at[i], at[i + 2]) + SMALL
-            stay = min(at[i + 1], least + jump)
-            now[k] = np.float32(cost[k]) + min(step, stay) - least
-            total[k] += now[k]
-            fewest = min(fewest, now[k])
-    return fewest
+        begin, found = code.load(code.gep(here, [count(run)])), most
+        for start, of_run in ((first, 0), (second, HIGH)):
+            step = code.sub(begin, start)
+            step = code.select(code.icmp_signed("<", step, count(-RUN - 1)), count(-RUN - 1), step)
+            step = code.select(code.icmp_signed(">", step, count(RUN + 1)), count(RUN + 1), step)
+            stored = code.get(types.CPointer(types.float32), path, code.offset(step, of_run - 1), HIGH)
+            within = code.icmp_unsigned("<", code.add(lanes, code.repeat(step, HIGH)), lanes.type([RUN] * HIGH))
+            found = code.select(within, stored, found)
+        runs.append(found)
+    return code.shuffle(*runs, [*range(1, 2 * HIGH), 0])
 
 
-@compiled(nogil=True, cache=True, fastmath=True)
+@compiled(nogil=True, cache=True)
 def band_aggregate(cost, guide, low, high, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008), added to total (h, w, LABELS)."""
-    for dx in range(-1, 2):
-        for way in range(2):
-            _sweep(cost, guide, low, high, total, dx, way)
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008): total (h, w, LANES)."""
+    width = cost.shape[1]
+    runs, paths = np.stack((low, high), -1), np.empty((6 * width + 3) * LANES, np.float32)
+    fewest = np.empty(6 * width + 1, np.float32)
     for way in range(2):
-        _sweep_rows(cost, guide, low, high, total, way)
+        _sweep(way, guide, runs, cost.reshape(-1), total.reshape(-1), paths, fewest)
 
 
-@compiled(inline="always")
-def _sweep_rows(cost, guide, low, high, total, way):
-    """Paths along rows."""
-    height, width, _ = cost.shape
-    before, now = np.zeros((2, LABELS), np.float32)
-    at = np.empty(RUN + 2, np.float32)
-    first, step = (0, 1) if way == 0 else (width - 1, -1)
-    for y in range(height):
-        least = np.float32(0)
+@compiled
+def _sweep(way, guide, runs, cost, total, paths, fewest):
+    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the row, and
+    from three of the row before. With `way` 1 rows and columns are taken from the last."""
+    height, width = guide.shape
+    cost, total, runs, paths, fewest = pointers((cost, total, runs.reshape(-1), paths[LANES:], fewest))
+    none, step = np.float32(0), 1 - 2 * way
+    for row in range(height):
+        y = row if way == 0 else height - 1 - row
         for i in range(width):
-            x = first + i * step
-            if i == 0:
-                for k in range(LABELS):
-                    now[k] = cost[y, x, k]
-                    total[y, x, k] += now[k]
-                least = now.min()
-            else:
-                jump = _jump(guide[y, x], guide[y, x - step])
-                there = low[y, x - step], high[y, x - step]
-                here = low[y, x], high[y, x]
-                least = _advance(before, there, least, cost[y, x], here, total[y, x], now, jump, at)
-            before, now = now, before
-
-
-@compiled(inline="always")
-def _sweep(cost, guide, low, high, total, dx, way):
-    """Paths from row to row, that move by `dx` columns on the way."""
-    height, width, _ = cost.shape
-    before, now = np.zeros((2, width, LABELS), np.float32)
-    fewest, fewer = np.zeros((2, width), np.float32)
-    at = np.empty(RUN + 2, np.float32)
-    first, step = (0, 1) if way == 0 else (height - 1, -1)
-    for i in range(height):
-        y = first + i * step
-        for x in range(width):
-            origin = x - dx
-            if i == 0 or origin < 0 or origin >= width:
-                for k in range(LABELS):
-                    now[x, k] = cost[y, x, k]
-                    total[y, x, k] += now[x, k]
-                fewer[x] = now[x].min()
-            else:
-                jump = _jump(guide[y, x], guide[y - step, origin])
-                there = low[y - step, origin], high[y - step, origin]
-                here = low[y, x], high[y, x]
-                fewer[x] = _advance(
-                    before[origin], there, fewest[origin], cost[y, x], here, total[y, x], now[x], jump, at
-                )
-        before, now = now, before
-        fewest, fewer = fewer, fewest
+            x = i if way == 0 else width - 1 - i
+            p = y * width + x
+            here, costs = from_index(runs, 2 * p), _costs_at(cost, p * LANES)
+            beside = here[1] - here[0] == RUN
+            sums = splat(none)
+            for k in range(4):
+                # Three paths come from the row before and are kept by columns, the fourth from the pixel before.
+                dx = k - 1 if k < 3 else -step
+                dy = step if k < 3 else 0
+                now = (row % 2 * 3 + k) * width + x if k < 3 else 6 * width
+                if (k < 3 and row == 0) or not 0 <= x + dx < width:
+                    path = _walled(costs, beside)
+                else:
+                    before = ((row + 1) % 2 * 3 + k) * width + x + dx if k < 3 else now
+                    there, path = from_index(runs, 2 * (p - dy * width + dx)), load(paths, before * LANES)
+                    if there[0] != here[0] or there[1] != here[1]:
+                        path = _aligned(from_index(paths, before * LANES), there, here)
+                    jump = _jump(guide[y, x], guide[y - dy, x + dx])
+                    path = _walled(_one_step(path, fewest[before], jump, costs), beside)
+                store(paths, now * LANES, path)
+                fewest[now] = _least(path)
+                sums = add(sums, path)
+            store(total, p * LANES, sums if way == 0 else add(load(total, p * LANES), sums))
 
 
 @compiled(nogil=True, cache=True)
@@ -151,30 +186,27 @@ def band_winners(total, low, high, end, along, length, rows, columns, disparity,
     """Each pixel's best label, to a fraction (disparity), and its distance from the best label of all alpha pixels that
     match the same pixel of beta (unlike, 0 to 1)."""
     height, width, _ = total.shape
-    lowest = np.full((rows, columns), MOST, np.float32)
-    claims = np.full((rows, columns), np.int32(-100000), np.int32)
+    costs, nowhere = total.view(np.int32), rows * columns  # the order of positive floats is that of their bits
+    claims = np.full(nowhere + 1, NOTHING)
+    matched, at = np.empty((height, width), np.int32), np.empty(LANES, np.int32)
     for y in range(height):
         for x in range(width):
-            for k in range(LABELS):
-                label = _label(low[y, x], high[y, x], k)
-                if label <= length[y, x] + HALF:
-                    column, row = _pixel(end[y, x], along[y, x], label)
-                    if 0 <= row < rows and 0 <= column < columns and total[y, x, k] < lowest[row, column]:
-                        lowest[row, column], claims[row, column] = total[y, x, k], label
+            sums, least = costs[y, x], NOTHING
+            _positions(end[y, x], along[y, x], low[y, x], high[y, x], length[y, x] + HALF, rows, columns, at)
+            for lane in range(LANES):
+                if lane % HIGH < RUN:
+                    label, cost = np.int64(_label(low[y, x], high[y, x], lane)), np.int64(sums[lane]) << 32
+                    claims[at[lane]] = min(claims[at[lane]], cost | label)
+                    least = min(least, cost | np.int64(lane))
+            best = least & 15
+            run = 0 if best < RUN else HIGH
+            label = np.float32(_label(low[y, x], high[y, x], best))
+            disparity[y, x] = label + _between(total[y, x, run : run + RUN], best - run, RUN - 1)
+            matched[y, x], unlike[y, x] = at[best], label
     for y in range(height):
         for x in range(width):
-            best = 0
-            for k in range(1, LABELS):
-                if total[y, x, k] < total[y, x, best]:
-                    best = k
-            label = _label(low[y, x], high[y, x], best)
-            run = 0 if best < RUN else RUN
-            fraction = _between(total[y, x, run : run + RUN], best - run, RUN - 1)
-            disparity[y, x] = np.float32(label) + fraction
-            column, row = _pixel(end[y, x], along[y, x], label)
-            unlike[y, x] = ONE
-            if label <= length[y, x] + HALF and 0 <= row < rows and 0 <= column < columns:
-                unlike[y, x] = min(np.float32(abs(claims[row, column] - label)) / FARTHEST, ONE)
+            away = abs(np.float32(claims[matched[y, x]] & 0xFFFFFFFF) - unlike[y, x])
+            unlike[y, x] = min(away / FARTHEST, ONE) if matched[y, x] < nowhere else ONE
 
 
 for _entry in (band_costs, band_aggregate, band_winners):

@@ -165,9 +165,9 @@ def _block(views: tuple, box: tuple, found: NDArray, unlike: NDArray) -> None:
     inner, outer = box
     planes = (own, own_bits, end, along, length, cut, low, high)
     a, a_bits, e, u, n, c, lo, hi = (np.ascontiguousarray(x[outer]) for x in planes)
-    cost = np.empty((*a.shape, kernels.LABELS), np.uint8)
+    cost = np.empty((*a.shape, kernels.LANES), np.uint8)
     kernels.band_costs(a, a_bits, other, other_bits, e, u, n, c, lo, hi, cost)
-    total = np.zeros(cost.shape, np.float32)
+    total = np.empty(cost.shape, np.float32)
     kernels.band_aggregate(cost, a, lo, hi, total)
     d, f = np.empty(a.shape, np.float32), np.empty(a.shape, np.float32)
     kernels.band_winners(total, lo, hi, e, u, n, *other.shape, d, f)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -36,7 +36,8 @@ BLOCK = 320
 """Sides of what is processed at a time, in pixels of the reduced images."""
 LONG_BLOCK = 640
 """The longer side of the blocks of large images, along the segments."""
-LEAST_MARGIN, MOST_MARGIN = 64, 192
+MARGIN = 64
+"""What is matched around a block."""
 PIXEL_BYTES, LABEL_BYTES = 128, 3
 """What a block takes for each pixel, and for each label of each pixel: cost, and sum of costs."""
 MOST_COSTS = 2**25
@@ -183,16 +184,23 @@ def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[
     bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
     in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
     tasks, nbytes = [], 1.0
+    label, place = np.empty((2, *own.shape), np.int32)
+    claims: list[list[NDArray[np.int32]]] = [[] for _ in own]
     for i, (a, b) in enumerate(zip(own, other)):
         views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
-        margin = min(labels + 32, MOST_MARGIN)
-        small = a.shape[0] * (BLOCK + 2 * margin) * labels <= MOST_COSTS
-        large = _large_blocks(a.shape, geometry.along[i], labels)
-        boxes = list(inner_and_outer(a.shape, margin, a.shape[0]) if small else large)
-        tasks += [partial(_block, views, box, labels, disparity[i], facts[i]) for box in boxes]
+        small = a.shape[0] * (BLOCK + 2 * MARGIN) * labels <= MOST_COSTS
+        across = np.abs(geometry.along[i]).max((0, 1))
+        large = (BLOCK, LONG_BLOCK) if across[0] > across[1] else (LONG_BLOCK, BLOCK)
+        boxes = list(inner_and_outer(a.shape, MARGIN, *((a.shape[0], BLOCK) if small else large)))
+        found = disparity[i], facts[i], label[i], place[i]
+        tasks += [partial(_block, views, box, labels, claims[i], found) for box in boxes]
         largest = max(_pixels_in(outer, a.shape) for _, outer in boxes)
         nbytes = max(nbytes, largest * (PIXEL_BYTES + LABEL_BYTES * labels))
     in_parallel(tasks, most=how_many_fit(nbytes))
+    for unlike, tables, own_label, its in zip(facts[..., 0], claims, label, place):
+        claimed = np.minimum.reduce(tables)[its] & 0xFFFF
+        apart = np.abs(claimed - own_label) / kernels.FARTHEST
+        np.minimum(apart, 1, out=unlike, where=its < other[0].size)
     return disparity, facts
 
 
@@ -200,45 +208,37 @@ def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
     return math.prod(min(s.stop, n) - s.start for s, n in zip(box, hw))
 
 
-def _large_blocks(hw: tuple[int, ...], along: NDArray, labels: int) -> Iterator[Any]:
-    """Blocks of an image that is too large to be as high as one, with the margins that matching back asks for: as long
-    as segments are in x and in y."""
-    x, y = (min(int(labels * np.abs(along[..., i]).max()) + LEAST_MARGIN, MOST_MARGIN) for i in range(2))
-    return inner_and_outer(hw, (y, x), *((BLOCK, LONG_BLOCK) if x > y else (LONG_BLOCK, BLOCK)))
-
-
 def inner_and_outer(
-    hw: tuple[int, ...], margin: int | tuple[int, int], rows: int | None = None, columns: int | None = None
+    hw: tuple[int, ...], margin: int, rows: int = BLOCK, columns: int = BLOCK
 ) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
-    """Inner and outer blocks of so many rows and columns (by default squares): the result, and what is computed for it.
-
-    `margin` is in y and in x.
-    """
-    rows, columns = rows or BLOCK, columns or BLOCK
-    down, across = (margin, margin) if isinstance(margin, int) else margin
+    """Inner and outer blocks of so many rows and columns: the result, and what is computed for it."""
     for top in range(0, hw[0], rows):
         for left in range(0, hw[1], columns):
             inner = slice(top, min(top + rows, hw[0])), slice(left, min(left + columns, hw[1]))
-            outer = (
-                slice(max(top - down, 0), top + rows + down),
-                slice(max(left - across, 0), left + columns + across),
-            )
-            yield inner, outer
+            yield inner, tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in inner)
 
 
-def _block(views: tuple, box: tuple, labels: int, disparity: NDArray, facts: NDArray) -> None:
+def _block(views: tuple, box: tuple, labels: int, claims: list[NDArray[np.int32]], found: Sequence[NDArray]) -> None:
+    """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is of one
+    thread at a time; what all claim is the least of them."""
     own, own_bits, other, other_bits, end, along, length, cut = views
     inner, outer = box
     planes = (own, own_bits, end, along, length, cut)
-    a, a_bits, e, u, n, o = (np.ascontiguousarray(x[outer]) for x in planes)
+    a, a_bits, e, u, n, c = (np.ascontiguousarray(x[outer]) for x in planes)
     cost = np.empty((*a.shape, labels), np.uint8)
-    kernels.costs(a, a_bits, other, other_bits, e, u, n, o, cost)
+    kernels.costs(a, a_bits, other, other_bits, e, u, n, c, cost)
     total = np.empty(cost.shape, np.int16)
     kernels.aggregate(cost, a, total)
-    r, f = np.empty(a.shape, np.float32), np.empty((*a.shape, 3), np.float32)
-    kernels.winners(total, e, u, n, o, *other.shape, r, f)
-    inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
-    disparity[inner], facts[inner] = r[inside], f[inside]
+    try:
+        table = claims.pop()
+    except IndexError:
+        table = np.full(other.size + 1, 2**31 - 1, np.int32)
+    parts = [np.ascontiguousarray(plane[inner]) for plane in found]
+    corner = (i.start - o.start for i, o in zip(inner, outer))
+    kernels.winners(total, e, u, n, c, *other.shape, *corner, table, *parts)
+    claims.append(table)
+    for plane, part in zip(found, parts):
+        plane[inner] = part
 
 
 def _normalised(image: Tensor, level: Tensor) -> Tensor:
@@ -302,7 +302,12 @@ def length_of(segments: Segments) -> Float[Tensor, "*n"]:
 def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
     """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is known."""
     length = length_of(segments) if length is None else length
-    return (segments.start - segments.end) / torch.where(length > 0, length, 1.0)[..., None]
+    step, divisor = segments.start - segments.end, torch.where(length > 0, length, 1.0)
+    if step.requires_grad or not compilable(step):
+        return step / divisor[..., None]
+    for part in step.unbind(-1):
+        part.div_(divisor)
+    return step
 
 
 def reduced(segments: Segments, factor: int) -> Segments:

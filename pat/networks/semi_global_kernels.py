@@ -203,22 +203,30 @@ def _add(total, a, b, c, d, first):
 
 
 @compiled(nogil=True, cache=True)
-def winners(total, end, along, length, cut, rows, columns, disparity, facts):
-    """Each pixel's best label, to a fraction (disparity); and facts (h, w, 3): its distance from the best label of all
-    alpha pixels that match the same pixel of beta, its margin to the second best, and its cost. `total` is in parts."""
-    claims = _claims(total, end, along, length, rows, columns)
-    height, width, labels = total.shape
+def winners(total, end, along, length, cut, rows, columns, top, left, claims, disparity, facts, labels, positions):
+    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity) and whole
+    (labels); where it is in beta, pixels counted row by row (positions; rows * columns: not on it); its margin to the
+    second best, and its cost (the last of facts (h, w, 3)). `total` is in parts.
+
+    `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it, and that
+    pixel's label: 16 bits of either.
+    """
+    height, width, _ = facts.shape
+    nowhere, most = rows * columns, total.shape[2]
+    at = np.empty(most, np.int32)
     for y in range(height):
         for x in range(width):
-            last = labels - 1 if cut[y, x] else min(labels - 1, int(length[y, x] + HALF))
-            best, second = _two_best(total[y, x], last)
-            lowest = total[y, x, best]
-            disparity[y, x] = np.float32(best) + _between(total[y, x], best, last)
-            column, row = _pixel(end[y, x], along[y, x], best)
-            facts[y, x, 0] = ONE
-            if best <= length[y, x] + HALF and 0 <= row < rows and 0 <= column < columns:
-                claimed = claims[row * columns + column]
-                facts[y, x, 0] = min(np.float32(abs(claimed - best)) / FARTHEST, ONE)
+            here = y + top, x + left
+            sums, count = total[here], _count_within(length[here], most)
+            _places(end[here], along[here], count, rows, columns, at)
+            for label in range(count):
+                place = at[label] if at[label] >= 0 else nowhere
+                claims[place] = min(claims[place], np.int32(sums[label]) << 16 | np.int32(label))
+            last = most - 1 if cut[here] else min(most - 1, int(length[here] + HALF))
+            best, second = _two_best(sums, last)
+            lowest = sums[best]
+            disparity[y, x] = np.float32(best) + _between(sums, best, last)
+            labels[y, x], positions[y, x] = best, at[best] if best < count and at[best] >= 0 else nowhere
             facts[y, x, 1] = min(np.float32(second - lowest) / (8 * PARTS * LARGE), ONE)
             facts[y, x, 2] = np.float32(lowest) / (8 * PARTS * LARGE)
 
@@ -237,24 +245,6 @@ def regression(brightness, totals, products, band, floor, out):
             slope = (product[y, x] * share - middle * mean) / (variance + floor)
             beyond = min(max(brightness[y, x] - mean, -MOST_BEYOND), MOST_BEYOND)
             out[0, band, y, x], out[1, band, y, x] = middle + slope * beyond, middle
-
-
-@compiled(inline="always")
-def _claims(total, end, along, length, rows, columns):
-    """For each pixel of beta, row by row, the label of the alpha pixel that matches it at the least cost."""
-    height, width, labels = total.shape
-    lowest = np.full(rows * columns, WALL, np.int16)
-    claims = np.full(rows * columns, -labels, np.int32)
-    places = np.empty(labels, np.int32)
-    for y in range(height):
-        for x in range(width):
-            count, sums = _count_within(length[y, x], labels), total[y, x]
-            _places(end[y, x], along[y, x], count, rows, columns, places)
-            for label in range(count):
-                at = places[label]
-                if at >= 0 and sums[label] < lowest[at]:
-                    lowest[at], claims[at] = sums[label], label
-    return claims
 
 
 @compiled(inline="always")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import re
 import sys
 import time
@@ -10,14 +11,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 
-M_TRIM_THRESHOLD, M_MMAP_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -3, -4, -8
+M_TRIM_THRESHOLD, M_MMAP_MAX, M_ARENA_MAX = -1, -4, -8
 """Options of glibc's mallopt (malloc.h)."""
-LARGE, SHARE = 2**22, 1 / 256
-"""A block is returned to the system when it is freed if it has this many bytes and this share of the limit."""
-LARGEST = 2**25
-"""What glibc takes at most for M_MMAP_THRESHOLD."""
+NEAR = 0.94
+"""The part of a limit from which freed memory is returned to the system."""
+EVERY = 0.005
+"""Seconds between looks at how much the process has, under a limit."""
 
 
 def parse_bytes(amount: float | str) -> float:
@@ -36,23 +37,10 @@ def parse_bytes(amount: float | str) -> float:
 def keep_freed() -> None:
     """Keep freed memory for later use: glibc returns large blocks at once, and an eighth of the time of fusing a frame
     goes into getting them again. Of the whole process: for commands and workers, which are ours."""
-    global _KEEPS
-    _KEEPS = _keeping(keep=True)
-
-
-_KEEPS = False
-"""Whether `keep_freed` was called."""
-
-
-def _keeping(*, keep: bool, large: float = LARGE) -> bool:
-    """Set glibc's options so that large freed blocks are kept or returned; whether it has such options."""
     options = getattr(ctypes.CDLL(None), "mallopt", None) if sys.platform == "linux" else None
     if options is not None:
-        kept = (M_MMAP_MAX, 0), (M_ARENA_MAX, 1)
-        returned = (M_MMAP_MAX, 2**16), (M_MMAP_THRESHOLD, int(min(large, LARGEST)))
-        for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), *(kept if keep else returned)):
+        for option, value in ((M_TRIM_THRESHOLD, 2**31 - 1), (M_MMAP_MAX, 0), (M_ARENA_MAX, 1)):
             options(option, value)
-    return options is not None
 
 
 def give_back() -> None:
@@ -70,23 +58,32 @@ _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
 
 @contextmanager
 def limited(limit: float | None) -> Iterator[None]:
-    """Within this, `how_many_fit` knows how many bytes the process may take in all, and large freed blocks are
-    returned to the system at once; None: no limit."""
-    token = _LIMIT.set(limit)
-    _adapt()
+    """Within this, `how_many_fit` knows how many bytes the process may take in all, and freed memory is returned to the
+    system when the process comes near that; None: no limit."""
+    token, done = _LIMIT.set(limit), Event()
+    if limit is not None:
+        Thread(target=_return_near, args=(NEAR * limit, done), daemon=True).start()
     try:
         yield
     finally:
+        done.set()
         _LIMIT.reset(token)
-        _adapt()
 
 
-def _adapt() -> None:
-    """Keep freed memory, if `keep_freed` was called, where there is no limit."""
-    limit = _LIMIT.get()
-    if _KEEPS:
-        _keeping(keep=limit is None, large=max(LARGE, SHARE * (limit or 0)))
-        give_back()
+def _return_near(most: float, done: Event) -> None:
+    """Return freed memory whenever the process has more than `most` bytes; less often while that does not help."""
+    near = False
+    while not done.wait(5 * EVERY if near else EVERY):
+        near = resident() > most
+        if near:
+            give_back()
+            near = resident() > most
+
+
+def resident() -> float:
+    """Resident bytes of this process; 0 where the system does not say (Linux does)."""
+    pages = _text(Path("/proc/self/statm")).split()[1:2]
+    return float(pages[0]) * os.sysconf("SC_PAGE_SIZE") if pages else 0.0
 
 
 def how_many_fit(nbytes: float) -> int | None:
@@ -95,8 +92,7 @@ def how_many_fit(nbytes: float) -> int | None:
     if limit is None:
         return None
     give_back()
-    resident = re.search(r"VmRSS:\s+(\d+) kB", _text(Path("/proc/self/status")))
-    return max(int((ROOM * limit - float(resident[1]) * 2**10) // nbytes), 1) if resident else 1
+    return max(int((ROOM * limit - resident()) // nbytes), 1)
 
 
 def watch_peak(pid: int, *, every: float = 0.2) -> Callable[[], float]:

@@ -17,7 +17,6 @@ import numpy as np
 import yaml
 from jaxtyping import Float
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from arraygeom.atomic import write_text
 
@@ -144,6 +143,8 @@ class Motion:
     def at(self, time: float) -> ObjectPose:
         """Where the object is at a time in seconds."""
         a, b, fraction = self._between(time)
+        from scipy.spatial.transform import Rotation  # here, as it takes .2 s to import
+
         start = Rotation.from_rotvec(a.rotation)
         rotation = (Rotation.from_rotvec(b.rotation) * start.inv()).as_rotvec()
         R = (Rotation.from_rotvec(fraction * rotation) * start).as_matrix()

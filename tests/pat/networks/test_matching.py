@@ -7,7 +7,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, pixel_grid
 from pat.networks import band_kernels, semi_global_kernels
-from pat.networks.band_kernels import LABELS, RUN
+from pat.networks.band_kernels import HIGH, LANES, RUN
 from pat.networks.matching import _runs, matched
 from pat.networks.semi_global import Normalisations, matched_at_half_size
 from tests.pat.networks.matched_scenes import beside, blurred
@@ -15,22 +15,33 @@ from tests.pat.networks.matched_scenes import beside, blurred
 H, W, NEAREST = 96, 160, 30
 FAR, NEAR = 6, 21
 BOX = (slice(21, 70), slice(53, 104))
+LABELS = [*range(RUN), *range(HIGH, HIGH + RUN)]
+"""Lanes that stand for labels."""
+
+
+def in_lanes(cost):
+    """Costs (h, w, labels) in their lanes, anything in the others."""
+    lanes = np.random.default_rng(2).integers(0, 256, (*cost.shape[:2], LANES), np.uint8)
+    lanes[..., LABELS] = cost
+    return lanes
 
 
 def test_with_all_labels_it_is_semi_global_matching():
     """Both runs beside each other are ten labels; those of every pixel begin elsewhere."""
     rng = np.random.default_rng(0)
     guide = rng.random((9, 11), np.float32)
-    cost = rng.integers(0, 60, (9, 11, LABELS), np.uint8)
+    cost = rng.integers(0, 60, (9, 11, 2 * RUN), np.uint8)
     low = np.full((9, 11), 3, np.int32)
-    whole, bands = np.empty(cost.shape, np.int16), np.zeros(cost.shape, np.float32)
+    whole, bands = np.empty(cost.shape, np.int16), np.empty((9, 11, LANES), np.float32)
     semi_global_kernels.aggregate(cost, guide, whole)
-    band_kernels.band_aggregate(cost, guide, low, low + RUN, bands)
-    np.testing.assert_allclose(bands, whole / semi_global_kernels.PARTS, atol=8 / semi_global_kernels.PARTS)
+    band_kernels.band_aggregate(in_lanes(cost), guide, low, low + RUN, bands)
+    np.testing.assert_allclose(
+        bands[..., LABELS], whole / semi_global_kernels.PARTS, atol=8 / semi_global_kernels.PARTS
+    )
 
 
 def aggregated(cost, guide, labels):
-    """One path along a row, written out: `labels` (w, LABELS) of each pixel."""
+    """One path along a row, written out: `labels` (w, 10) of each pixel."""
     total = cost.astype(float).copy()
     for order in (range(1, len(cost)), range(len(cost) - 2, -1, -1)):
         path = cost.astype(float).copy()
@@ -47,14 +58,14 @@ def aggregated(cost, guide, labels):
 def test_runs_of_neighbours_are_aligned_by_label():
     rng = np.random.default_rng(1)
     guide = rng.random((1, 12), np.float32)
-    cost = rng.integers(0, 60, (1, 12, LABELS), np.uint8)
+    cost = rng.integers(0, 60, (1, 12, 2 * RUN), np.uint8)
     low = rng.integers(0, 6, (1, 12), np.int32)
     high = low + RUN + rng.integers(0, 6, (1, 12), np.int32)
-    total = np.zeros(cost.shape, np.float32)
-    band_kernels.band_aggregate(cost, guide, low, high, total)
+    total = np.empty((1, 12, LANES), np.float32)
+    band_kernels.band_aggregate(in_lanes(cost), guide, low, high, total)
     run = np.arange(RUN)
     labels = np.concatenate([low[0][:, None] + run, high[0][:, None] + run], 1)
-    paths = total[0] - 6 * cost[0].astype(float)
+    paths = total[0][:, LABELS] - 6 * cost[0].astype(float)
     np.testing.assert_allclose(paths, aggregated(cost[0], guide[0], labels), rtol=1e-4, atol=1e-2)
 
 

@@ -169,10 +169,12 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
 def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
     running, most, lock = [], [], threading.Lock()
 
-    def block(views, box, labels, disparity, facts):
+    def block(views, box, labels, claims, found):
         with lock:
             running.append(box)
             most.append(len(running))
+        claims.append(np.zeros(1, np.int32))
+        found[3][:] = 0
         time.sleep(0.05)
         running.remove(box)
 
@@ -188,6 +190,22 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
         matched_at_half_size(alpha, beta, sampled_at(pair, 2), normalisation)
     assert max(most) in at_once
     assert len(most) == 4 * 6
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_blocks_know_what_others_claim(monkeypatch, threads):
+    """Blocks whose margins hold the whole image find what a single one does."""
+    pair = pair_of(0.1)
+    alpha, beta, _ = plane_seen(pair, 2.0)
+    given = alpha, beta, sampled_at(pair, 2), Normalisation.of(alpha, beta)
+    whole = matched_at_half_size(*given)
+    for name, value in {"BLOCK": 12, "LONG_BLOCK": 20, "MARGIN": 1000, "MOST_COSTS": 0}.items():
+        monkeypatch.setattr(pat.networks.semi_global, name, value)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    blocks = matched_at_half_size(*given)
+    assert (whole.facts[:, 0] > pat.networks.semi_global.CONSISTENT).any()
+    for one, other in zip(whole, blocks):
+        assert torch.equal(one, other)
 
 
 def test_a_batch_is_its_images_one_by_one():
@@ -266,6 +284,10 @@ def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut
     unlike = 48 + int(kernels.TRUNCATED)
     assert cost.ravel().tolist() == [unlike] * 3 + [beyond] * 2
     disparity, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 3), np.float32)
-    kernels.winners(kernels.PARTS * cost.astype(np.int16), ends, along, length, edge, 1, 9, disparity, facts)
+    claims, (label, place) = np.full(10, 2**31 - 1, np.int32), np.empty((2, 1, 1), np.int32)
+    total, at = kernels.PARTS * cost.astype(np.int16), (1, 9, 0, 0)
+    kernels.winners(total, ends, along, length, edge, *at, claims, disparity, facts, label, place)
     assert (disparity[0, 0] > 2) == (cut == 1)
-    assert (facts[0, 0, 0] == 1) == (cut == 1)
+    assert (place[0, 0] == 9) == (cut == 1)
+    assert claims[[0, 1, 2]].tolist() == [(unlike * kernels.PARTS << 16) + label for label in (2, 1, 0)]
+    assert (claims[3:] == 2**31 - 1).all()

@@ -1,0 +1,26 @@
+"""Panels of images side by side."""
+
+import pytest
+import torch
+
+from pat.media.figures import GAP, TITLE, draw_panels
+
+
+@pytest.mark.parametrize("factor", [0.5, 4.0], ids=["reduced", "enlarged"])
+def test_panels_keep_their_shape_and_stand_row_by_row(factor):
+    wide = round(110 * 4.0) // 2 - GAP
+    h, w = round(wide / factor) // 2, round(wide / factor)
+    (red, green), grey = torch.zeros(2, 3, h, w), torch.full((1, h, h), 0.5)
+    red[0], green[1] = 1, 1
+    drawn = draw_panels({"a": red, "b": green, "square": grey}, columns=2, width=4.0)
+    high = round(wide * h / w)
+    rows = [TITLE + high // 2 + i * (TITLE + high) for i in range(2)]
+    middles = [GAP // 2 + wide // 2 + i * (wide + GAP) for i in range(2)]
+    assert drawn.size == (2 * (wide + GAP), 2 * (TITLE + high) + GAP)
+    assert drawn.getpixel((middles[0], rows[0])) == (255, 0, 0)
+    assert drawn.getpixel((middles[1], rows[0])) == (0, 255, 0)
+    assert drawn.getpixel((middles[0], rows[1])) == (128, 128, 128)
+    assert drawn.getpixel((middles[0] - high // 2 - 4, rows[1])) == (255, 255, 255)
+    assert drawn.getpixel((middles[1], rows[1])) == (255, 255, 255)
+    title = drawn.crop((0, 0, wide, TITLE)).getextrema()
+    assert title[0][0] < 100
