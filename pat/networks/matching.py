@@ -161,9 +161,9 @@ def precise(
 def _surfaces(disparity: NDArray[np.float32], brightness: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """A guide (h, w, 3) whose edges are those of disparity and of brightness. Disparity as two triangular waves, one of
     which has a slope where the other turns: it may be larger than 8 bits hold."""
-    levels = disparity * PIXEL
-    waves = (np.abs((levels + phase) % 510 - 255) for phase in (0.0, 127.5))
-    return np.stack([brightness, *(wave.astype(np.uint8) for wave in waves)], -1)
+    levels = (disparity * PIXEL).astype(np.int32)
+    waves = ((n ^ -(n >> 8 & 1)).astype(np.uint8) for n in (levels, levels + 128))
+    return np.stack([brightness, *waves], -1)
 
 
 def _runs(half: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
