@@ -26,8 +26,6 @@ from .semi_global_kernels import (
 RUN = 5
 """Labels in a run."""
 LABELS = 2 * RUN
-SMALL, LARGE = np.float32(20.0), np.float32(80.0)
-"""Penalties as at half the size, where a label is two pixels. Chosen on Middlebury's pairs of the tune half."""
 
 
 @compiled(inline="always")
@@ -69,7 +67,7 @@ def _aligned(before, origin_low, origin_high, first, out):
 
 
 @compiled(inline="always")
-def _advance(before, there, least, cost, here, total, now, jump, at):
+def _advance(before, there, least, cost, here, total, now, small, jump, at):
     """One step of a path, between pixels whose runs begin at `there` and `here`: its costs `now`, added to `total`; the
     least."""
     fewest = MOST
@@ -77,7 +75,7 @@ def _advance(before, there, least, cost, here, total, now, jump, at):
         _aligned(before, there[0], there[1], here[run], at)
         for i in range(RUN):
             k = run * RUN + i
-            step = min(at[i], at[i + 2]) + SMALL
+            step = min(at[i], at[i + 2]) + small
             stay = min(at[i + 1], least + jump)
             now[k] = np.float32(cost[k]) + min(step, stay) - least
             total[k] += now[k]
@@ -86,17 +84,20 @@ def _advance(before, there, least, cost, here, total, now, jump, at):
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
-def band_aggregate(cost, guide, low, high, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008), added to total (h, w, LABELS)."""
+def band_aggregate(cost, guide, low, high, small, large, total):
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008), added to total (h, w, LABELS).
+
+    Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no edge).
+    """
     for dx in range(-1, 2):
         for way in range(2):
-            _sweep(cost, guide, low, high, total, dx, way)
+            _sweep(cost, guide, low, high, small, large, total, dx, way)
     for way in range(2):
-        _sweep_rows(cost, guide, low, high, total, way)
+        _sweep_rows(cost, guide, low, high, small, large, total, way)
 
 
 @compiled(inline="always")
-def _sweep_rows(cost, guide, low, high, total, way):
+def _sweep_rows(cost, guide, low, high, small, large, total, way):
     """Paths along rows."""
     height, width, _ = cost.shape
     before, now = np.zeros((2, LABELS), np.float32)
@@ -112,15 +113,15 @@ def _sweep_rows(cost, guide, low, high, total, way):
                     total[y, x, k] += now[k]
                 least = now.min()
             else:
-                jump = jump_between(guide[y, x], guide[y, x - step], SMALL, LARGE)
+                jump = jump_between(guide[y, x], guide[y, x - step], small, large)
                 there = low[y, x - step], high[y, x - step]
                 here = low[y, x], high[y, x]
-                least = _advance(before, there, least, cost[y, x], here, total[y, x], now, jump, at)
+                least = _advance(before, there, least, cost[y, x], here, total[y, x], now, small, jump, at)
             before, now = now, before
 
 
 @compiled(inline="always")
-def _sweep(cost, guide, low, high, total, dx, way):
+def _sweep(cost, guide, low, high, small, large, total, dx, way):
     """Paths from row to row, that move by `dx` columns on the way."""
     height, width, _ = cost.shape
     before, now = np.zeros((2, width, LABELS), np.float32)
@@ -137,11 +138,11 @@ def _sweep(cost, guide, low, high, total, dx, way):
                     total[y, x, k] += now[x, k]
                 fewer[x] = now[x].min()
             else:
-                jump = jump_between(guide[y, x], guide[y - step, origin], SMALL, LARGE)
+                jump = jump_between(guide[y, x], guide[y - step, origin], small, large)
                 there = low[y - step, origin], high[y - step, origin]
                 here = low[y, x], high[y, x]
                 fewer[x] = _advance(
-                    before[origin], there, fewest[origin], cost[y, x], here, total[y, x], now[x], jump, at
+                    before[origin], there, fewest[origin], cost[y, x], here, total[y, x], now[x], small, jump, at
                 )
         before, now = now, before
         fewest, fewer = fewer, fewest

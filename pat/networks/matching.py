@@ -44,6 +44,8 @@ from .warped import at_matches, box_mean, diffused_from, matched_colours
 
 NEIGHBOURHOOD = 5
 """Side of the neighbourhood at half the size, pixels."""
+PENALTIES = np.float32(20.0), np.float32(80.0)
+"""Of labels that differ by one and by more; half the size, where a label is two pixels, has others."""
 SAME = 0.7
 """Matches at half and at full size that are less than this many pixels apart are of the same surface."""
 STEP_RADIUS, STEP_FLOOR, MOST_STEP = 3, 2e-5, 0.25
@@ -53,7 +55,7 @@ FLAT, LEAST_WEIGHT = 3e-6, 0.01
 what any consistent match weighs."""
 SURFACE, PIXEL = (30.0, 4.0), 8.0
 """Strength of that smoothing, and the 8-bit difference that counts as an edge; how many such levels a pixel of
-disparity counts. These, `SAME` and `FLAT` are chosen on Middlebury's pairs of the tune half."""
+disparity counts. These, `PENALTIES`, `SAME` and `FLAT` are chosen on Middlebury's pairs of the tune half."""
 MARGIN = 48
 """What is matched around a block, pixels."""
 BLOCK_BYTES = 120.0 * (BLOCK + 2 * MARGIN) ** 2
@@ -187,7 +189,7 @@ def _block(views: tuple, box: tuple, found: NDArray, unlike: NDArray) -> None:
     cost = np.empty((*a.shape, kernels.LABELS), np.uint8)
     kernels.band_costs(a, a_bits, other, other_bits, e, u, n, c, lo, hi, cost)
     total = np.zeros(cost.shape, np.float32)
-    kernels.band_aggregate(cost, a, lo, hi, total)
+    kernels.band_aggregate(cost, a, lo, hi, *PENALTIES, total)
     d, f = np.empty(a.shape, np.float32), np.empty(a.shape, np.float32)
     kernels.band_winners(total, lo, hi, e, u, n, *other.shape, d, f)
     inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))

@@ -147,7 +147,7 @@ def colour_noise(
     fine = box_mean((parts - box_mean(parts, DETAIL_RADIUS)).square(), DETAIL_RADIUS)
     fine = torch.where(weight > 0.5, fine, torch.nan)[..., ::4, ::4].flatten(2)
     least, of_texture = fine.nanquantile(LOWEST, 2).nan_to_num(0.0).split(1, 1)
-    return (NOISE_SHARE * (least - TEXTURE_SHARE * of_texture)).clamp(min=0)[..., None]
+    return (NOISE_SHARE * (least - TEXTURE_SHARE * of_texture)).clamp(min=0)[..., None, None]
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
