@@ -42,7 +42,7 @@ SATURATED = 0.15
 """Where brightness explains no colour, colour differences grow with brightness by this part of their ratio to it."""
 NOISE_SHARE, TEXTURE_SHARE, LOWEST = 20.0, 0.6, 0.1
 """Variance of colour's noise, of all bands, over that of what the views' brightness differs by beyond this share of
-texture, where there is least of either: at this quantile. Chosen on SYNTIM's and Middlebury's pairs of the tune half."""
+texture, where there is least of either: at this quantile. Chosen on SYNTIM and Middlebury pairs of the tune half."""
 MOST_DETAIL = 0.2
 """Differences of brightness beyond this are no detail that beta lost."""
 
