@@ -40,6 +40,8 @@ class ResponseSettings(NamedTuple):
     greenest: share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's, and alpha is
         brighter than luma where an unfiltered sensor would be darker, or the other way round: that is light too.
     alike: a gain explains alpha as well as weights do if its misfit is up to this much larger.
+    equal_weights: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to be taken in
+        their place: a sensor without filters. Light may differ between the views by a gain of this standard deviation.
     least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
     equal: the error over the least one up to which a gamma explains alpha as well.
     better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
@@ -59,6 +61,7 @@ class ResponseSettings(NamedTuple):
     light: tuple[float, float] = (0.035, 0.12)
     greenest: float = 0.62
     alike: float = 2.0
+    equal_weights: tuple[float, float] = (8.0, 0.006)
     least_change: float = 0.01
     equal: float = 1.1
     better: float = 0.8
@@ -238,6 +241,17 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
         values = torch.linalg.solve((design * counts) @ design.T + prior, (design * counts) @ rest)
         return float(counts @ (rest - values @ design).square() + values @ prior @ values), values
 
+    def or_equal(weights: Tensor, gain: float) -> tuple[Tensor, float]:
+        """1/3 of each band with the gain that fits best, if they explain alpha about as well as these weights."""
+        more, deviation = settings.equal_weights
+        precision = x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
+        equal = torch.full_like(weights, 1 / 3)
+        shades = [gain * (w @ x) for w in (weights, equal)]
+        (misfit, _), (of_equal, (light,)) = (explained(y - shade, shade[None], precision) for shade in shades)
+        if of_equal > misfit + more:
+            return weights, gain
+        return equal, gain if gain == 1 else gain * (1 + float(light))
+
     def negative(weights: Tensor) -> float:
         return float((weights.clamp(max=0) / settings.negative).square().sum())
 
@@ -261,6 +275,8 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     by_light = by_light or (unlike_sensors and no_sensor)
     if exposure == 1 and (differing < settings.least_change or by_light):
         chosen = rec601
+    elif chosen is not rec601:
+        chosen, exposure = or_equal(chosen, exposure)
     return misfit, Response(chosen, exposure, gamma, found.explained)
 
 

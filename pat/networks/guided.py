@@ -50,6 +50,8 @@ HEAD_SHARE = 0.5
 """How much of what the head adds is added: it was trained to mend more than is left to be mended."""
 LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
+LIKEST = 3.0
+"""How much more a beta's colour counts, as a logit, where it is as bright as alpha than where it is unlike it."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
 
@@ -273,11 +275,14 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
 
 
 def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
-    """The estimate of several betas with the same bands: what each shows, weighted by its odds of being right."""
+    """The estimate of several betas with the same bands: what each shows, weighted by its odds of being right.
+
+    Beside depth's edges one beta may show another surface and be as confident as the others: its brightness tells.
+    """
     if len(estimates) == 1:
         return estimates[0]
     logits = torch.stack([e.logit for e in estimates])
-    weights = logits.softmax(0)
+    weights = (logits + LIKEST * torch.stack([e.likeness for e in estimates])).softmax(0)
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         return sum(w * p for w, p in zip(weights, parts)) + torch.zeros_like(parts[0])

@@ -1,5 +1,7 @@
 """Alpha's response: stated or fitted, applied to beta, and taken back from the result."""
 
+import math
+
 import pytest
 import torch
 
@@ -46,6 +48,23 @@ def test_grey_points_leave_rec601():
     g = torch.Generator().manual_seed(0)
     x = (torch.rand(1, 4000, generator=g) * 0.9 + 0.05).expand(3, -1) + 0.005 * torch.randn(3, 4000, generator=g)
     assert fit(x, x.mean(0) + 0.01 * torch.randn(4000, generator=g)).is_rec601
+
+
+def test_a_sensor_without_filters_is_preferred_to_weights_that_explain_alpha_hardly_better():
+    """Light that differs by place bends the fit; equal weights are taken for it, other sensors are not."""
+    g = torch.Generator().manual_seed(0)
+    x = torch.rand(3, 1, generator=g) * 0.5 + 0.4 * torch.rand(3, 4000, generator=g) ** 2 + 0.05
+    light = 1 + 0.015 * (x[0] - x[0].mean()) / x[0].std()
+    noise = 0.01 * torch.randn(4000, generator=g)
+    freely = SETTINGS._replace(equal_weights=(-math.inf, 1.0))
+    alpha = light * x.mean(0) + noise
+    assert (fit(x, alpha, settings=freely).weights - 1 / 3).abs().max() > 0.01
+    assert fit(x, alpha).weights.tolist() == [1 / 3] * 3
+    other = fit(x, combined(x[:, :, None], WEIGHTS)[0, :, 0] * light + noise).weights
+    assert (other - torch.tensor(WEIGHTS)).abs().max() < 0.06
+    gain = fit(x, 0.6 * alpha)
+    assert gain.weights.tolist() == [1 / 3] * 3
+    assert gain.gain == pytest.approx(0.6, rel=0.02)
 
 
 def points_of_one_hue():

@@ -9,7 +9,10 @@ from arraygeom import Camera, Pose, Rig, Segments, intrinsics
 from arraygeom.fields import pinhole_track
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
+from pat.fusion.inputs import frame_inputs
+from pat.fusion.views import Views
 from pat.media.colour import luminance
+from pat.networks.guided import combined
 from pat.networks.pieces import tiles_of
 from pat.networks.several import SUPPORT, MatchedBeta
 from pat.networks.weights import load_weights
@@ -67,6 +70,20 @@ def test_two_colour_cameras_on_opposite_sides_see_more_than_either(network, scen
     hidden_on_the_right = (slice(30, 66), slice(126, 138))
     depth = frame.depth[hidden_on_the_right]
     assert (depth - FAR).abs().nanmedian() < 0.5
+
+
+def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(network, scene, monkeypatch):
+    rig, images, _ = scene
+    inputs = frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
+    one, other = network.explain(inputs)[1]
+    bright, dark = (
+        e._replace(
+            colour=torch.full_like(e.colour, v), logit=torch.ones_like(e.logit), likeness=torch.full_like(e.likeness, v)
+        )
+        for e, v in ((one, 1.0), (other, 0.0))
+    )
+    assert combined([bright, dark]).colour.min() > 0.9
+    assert combined([dark, dark._replace(colour=bright.colour)]).colour.mean() == pytest.approx(0.5)
 
 
 def test_the_order_of_the_betas_does_not_matter(network, scene):
