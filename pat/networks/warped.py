@@ -43,6 +43,8 @@ SATURATED = 0.15
 NOISE_SHARE, TEXTURE_SHARE, LOWEST = 20.0, 0.6, 0.1
 """Variance of colour's noise, of all bands, over that of what the views' brightness differs by beyond this share of
 texture, where there is least of either: at this quantile. Chosen on SYNTIM and Middlebury pairs of the tune half."""
+LEAST_NOISE = 2e-5
+"""Less variance than this, two thirds of a level of 8 bits in each band, is left: taking it out takes time."""
 MOST_DETAIL = 0.2
 """Differences of brightness beyond this are no detail that beta lost."""
 
@@ -68,7 +70,7 @@ def matched_colours(
     if bands > 1:
         colour, bright = _scaled_to_alpha(values - own, own, alpha, weight)
         noise = colour_noise(brightness - soft, soft, weight * consistent)
-        colour = _without_noise(colour, bright, noise) if bool(noise.any()) else colour
+        colour = _without_noise(colour, bright, noise) if float(noise.amax()) > LEAST_NOISE else colour
         detailed = _detailed(colour, bright, alpha, SATURATED)
         matched = torch.lerp(colour, detailed, explained_share(own, soft, valid * consistent)) + own - alpha
     else:
