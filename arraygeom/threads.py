@@ -8,23 +8,33 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from functools import lru_cache
 
 import torch
 
 
 def in_parallel(tasks: Sequence[Callable[[], object]], *, most: int | None = None) -> None:
-    """Run tasks on the threads that torch may use, or `most` of them, this one included; an error of any is raised."""
+    """Run tasks on the threads that torch may use, or `most` of them, this one included.
+
+    After an error in one no other is begun; it is raised once those that were are at their end.
+    """
     left = iter(tasks)
 
     def work() -> None:
-        for task in left:
-            task()
+        try:
+            for task in left:
+                task()
+        except BaseException:
+            list(left)
+            raise
 
     helpers = min(torch.get_num_threads(), len(tasks), most or len(tasks)) - 1
     waiting = [_pool(os.getpid(), helpers).submit(work) for _ in range(helpers)]
-    work()
+    try:
+        work()
+    finally:
+        wait(waiting)
     for future in waiting:
         future.result()
 

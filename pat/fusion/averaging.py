@@ -51,42 +51,42 @@ def averaged_with_alike(
     if noise.beta:
         colour = _averaged_colour(colour, luma, beta, confidence.square(), noise.beta**0.5)
     if noise.alpha:
-        scale, reach, share = LUMA
-        sums, weight = sums_of_alike(torch.cat([colour, luma]), alpha, scale * noise.alpha**0.5, reach)
+        scale, radius, share = LUMA
+        sums, weight = sums_of_alike(torch.cat([colour, luma]), alpha, scale * noise.alpha**0.5, radius)
         luma = torch.lerp(luma, sums / weight, share)
     return from_luma_chroma(luma, colour)
 
 
 def _averaged_colour(colour: Tensor, luma: Tensor, beta: Tensor, counts: Tensor, root: float) -> Float[Tensor, "2 h w"]:
-    scale, reach, detail = OWN
-    sums, weight = sums_of_alike(torch.cat([colour, detail * luma]), colour, scale * root, reach)
+    scale, radius, detail = OWN
+    sums, weight = sums_of_alike(torch.cat([colour, detail * luma]), colour, scale * root, radius)
     colour = sums / weight
-    scale, reach, detail, share = RECORDED
+    scale, radius, detail, share = RECORDED
     recorded = (beta - luminance(beta))[[0, 2]]
     values = torch.cat([recorded * counts, counts])
-    sums, _ = sums_of_alike(torch.cat([colour, detail * luma]), values, scale * root, reach, step=2)
+    sums, _ = sums_of_alike(torch.cat([colour, detail * luma]), values, scale * root, radius, step=2)
     enough = share * sums[2:] / (sums[2:] + 1)
     return torch.lerp(colour, sums[:2] / (sums[2:] + 1e-6), enough)
 
 
 def sums_of_alike(
-    guide: Float[Tensor, "c h w"], values: Float[Tensor, "k h w"], scale: float, reach: int, step: int = 1
+    guide: Float[Tensor, "c h w"], values: Float[Tensor, "k h w"], scale: float, radius: int, step: int = 1
 ) -> tuple[Float[Tensor, "k h w"], Float[Tensor, "1 h w"]]:
     """For each pixel the weighted sums of the values at pixels around it, and of the weights.
 
     The weight is about exp(-d / scale^2), where d is the mean square difference of the guide's 3 x 3 patches around
-    both. The pixels are those at most `reach` rows and columns away, every `step`-th of them; beyond the edges images
+    both. The pixels are those at most `radius` rows and columns away, every `step`-th of them; beyond the edges images
     are mirrored. All in float32 on the CPU, on as many threads as torch may use; back on the values' device.
     """
     h, w = guide.shape[-2:]
-    around = reach + 1
+    around = radius + 1
     mirrored = [(0, 0), (around, around), (around, around)]
     planes = [np.pad(image.detach().float().cpu().numpy(), mirrored, mode="reflect") for image in (guide, values)]
     out = np.zeros((len(values) + 1, h, w), np.float32)
     sharpness = np.float32(1 / (8 * 9 * len(guide) * scale**2))
 
     def rows(top: int) -> None:
-        add_alike(*planes, around, reach, step, sharpness, top, out[:, top : top + ROWS])
+        add_alike(*planes, around, radius, step, sharpness, top, out[:, top : top + ROWS])
 
     in_parallel([lambda top=top: rows(top) for top in range(0, h, ROWS)])
     sums = torch.from_numpy(out).to(values)
@@ -94,7 +94,7 @@ def sums_of_alike(
 
 
 @compiled(nogil=True, cache=True, fastmath=True)
-def add_alike(guide, values, around, reach, step, sharpness, top, out):
+def add_alike(guide, values, around, radius, step, sharpness, top, out):
     """Add to `out` (k + 1, rows, w), from row `top`: the weighted values, and the weights.
 
     The weight is (1 - d / 8)^8, or 0 where d is over 8, in place of the exponential.
@@ -104,8 +104,8 @@ def add_alike(guide, values, around, reach, step, sharpness, top, out):
     difference = np.zeros((3, width + 2), np.float32)
     weight = np.zeros(width, np.float32)
     first = around - 1
-    for dy in range(-reach, reach + 1, step):
-        for dx in range(-reach, reach + 1, step):
+    for dy in range(-radius, radius + 1, step):
+        for dx in range(-radius, radius + 1, step):
             for y in range(-1, rows + 1):
                 row = difference[y % 3]
                 row[:] = 0

@@ -20,11 +20,10 @@ from .semi_global_kernels import (
     MOST,
     NOWHERE,
     ONE,
-    SMALL,
     UNSEEN,
     _between,
-    _jump,
     dissimilarity,
+    jump_between,
 )
 
 RUN = 5
@@ -83,14 +82,14 @@ def _costs_at(code, cost, i: index):
 
 
 @instruction(lambda path, *_: path)
-def _one_step(code, path, least, jump, cost):
+def _one_step(code, path, least, small, jump, cost):
     """The costs of a path at the next pixel, whose runs are the same; those of lanes without a label mean nothing."""
 
     def less(a, b):
         return code.select(code.fcmp_ordered("<", a, b), a, b)
 
     before, after = (code.shuffle(path, None, [(k + i) % LANES for k in range(LANES)]) for i in (-1, 1))
-    step = code.fadd(less(before, after), ir.Constant(path.type, [float(SMALL)] * LANES))
+    step = code.fadd(less(before, after), code.repeat(small))
     stay = less(path, code.repeat(code.fadd(least, jump)))
     return code.fsub(code.fadd(cost, less(step, stay)), code.repeat(least))
 
@@ -137,17 +136,20 @@ def _aligned(code, path, there, here):
 
 
 @compiled(nogil=True, cache=True)
-def band_aggregate(cost, guide, low, high, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008): total (h, w, LANES)."""
+def band_aggregate(cost, guide, low, high, small, large, total):
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008): total (h, w, LANES).
+
+    Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no edge).
+    """
     width = cost.shape[1]
     runs, paths = np.stack((low, high), -1), np.empty((6 * width + 3) * LANES, np.float32)
     fewest = np.empty(6 * width + 1, np.float32)
     for way in range(2):
-        _sweep(way, guide, runs, cost.reshape(-1), total.reshape(-1), paths, fewest)
+        _sweep(way, guide, runs, cost.reshape(-1), small, large, total.reshape(-1), paths, fewest)
 
 
 @compiled
-def _sweep(way, guide, runs, cost, total, paths, fewest):
+def _sweep(way, guide, runs, cost, small, large, total, paths, fewest):
     """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the row, and
     from three of the row before. With `way` 1 rows and columns are taken from the last."""
     height, width = guide.shape
@@ -173,8 +175,8 @@ def _sweep(way, guide, runs, cost, total, paths, fewest):
                     there, path = from_index(runs, 2 * (p - dy * width + dx)), load(paths, before * LANES)
                     if there[0] != here[0] or there[1] != here[1]:
                         path = _aligned(from_index(paths, before * LANES), there, here)
-                    jump = _jump(guide[y, x], guide[y - dy, x + dx])
-                    path = _walled(_one_step(path, fewest[before], jump, costs), beside)
+                    jump = jump_between(guide[y, x], guide[y - dy, x + dx], small, large)
+                    path = _walled(_one_step(path, fewest[before], small, jump, costs), beside)
                 store(paths, now * LANES, path)
                 fewest[now] = _least(path)
                 sums = add(sums, path)

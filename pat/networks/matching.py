@@ -44,10 +44,18 @@ from .warped import at_matches, box_mean, diffused_from, matched_colours
 
 NEIGHBOURHOOD = 5
 """Side of the neighbourhood at half the size, pixels."""
-SAME = 1.0
+PENALTIES = np.float32(20.0), np.float32(80.0)
+"""Of labels that differ by one and by more; half the size, where a label is two pixels, has others."""
+SAME = 0.7
 """Matches at half and at full size that are less than this many pixels apart are of the same surface."""
-STEP_RADIUS, STEP_FLOOR, MOST_STEP = 3, 2e-4, 0.25
+STEP_RADIUS, STEP_FLOOR, MOST_STEP = 3, 2e-5, 0.25
 """Window and regulariser (variance of brightness) of the step to a fraction of a pixel, and its most pixels."""
+FLAT, LEAST_WEIGHT = 3e-6, 0.01
+"""Slope of brightness (its square) along the segment at which a match weighs half in the smoothing of surfaces, and
+what any consistent match weighs."""
+SURFACE, PIXEL = (30.0, 4.0), 8.0
+"""Strength of that smoothing, and the 8-bit difference that counts as an edge; how many such levels a pixel of
+disparity counts. These, `PENALTIES`, `SAME` and `FLAT` are chosen on Middlebury's pairs of the tune half."""
 MARGIN = 48
 """What is matched around a block, pixels."""
 BLOCK_BYTES = 120.0 * (BLOCK + 2 * MARGIN) ** 2
@@ -132,19 +140,32 @@ def precise(
     normalisation: Normalisation,
 ) -> Float[Tensor, "b 1 h w"]:
     """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both; from there
-    a step of least squares of the brightness around each pixel (Lucas and Kanade 1981)."""
+    a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the result smoothed within
+    surfaces, where brightness says little of the position more than elsewhere."""
     own, other = normalisation.equally_sharp(alpha, normalisation.normalised(guide))
-    sure = (unlike < CONSISTENT) & ((disparity - rough).abs() < SAME)
-    start = torch.where(sure, (disparity + rough) / 2, disparity)
+    consistent = unlike < CONSISTENT
+    near = consistent & ((disparity - rough).abs() < SAME)
+    start = torch.where(near, (disparity + rough) / 2, disparity)
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
     seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start)[0].split(1, 1)
     towards = along(segments).movedim(-1, 1).to(other)
     mean = partial(box_mean, radius=2 * STEP_RADIUS)
     rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
     rise, rest = rise - mean(rise), rest - mean(rest)
-    products = box_mean(torch.cat([rise * rest, rise.square()], 1), STEP_RADIUS)
-    step = products[:, :1] / (products[:, 1:] + STEP_FLOOR)
-    return torch.where(sure, start + step.clamp(-MOST_STEP, MOST_STEP), start)
+    common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), STEP_RADIUS).split(1, 1)
+    step = (common / (slope + STEP_FLOOR)).clamp(-MOST_STEP, MOST_STEP)
+    weight = torch.where(consistent, slope / (slope + FLAT) + LEAST_WEIGHT, 0.0) + 1e-5
+    planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
+    smooth = np.stack([filled(d, w, _surfaces(d[0], brightness), SURFACE) for d, w, brightness in planes])
+    return torch.from_numpy(smooth).to(disparity)
+
+
+def _surfaces(disparity: NDArray[np.float32], brightness: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A guide (h, w, 3) whose edges are those of disparity and of brightness. Disparity as two triangular waves, one of
+    which has a slope where the other turns: it may be larger than 8 bits hold."""
+    levels = (disparity * PIXEL).astype(np.int32)
+    waves = ((n ^ -(n >> 8 & 1)).astype(np.uint8) for n in (levels, levels + 128))
+    return np.stack([brightness, *waves], -1)
 
 
 def _runs(half: NDArray[np.float32]) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
@@ -168,7 +189,7 @@ def _block(views: tuple, box: tuple, found: NDArray, unlike: NDArray) -> None:
     cost = np.empty((*a.shape, kernels.LANES), np.uint8)
     kernels.band_costs(a, a_bits, other, other_bits, e, u, n, c, lo, hi, cost)
     total = np.empty(cost.shape, np.float32)
-    kernels.band_aggregate(cost, a, lo, hi, total)
+    kernels.band_aggregate(cost, a, lo, hi, *PENALTIES, total)
     d, f = np.empty(a.shape, np.float32), np.empty(a.shape, np.float32)
     kernels.band_winners(total, lo, hi, e, u, n, *other.shape, d, f)
     inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))

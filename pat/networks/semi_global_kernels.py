@@ -16,7 +16,7 @@ LEVELS = np.float32(30.0)
 TRUNCATED = np.float32(20.0)
 SMALL, LARGE = np.float32(12.0), np.float32(100.0)
 """Penalties of neighbours whose labels differ by one, and by more (the latter where alpha shows no edge)."""
-EDGE = np.float32(8 / 255)
+EDGE = np.float32(4 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
 FARTHEST = np.float32(8)
 """A difference of labels in the left-right check counts as at most this."""
@@ -132,13 +132,14 @@ def _advance(before, least, jump, cost, now):
 
 
 @compiled(inline="always")
-def _jump(a, b):
-    return max(SMALL + ONE, LARGE / (ONE + abs(a - b) / EDGE))
+def jump_between(a, b, small, large):
+    """The penalty of labels that differ by more than one, between pixels of alpha's brightness a and b."""
+    return max(small + ONE, large / (ONE + abs(a - b) / EDGE))
 
 
 @compiled(inline="always")
 def _jump_in_parts(a, b):
-    return np.int16(_jump(a, b) * PARTS + HALF)
+    return np.int16(jump_between(a, b, SMALL, LARGE) * PARTS + HALF)
 
 
 @compiled(nogil=True, cache=True)

@@ -8,7 +8,7 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Segments, pixel_grid
 from pat.networks import band_kernels, semi_global_kernels
 from pat.networks.band_kernels import HIGH, LANES, RUN
-from pat.networks.matching import _runs, matched
+from pat.networks.matching import PENALTIES, _runs, _surfaces, matched
 from pat.networks.semi_global import Normalisations, matched_at_half_size
 from tests.pat.networks.matched_scenes import beside, blurred
 
@@ -34,22 +34,23 @@ def test_with_all_labels_it_is_semi_global_matching():
     low = np.full((9, 11), 3, np.int32)
     whole, bands = np.empty(cost.shape, np.int16), np.empty((9, 11, LANES), np.float32)
     semi_global_kernels.aggregate(cost, guide, whole)
-    band_kernels.band_aggregate(in_lanes(cost), guide, low, low + RUN, bands)
+    penalties = semi_global_kernels.SMALL, semi_global_kernels.LARGE
+    band_kernels.band_aggregate(in_lanes(cost), guide, low, low + RUN, *penalties, bands)
     np.testing.assert_allclose(
         bands[..., LABELS], whole / semi_global_kernels.PARTS, atol=8 / semi_global_kernels.PARTS
     )
 
 
-def aggregated(cost, guide, labels):
+def aggregated(cost, guide, labels, small, large):
     """One path along a row, written out: `labels` (w, 10) of each pixel."""
     total = cost.astype(float).copy()
     for order in (range(1, len(cost)), range(len(cost) - 2, -1, -1)):
         path = cost.astype(float).copy()
         for x in order:
             before = x - 1 if order.step > 0 else x + 1
-            jump = max(13.0, 100 / (1 + abs(float(guide[x]) - float(guide[before])) / (8 / 255)))
+            jump = max(small + 1, large / (1 + abs(float(guide[x]) - float(guide[before])) / (4 / 255)))
             apart = np.abs(labels[x][:, None] - labels[before][None])
-            step = np.where(apart == 0, 0.0, np.where(apart == 1, 12.0, jump))
+            step = np.where(apart == 0, 0.0, np.where(apart == 1, small, jump))
             path[x] = cost[x] + (path[before][None] + step).min(1) - path[before].min()
         total += path
     return total - cost
@@ -62,11 +63,11 @@ def test_runs_of_neighbours_are_aligned_by_label():
     low = rng.integers(0, 6, (1, 12), np.int32)
     high = low + RUN + rng.integers(0, 6, (1, 12), np.int32)
     total = np.empty((1, 12, LANES), np.float32)
-    band_kernels.band_aggregate(in_lanes(cost), guide, low, high, total)
+    band_kernels.band_aggregate(in_lanes(cost), guide, low, high, *PENALTIES, total)
     run = np.arange(RUN)
     labels = np.concatenate([low[0][:, None] + run, high[0][:, None] + run], 1)
     paths = total[0][:, LABELS] - 6 * cost[0].astype(float)
-    np.testing.assert_allclose(paths, aggregated(cost[0], guide[0], labels), rtol=1e-4, atol=1e-2)
+    np.testing.assert_allclose(paths, aggregated(cost[0], guide[0], labels, *PENALTIES), rtol=1e-4, atol=1e-2)
 
 
 @pytest.mark.parametrize("half", [np.full((6, 6), 9.0), np.tile([4.0, 4.0, 4.0, 30.0, 30.0, 30.0], (6, 1))])
@@ -125,3 +126,29 @@ def test_a_match_is_found_to_a_tenth_of_a_pixel(disparity):
     error = (found - shift / 8)[..., 8:-8, 40:-8]
     assert abs(float(error.mean())) < 0.05
     assert float(error.abs().mean()) < 0.1
+
+
+def test_a_slope_with_little_texture_is_found_to_a_fraction_of_a_pixel_in_noise():
+    """Disparity rises from 8 to 11 pixels; texture is hardly more than the noise of either camera."""
+    g = torch.Generator().manual_seed(5)
+    x = torch.arange(160.0).expand(96, -1)
+    disparity = 8 + x / 53
+    scene = blurred(torch.rand(1, 1, 96, 8 * 224, generator=g), 16.0)
+    scene = 0.5 + 0.03 * (scene - scene.mean()) / scene.std()
+    rows = torch.arange(96)[:, None]
+    beta = scene[0, 0, :, 64 : 64 + 8 * 160 : 8]
+    # alpha's pixel x shows what beta's shows at x - disparity.
+    alpha = scene[0, 0][rows, (64 + 8 * (x - disparity)).round().long().clamp(min=0)]
+    images = [p[None, None] + 0.01 * torch.randn(1, 1, 96, 160, generator=g) for p in (alpha, beta)]
+    _, _, segments = beside(images[0], 0, 160)
+    found, _ = matched(*images, *segments, Normalisations.of(*images))
+    assert float((found[0, 0] - disparity).abs()[8:-8, 24:-8].mean()) < 0.2
+
+
+def test_surfaces_apart_have_an_edge_between_them_however_large_their_disparities():
+    disparity = np.linspace(0, 400, 3001, dtype=np.float32)[None]
+    levels = _surfaces(disparity, np.zeros(disparity.shape, np.uint8)).astype(int)[0]
+    for pixels, steps in ((0.4, 3), (4.0, 30), (20.0, 150)):
+        apart = np.abs(levels[steps:] - levels[:-steps]).max(1)
+        assert apart.max() <= 8 * pixels + 1
+        assert apart.min() >= min(0.5 * 8 * pixels - 1, 30)

@@ -1,12 +1,13 @@
 """Beta's bands at alpha's view: detail, brightness, weight, and what is diffused."""
 
 import numpy as np
+import pytest
 import torch
 
 from arraygeom import Segments, pixel_grid
 from pat.media.colour import luminance
 from pat.networks.matching import semi_global_matching
-from pat.networks.warped import LIKENESS, _diffused, explained_share, match_weight
+from pat.networks.warped import LIKENESS, _diffused, colour_noise, explained_share, match_weight
 from tests.pat.networks.matched_scenes import beside, blurred, faint
 
 
@@ -128,3 +129,31 @@ def test_an_alpha_in_the_infrared_gives_no_detail():
     found = semi_global_matching(infrared, luminance(beta), beta, *in_place((64, 128)))
     chroma = [image - luminance(image) for image in (found.matched, beta)]
     assert (chroma[0] - chroma[1]).abs().mean() < 0.3 * (chroma[1] - chroma[1].mean((2, 3), keepdim=True)).abs().mean()
+
+
+def noisy_scene(noise: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Alpha, beta and ground truth of stripes of two colours, textured, with noise in both views."""
+    g = torch.Generator().manual_seed(6)
+    alpha = faint(4, contrast=0.06, blur=2.0)[..., :128]
+    tints = torch.tensor([[1.3, 1.0, 0.4], [0.6, 1.1, 1.3]])[torch.arange(128) // 32 % 2].mT[None, :, None]
+    truth = alpha * tints
+    truth = truth + alpha - luminance(truth)
+    return *(p + noise * torch.randn(p.shape, generator=g) for p in (alpha, truth)), truth
+
+
+def test_noise_of_colour_is_taken_out_and_edges_stay():
+    alpha, beta, truth = noisy_scene(0.04)
+    found, given = chroma_errors(alpha, beta, truth, in_place((64, 128)))
+    assert found.square().mean() < 0.4 * given.square().mean()
+    beside_edges = (torch.arange(128) + 1) % 32 < 2
+    assert found[..., beside_edges].square().mean() < 1.0 * given[..., beside_edges].square().mean()
+
+
+def test_texture_and_lost_detail_are_no_noise():
+    alpha = noisy_scene(0.0)[0]
+    blurry, g = blurred(alpha, 1.0), torch.Generator().manual_seed(7)
+    ones = torch.ones_like(alpha)
+    assert float(colour_noise(blurry - alpha, alpha, ones)) == 0
+    found = [float(colour_noise(n * torch.randn(alpha.shape, generator=g), alpha, ones)) for n in (0.02, 0.04)]
+    assert found[1] == pytest.approx(4 * found[0], rel=0.3)
+    assert colour_noise(alpha, alpha, 0 * ones).tolist() == [[[[0.0]]]]
