@@ -9,8 +9,6 @@ from typing import Any, ClassVar, TypeVar
 import torch
 from torch import Tensor
 
-from .text import batch_text
-
 T = TypeVar("T", bound="Batched")
 LABELS = ("name", "sensor")
 """Fields that may differ between what is stacked; the batch has those of the first."""
@@ -73,7 +71,10 @@ class Batched:
     __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}: {', '.join(p for p in (batch_text(self), self._text()) if p)}"
+        return f"{type(self).__name__}: {', '.join(filter(None, (self._batch_text(), self._text())))}"
+
+    def _batch_text(self) -> str:
+        return f"batch of {'x'.join(map(str, self.batch_shape))}" if self.batch_shape else ""
 
     def _text(self) -> str:
         raise NotImplementedError

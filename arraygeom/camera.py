@@ -25,7 +25,7 @@ from .pixels import (
 )
 from .pose import Pose
 from .sensor import Sensor
-from .text import view_text
+from .text import view_facts
 
 if TYPE_CHECKING:
     from kornia.geometry.camera import PinholeCamera
@@ -79,7 +79,7 @@ class View(Batched):
         return within(x, self.hw)
 
     def _text(self) -> str:
-        return view_text(self)
+        return " ".join(filter(None, view_facts(self)))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False, repr=False)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 from functools import cache
+from importlib.util import find_spec
 from typing import Any
 from uuid import uuid4
 
@@ -25,6 +26,12 @@ def compiled(function=None, **options):
             raise
         _warn_of_no_folder()
         return njit(inspect.unwrap(function), **options)
+
+
+@cache
+def can_compile() -> bool:
+    """Whether numba is installed: without it, what has a readable form takes that."""
+    return find_spec("numba") is not None
 
 
 @cache

@@ -38,7 +38,6 @@ from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .pixels import to_homogeneous
-from .text import distortion_text
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
@@ -137,7 +136,7 @@ class Distortion(Batched):
         return fisheye_unproject(c, xy_d) if self.model == KANNALA_BRANDT else central_unproject(self.model, c, xy_d)
 
     def _text(self) -> str:
-        return distortion_text(self)
+        return self.model + ("" if self.batch_shape else "".join(f" {c:.4g}" for c in self.coefficients.tolist()))
 
     @property
     def squared_limit(self) -> float:

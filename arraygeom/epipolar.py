@@ -216,7 +216,8 @@ def depth_from_track(track: Track, x: Real[Tensor, "*n 2"], deviation: Float[Ten
     z_ratio = Z + w * DZ
     valid = moves & (w > 0) & (z_ratio > FRONT)
     depth = torch.where(valid, 1 / torch.where(valid, w, 1.0), 0.0)
+    if deviation is None:
+        return Depth(depth, torch.zeros_like(w), valid)
     length = torch.where(valid, along_x.square() + along_y.square(), 1.0).sqrt()
     pixels_per_w = torch.where(valid, slope.abs() / (length * torch.where(valid, z_ratio, 1.0)), 1.0)
-    sigma = torch.zeros_like(w) if deviation is None else deviation
-    return Depth(depth, torch.where(valid, sigma / pixels_per_w, 0.0) * depth.square(), valid)
+    return Depth(depth, torch.where(valid, deviation / pixels_per_w, 0.0) * depth.square(), valid)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from .batching import Batched
 from .pixels import broadcasts, floating, product
-from .text import pose_text
+from .text import angle, range_text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -75,7 +75,10 @@ class Pose(Batched):
         return Pose(R, self.t if translation is None else self.t + translation)
 
     def _text(self) -> str:
-        return pose_text(self)
+        degrees = angle(self.R).rad2deg()
+        if self.batch_shape:
+            return f"{range_text(degrees, '.3g')} deg"
+        return f"rotation {float(degrees):.2f} deg, t ({', '.join(f'{v:.4g}' for v in self.t.tolist())}) m"
 
 
 def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:

@@ -7,6 +7,7 @@ import difflib
 import fnmatch
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -20,7 +21,7 @@ from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
 from .pose import Pose
-from .text import baseline_text, depth_text, rig_html, rig_text, view_text
+from .text import baseline_text, depth_text, view_facts
 from .tracing import traced
 
 if TYPE_CHECKING:
@@ -158,9 +159,9 @@ class Pair(Batched):
 
     def _text(self) -> str:
         views = {"alpha": self.alpha, "beta": self.beta}
-        named = ", ".join(f"{name} {view_text(view)}" for name, view in views.items())
+        named = ", ".join(f"{name} {view._text()}" for name, view in views.items())
         link = "" if self.link is None else f"link by {self.link._text()}"
-        return "; ".join(part for part in (named, baseline_text(views), depth_text(self.depth), link) if part)
+        return "; ".join(filter(None, (named, baseline_text(views), depth_text(self.depth), link)))
 
 
 def middle_depth(near: Float[Tensor, "*b"], far: Float[Tensor, "*b"]) -> Float[Tensor, "*b"]:
@@ -292,10 +293,16 @@ class Rig(Batched):
         write_rig(self, path)
 
     def _text(self) -> str:
-        return rig_text(self)
+        named = ", ".join(f"{name} {view._text()}" for name, view in self.cameras.items())
+        return "; ".join(filter(None, (named, baseline_text(self.cameras), depth_text(self.depth))))
 
     def _repr_html_(self) -> str:
-        return rig_html(self)
+        head = ("camera", "size", "focal length", "lens", "response")
+        rows = [head, *((name, *view_facts(view)) for name, view in self.cameras.items())]
+        cells = ["".join(f"<td>{escape(cell)}</td>" for cell in row) for row in rows]
+        facts = (self.name, self._batch_text(), baseline_text(self.cameras), depth_text(self.depth))
+        caption = escape("; ".join(filter(None, facts)))
+        return f"<table><caption>{caption}</caption>{''.join(f'<tr>{row}</tr>' for row in cells)}</table>"
 
     def _parameter_shapes(self) -> dict[str, Tensor]:
         """One tensor of the right shape, type and device for each parameter."""

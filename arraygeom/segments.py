@@ -16,7 +16,7 @@ from torch import Tensor
 
 from .batching import Batched
 from .pixels import HW
-from .text import positions_text, segments_text
+from .text import share_text
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -32,7 +32,7 @@ class Positions(Batched):
     mask: Bool[Tensor, "*n l"]
 
     def _text(self) -> str:
-        return positions_text(self)
+        return f"{self.mask.shape[-1]} samples each, {share_text(self.mask)} valid"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -80,7 +80,9 @@ class Segments(Batched):
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
 
     def _text(self) -> str:
-        return segments_text(self)
+        length = self.length[self.valid]
+        median = f", median length {float(length.detach().median()):.1f} px" if length.numel() else ""
+        return f"{share_text(self.valid)} valid{median}"
 
 
 def clip_to_image(start: Float[Tensor, "*n 2"], end: Float[Tensor, "*n 2"], hw: HW) -> Segments:

@@ -20,6 +20,9 @@ def execute(notebook: nbformat.NotebookNode, folder: Path) -> nbformat.NotebookN
     client.execute(env={**os.environ, "PYTHONPATH": str(HERE.parent)})
     for cell in notebook.cells:
         cell.metadata.pop("execution", None)
+        for output in cell.get("outputs", []):
+            if "image/jpeg" in output.get("data", {}):  # Pillow puts out PNG, too: ten times the size
+                output.data.pop("image/png", None)
     return notebook
 
 

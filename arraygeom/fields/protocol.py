@@ -10,6 +10,7 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..camera import Camera
+from ..compiled import can_compile
 from ..pixels import floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
@@ -58,7 +59,8 @@ def _numbers(pair: Pair) -> Tensor | None:
 def compilable(x: Tensor) -> bool:
     """Whether compiled loops can take a tensor: plain numbers on the CPU that nothing follows."""
     followed = traced() or transformations() or torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack()
-    return type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64) and not followed
+    plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
+    return plain and not followed and can_compile()
 
 
 CHUNK = 1 << 15

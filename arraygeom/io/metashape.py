@@ -71,9 +71,7 @@ def read(source: RigSource) -> Rig:
 
 def _document(source: RigSource) -> ET.Element:
     """The parsed text, once it is neither too large nor nested too deeply, and defines no entities."""
-    text = source.text()
-    if len(text) > LARGEST_TEXT:
-        raise source.fail(None, f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
+    text = source.text(LARGEST_TEXT)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
         raise source.fail(None, "defines entities, which Metashape does not write")
     parser: ET.XMLPullParser = ET.XMLPullParser(["start", "end"])

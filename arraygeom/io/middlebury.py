@@ -10,7 +10,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import torch
 from torch import Tensor
 
 from ..camera import Camera
@@ -36,12 +35,10 @@ def read(source: RigSource) -> Rig:
     if abs(doffs - float(Ks[1][0, 2] - Ks[0][0, 2])) > 0.5:
         raise source.fail("doffs", f"is {doffs:g}, which is not the difference of the principal points")
     hw = source.size(width, height, "width, height")
-    cameras = [Camera(K=K, cam_from_world=_along_x(-metres), hw=hw) for K, metres in zip(Ks, (0.0, baseline * 1e-3))]
-    return source.rig(zip(("cam0", "cam1"), cameras), depth=_depth(source, entries, Ks[0], baseline * 1e-3, doffs))
-
-
-def _along_x(metres: float) -> Pose:
-    return Pose(torch.eye(3, dtype=torch.float64), torch.tensor([metres, 0.0, 0.0], dtype=torch.float64))
+    first, metres = Pose.identity(), baseline * 1e-3
+    poses = first, Pose(first.R, first.t.new_tensor([-metres, 0.0, 0.0]))
+    cameras = [Camera(K=K, cam_from_world=pose, hw=hw) for K, pose in zip(Ks, poses)]
+    return source.rig(zip(("cam0", "cam1"), cameras), depth=_depth(source, entries, Ks[0], metres, doffs))
 
 
 def _depth(

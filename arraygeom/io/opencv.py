@@ -117,7 +117,7 @@ def _named(folder: Path, part: str) -> Path | None:
 
 
 def _nodes(source: RigSource) -> dict[str, Any]:
-    text = source.text()
+    text = source.text(LARGEST_TEXT)
     with needs("calibration", "reading OpenCV's files"):
         import cv2
     _check_nesting(source, text)
@@ -131,8 +131,6 @@ def _nodes(source: RigSource) -> dict[str, Any]:
 
 def _check_nesting(source: RigSource, text: str) -> None:
     """OpenCV's parsers recurse without a limit, and crash on files that nest deeply."""
-    if len(text) > LARGEST_TEXT:
-        raise source.fail(None, f"has {len(text):,} characters; at most {LARGEST_TEXT:,} are read")
     depth = 0
     # Tags, brackets, and what nests within a line of YAML: "- - - 1" and "a: b: c: 1".
     for token in re.finditer(r"<(/?)[\w!?](?:[^<>]*?(/?)>)?|[\[{]|[\]}]", text):

@@ -59,8 +59,8 @@ class RigSource:
         """Warn about the file as a whole."""
         warnings.warn(f"{self.path}: {message}", RigFileWarning, stacklevel=2)
 
-    def text(self) -> str:
-        """The file's text."""
+    def text(self, most: int | None = None) -> str:
+        """The file's text, of at most so many characters."""
         try:
             text = self.path.read_bytes().decode("utf-8-sig")
         except UnicodeDecodeError:
@@ -69,6 +69,8 @@ class RigSource:
             raise self.fail(None, f"cannot be read: {error.strerror}") from None
         if not text.strip():
             raise self.fail(None, "is empty")
+        if most is not None and len(text) > most:
+            raise self.fail(None, f"has {len(text):,} characters; at most {most:,} are read")
         return text
 
     def json(self) -> dict[str, Any]:

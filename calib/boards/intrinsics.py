@@ -72,8 +72,8 @@ def calibrate_camera(name: str, views: BoardViews, board: Board, *, lens: Lens =
         plausible = without_outliers(views, camera, poses, board.points)
         camera, poses = _solved(name, plausible, board, lens)
     check_tilts(name, poses, board)
-    rms = {key: _rms(camera, pose, plausible.seen[key], board.points) for key, pose in poses.items()}
-    return InitialCamera(camera, poses, rms)
+    distances = {key: _distances(camera, pose, plausible.seen[key], board.points) for key, pose in poses.items()}
+    return InitialCamera(camera, poses, {key: float(np.sqrt((d**2).mean())) for key, d in distances.items()})
 
 
 def near_homography(found: Detection, board: Board) -> Detection:
@@ -208,10 +208,6 @@ def _fisheye(views: BoardViews, board: Board, lens: Lens) -> Solved:
 def _distances(camera: Camera, pose: Pose, found: Detection, points: Points) -> np.ndarray:
     projected = camera.project_local(pose.apply(torch.from_numpy(points[found.ids]))).x.numpy()
     return np.linalg.norm(projected - found.x, axis=-1)
-
-
-def _rms(camera: Camera, pose: Pose, found: Detection, points: Points) -> float:
-    return float(np.sqrt((_distances(camera, pose, found, points) ** 2).mean()))
 
 
 def _pose(r: np.ndarray, t: np.ndarray) -> Pose:

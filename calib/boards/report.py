@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from io import BytesIO
@@ -17,6 +18,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from arraygeom import Camera, Rig
+from arraygeom.text import angle
 from arraygeom.viz import COLOURS, draw_rig, show_image
 
 from .adequacy import intrinsics_of, next_views
@@ -195,7 +197,7 @@ def pair_table(calibration: Calibration) -> str:
             (
                 f"{a} – {b}",
                 f"{1e3 * baseline:.2f}" + (f" ± {1e3 * deviation:.2f}" if deviation is not None else ""),
-                f"{_rotation_angle(cameras[a], cameras[b]):.3f}",
+                f"{math.degrees(angle(cameras[b].R @ cameras[a].R.T)):.3f}",
                 _mean_and_quantile(errors),
                 "" if held is None or not len(held) else _mean_and_quantile(held),
             )
@@ -235,11 +237,6 @@ def _with_deviations(calibration: Calibration, name: str, camera: Camera, kind: 
 def _digits(deviation: float) -> int:
     """Significant decimals of a value with a standard deviation."""
     return int(np.clip(1 - np.floor(np.log10(deviation)), 0, 8)) if deviation > 0 else 4
-
-
-def _rotation_angle(a: Camera, b: Camera) -> float:
-    cosine = (float((b.R @ a.R.T).trace()) - 1) / 2
-    return float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
 
 
 def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

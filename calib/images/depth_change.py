@@ -144,10 +144,7 @@ class DepthModes(NamedTuple):
 
 
 def depth_modes(
-    G: Float[Tensor, "m n"],
-    z: Float[Tensor, " n"],
-    covariance: Float[Tensor, "n n"],
-    left_out: Float[Tensor, "g n"],
+    G: Float[Tensor, "m n"], z: Float[Tensor, " n"], covariance: Float[Tensor, "n n"], left_out: Float[Tensor, "g n"]
 ) -> DepthModes:
     """The modes, from derivatives G of the logarithm of depth by parameters whose prior covariance is 1.
 

@@ -198,12 +198,7 @@ def diagnose_matches(rig: Rig, sizes: Mapping[str, HW], pairs: Pairs) -> Diagnos
 
 
 def _clearly_better(
-    rig: Rig,
-    remedy: Remedy,
-    figures: tuple[FitStatistics, FitStatistics],
-    pairs: Pairs,
-    inliers: Tensor,
-    noise: float,
+    rig: Rig, remedy: Remedy, figures: tuple[FitStatistics, FitStatistics], pairs: Pairs, inliers: Tensor, noise: float
 ) -> bool:
     """Whether a mistake explains the points clearly better than a drift of the rig does, whatever part is left out.
 
@@ -344,14 +339,7 @@ def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
 
 
 def _figures(
-    off: Tensor,
-    depth: Tensor,
-    front: Tensor,
-    *,
-    inliers: Tensor,
-    floor: float,
-    bounds: Depths | None,
-    handed: float,
+    off: Tensor, depth: Tensor, front: Tensor, *, inliers: Tensor, floor: float, bounds: Depths | None, handed: float
 ) -> FitStatistics:
     off = off[inliers]
     misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))

@@ -53,10 +53,7 @@ class UncalibratedRig(NamedTuple):
 
 @stage()
 def rig_from_images(
-    images: Mapping[str, Float[Tensor, "_ _ _"]],
-    *,
-    focal: Mapping[str, float] | None = None,
-    alpha: str | None = None,
+    images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None, alpha: str | None = None
 ) -> UncalibratedRig:
     """An uncalibrated rig of the cameras that took these images (C, H, W), good enough to fuse with.
 

@@ -17,12 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 
-from arraygeom import (
-    Positions,
-    Rig,
-    Segments,
-    pixel_grid,
-)
+from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
 from .matches import Matches, seen_depths

@@ -455,17 +455,14 @@ def _changes(parameters: Sequence[FreeParameter], solution: Solution) -> Iterabl
             )
 
 
-def _labels(parameters: Sequence[FreeParameter]) -> list[str]:
-    return [u.label(i) for u in parameters for i in range(len(u.sigma))]
-
-
 def _kept(parameters: Sequence[FreeParameter], solution: Solution) -> Iterable[str]:
     """The parameter with the largest part in each combination that keeps its value."""
     active = solution.active
     covariance = solution.covariance[active][:, active]
     moved = torch.linalg.lstsq(torch.linalg.cholesky(covariance), solution.directions[active]).solution
     complement = torch.linalg.svd(moved).U[:, moved.shape[1] :]
-    labels = [label for label, free in zip(_labels(parameters), active.tolist()) if free]
+    every = [u.label(i) for u in parameters for i in range(len(u.sigma))]
+    labels = [label for label, free in zip(every, active.tolist()) if free]
     parts = (torch.linalg.cholesky(covariance) @ complement).abs()
     return dict.fromkeys(labels[int(i)] for i in parts.argmax(0)) if parts.numel() else ()
 

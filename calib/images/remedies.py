@@ -174,13 +174,9 @@ def _with_poses(rig: Rig, names: Iterable[str], change: Callable[[Pose], Pose]) 
 
 def _units(rig: Rig) -> Iterator[Remedy]:
     for factor, words in UNITS.items() if rig.depth is not None else ():
-        scaled = partial(_scaled_pose, factor=factor)
+        scaled = partial(lambda pose, factor: Pose(pose.R, pose.t * factor), factor=factor)
         words = f"translations against the depth range: {words}"
         yield Remedy("units", words, partial(_with_poses, names=rig.names, change=scaled))
-
-
-def _scaled_pose(pose: Pose, factor: float) -> Pose:
-    return Pose(pose.R, pose.t * factor)
 
 
 def _exchanged(rig: Rig, names: list[str]) -> Iterator[Remedy]:
@@ -252,13 +248,9 @@ def _cropped_at_corner(old: HW, new: HW) -> Tensor:
     return shift_matrix(0, 0)
 
 
-def _cropped_centrally(old: HW, new: HW) -> Tensor:
-    return shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2)
-
-
 FITS: dict[str, Callable[[HW, HW], Tensor]] = {
     "resized": resize_matrix,
-    "cropped about its middle": _cropped_centrally,
+    "cropped about its middle": lambda old, new: shift_matrix((old[1] - new[1]) / 2, (old[0] - new[0]) / 2),
     "cropped at the right and the bottom": _cropped_at_corner,
 }
 """How an image may have come to another size."""
@@ -273,13 +265,10 @@ def _to_sizes(
 def _lenses(rig: Rig, names: list[str]) -> Iterator[Remedy]:
     curved = [n for n in _calibrated(rig, names) if n not in bare_cameras(rig, names)]
     for group, label in _groups(curved):
-        drop, negate = (partial(on_cameras, names=group, change=change) for change in (_without_lens, _opposite_lens))
+        drop = partial(on_cameras, names=group, change=lambda camera: camera.replace(distortion=None))
+        negate = partial(on_cameras, names=group, change=_opposite_lens)
         yield Remedy("distortion", f"images of {label} are undistorted already: distortion applied twice", drop)
         yield Remedy("distortion", f"distortion of {label} with the wrong sign (the inverse map)", negate)
-
-
-def _without_lens(camera: Camera) -> Camera:
-    return camera.replace(distortion=None)
 
 
 def _opposite_lens(camera: Camera) -> Camera:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
 from arraygeom.pixels import map_homogeneous
+from arraygeom.text import angle
 
 from .held_out import line_distances
 from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_lines
@@ -91,8 +92,8 @@ def self_calibrated(
     if not trials:
         return None
     least = min(trial.distance for trial in trials)
-    fitting = [trial for trial in trials if _alike(trial, least)]
-    return min(fitting, key=lambda trial: _angle(_pair(trial.rig).beta_from_alpha.R, upright))
+    fitting = [t for t in trials if t.distance <= (1 + ALIKE / math.sqrt(t.points)) * least + ALIKE_SLACK]
+    return min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ upright)))
 
 
 def refined_by_depth(
@@ -219,18 +220,8 @@ def _lateral_poses(matches: Matches, R: Tensor, K: Tensor, K_beta: Tensor) -> li
     return [Pose(R, t), Pose(R, -t)]
 
 
-def _angle(R: Tensor, other: Tensor) -> float:
-    """The angle between two rotations, radians."""
-    return math.acos(min(max((float((R.T @ other).trace()) - 1) / 2, -1.0), 1.0))
-
-
 def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
     return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
-
-
-def _alike(pair: RefinedPair, least: float) -> bool:
-    """Whether a pose is hardly worse than the best one, whose distance is `least`."""
-    return pair.distance <= (1 + ALIKE / math.sqrt(pair.points)) * least + ALIKE_SLACK
 
 
 def _refined_pair(rig: Rig, matches: Matches, near: Matches) -> RefinedPair | None:

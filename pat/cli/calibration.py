@@ -59,14 +59,14 @@ class Calibrate:
         if not self.board:
             raise ValueError("which board is in the images? Give it, such as --board charuco:8x6:30mm")
         options.writable(self.out)
-        patterns = options.files_by_name(self.camera, "--camera")
+        patterns = {name: str(pattern) for name, pattern in options.files_by_name(self.camera, "--camera").items()}
         if self.watch:
-            self._watch({name: str(pattern) for name, pattern in patterns.items()})
+            self._watch(patterns)
         found = calibrate_photos(
             self.photos,
             self.board,
             self.out,
-            patterns={name: str(pattern) for name, pattern in patterns.items()},
+            patterns=patterns,
             lens=self.lens,
             depth=self.depth,
             start=self.start,

@@ -117,7 +117,8 @@ def classical_calibrated(
     plane = _rectified_plane(pair, (near, far))
     mono = _warped(_planes(alpha), plane.from_alpha, plane.wh)
     other = _warped(_planes(beta), plane.from_beta, plane.wh)
-    inside = _covered(pair.beta.hw, plane.from_beta, plane.wh)
+    ones = np.ones(pair.beta.hw, np.float32)
+    inside: Image = cv2.warpPerspective(ones, plane.from_beta, plane.wh, flags=cv2.INTER_NEAREST)
     cameras = pair.cameras
     sharpness = float(cameras[1].K[0, 0] / cameras[0].K[0, 0])
     to_alpha = np.linalg.inv(plane.from_alpha)
@@ -352,11 +353,6 @@ def _sampled(image: Image, columns: Image, rows: Image, how: int = cv2.INTER_CUB
 def _warped(image: Image, H: NDArray, wh: tuple[int, int]) -> Image:
     """The image warped by x' ~ H x; its border is repeated beyond."""
     return cv2.warpPerspective(image, H, wh, flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _covered(hw: tuple[int, int], H: NDArray, wh: tuple[int, int]) -> Image:
-    """1 where an image of height and width `hw`, warped by H, has content."""
-    return cv2.warpPerspective(np.ones(hw, np.float32), H, wh, flags=cv2.INTER_NEAREST)
 
 
 def _box(planes: Image) -> Image:

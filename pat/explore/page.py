@@ -147,7 +147,8 @@ class Explorer:
         )
         heading = pn.pane.HTML(HEADING, sizing_mode="stretch_width", styles={"color": TEXT["color"]})
         head = pn.Row(heading, self.layer, reset, save, theme, sizing_mode="stretch_width", align="center")
-        views = [self._view(name, drawn) for name, drawn in zip((self.state.alpha, *self.betas), self._all_figures())]
+        figures = [self.alpha_figure, *self.figures]
+        views = [self._view(name, drawn) for name, drawn in zip((self.state.alpha, *self.betas), figures)]
         rows = [pn.Row(*views[i : i + 2], sizing_mode="stretch_width") for i in range(0, len(views), 2)]
         below = pn.Row(
             pn.Column(self.space, styles=CARD, sizing_mode="stretch_width"),
@@ -159,9 +160,6 @@ class Explorer:
         main = pn.Column(*rows, self.facts, below, sizing_mode="stretch_width")
         side = pn.Column(self.controls.panel(), styles=CARD)
         return pn.Column(head, pn.Row(side, main, sizing_mode="stretch_width"), sizing_mode="stretch_width", margin=12)
-
-    def _all_figures(self) -> list[Any]:
-        return [self.alpha_figure, *self.figures]
 
     def _view(self, name: str, drawn: Any) -> pn.viewable.Viewable:
         """An image with its caption, the zoomed patch in a corner below."""

@@ -128,18 +128,14 @@ class ExplorerScene:
             self.guides[name] = (luminance(image) if image.shape[0] == 3 else image.mean(0, keepdim=True))[None]
 
 
-def dense_field(pair: Pair) -> ReceptiveField:
-    """All of beta, reduced to some two thousand positions."""
-    h, w = pair.beta.hw
-    return Dense(stride=max(1, math.ceil(math.sqrt(h * w / 2048))))
-
-
+DENSE = 2048
+"""Positions of the dense field, roughly."""
 SIZED: dict[str, Callable[[Pair, ExplorerState], ReceptiveField]] = {
     "homography": lambda pair, state: HomographyDisplacement(displacement(pair, state)),
     "rectified": lambda pair, state: Rectified(displacement(pair, state), alpha_is="either"),
     "nearest": lambda pair, state: NearestVoxels(window=max(1, round(displacement(pair, state)))),
     "local": lambda pair, state: Local(9),
-    "dense": lambda pair, state: dense_field(pair),
+    "dense": lambda pair, state: Dense(stride=max(1, math.ceil(math.sqrt(math.prod(pair.beta.hw) / DENSE)))),
     "curved": lambda pair, state: Curved(256),
 }
 """Families whose extent is set by the controls or by the images' size."""
@@ -359,13 +355,8 @@ def fused_colour(scene: ExplorerScene, betas: Mapping[str, BetaReport], state: E
     if not coloured:
         return own
     weights = sum(s.peak for s in coloured)
-    difference = sum((s.peak / weights) * (s.value - grey_of(s.value)) for s in coloured)
+    difference = sum((s.peak / weights) * (s.value - luminance(s.value[:, None, None]).reshape(1)) for s in coloured)
     return own + difference
-
-
-def grey_of(colour: Float[Tensor, "3"]) -> Float[Tensor, "1"]:
-    """Luminance of one colour."""
-    return luminance(colour[:, None, None]).reshape(1)
 
 
 def parameter_lengths(rig: Rig) -> dict[str, int]:

@@ -1,12 +1,10 @@
 """Means over pixels whose surroundings are alike: non-local means (Buades et al. 2005) guided by another image.
 
 What a network makes of noisy views still has some of their noise. Pixels that are alike in its image are averaged in
-it, and then what the cameras recorded there.
+it, and then what betas recorded there.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -24,40 +22,20 @@ far away pixels are, and how much more luma counts than a colour difference. The
 Middlebury's pairs of the tune half."""
 RECORDED = 0.11, 16, 1.25, 0.75
 """Colour is averaged as beta recorded it then: the same, and how much of it is taken where enough is alike."""
-LUMA = 0.1, 5, 0.2
-"""Luma is averaged as alpha recorded it last: the scale, how far away pixels are, and how much of it is taken."""
 ROWS = 16
 """Rows that a thread works on at once: what it sums stays in its cache."""
 
 
-class Noises(NamedTuple):
-    """Mean standard deviation of the noise in alpha and in the betas."""
-
-    alpha: float
-    beta: float
-
-
 def averaged_with_alike(
-    image: Float[Tensor, "3 h w"],
-    alpha: Float[Tensor, "1 h w"],
-    beta: Float[Tensor, "3 h w"],
-    confidence: Float[Tensor, "1 h w"],
-    noise: Noises,
+    image: Float[Tensor, "3 h w"], beta: Float[Tensor, "3 h w"], confidence: Float[Tensor, "1 h w"], deviation: float
 ) -> Float[Tensor, "3 h w"]:
-    """An image with the mean of what is alike near each pixel: of its own colour differences, of those recorded by
-    beta, and of alpha as recorded. `beta` are its values at alpha's pixels, to be used as far as `confidence` says."""
-    luma = luminance(image)
+    """An image with the mean colour of what is alike near each pixel: of its own, and of that recorded by beta.
+
+    Luma stays. `beta` are its values at alpha's pixels, to be used as far as `confidence` says, with noise of this
+    standard deviation in the mean.
+    """
+    luma, counts, root = luminance(image), confidence.square(), deviation**0.5
     colour = (image - luma)[[0, 2]]
-    if noise.beta:
-        colour = _averaged_colour(colour, luma, beta, confidence.square(), noise.beta**0.5)
-    if noise.alpha:
-        scale, radius, share = LUMA
-        sums, weight = sums_of_alike(torch.cat([colour, luma]), alpha, scale * noise.alpha**0.5, radius)
-        luma = torch.lerp(luma, sums / weight, share)
-    return from_luma_chroma(luma, colour)
-
-
-def _averaged_colour(colour: Tensor, luma: Tensor, beta: Tensor, counts: Tensor, root: float) -> Float[Tensor, "2 h w"]:
     scale, radius, detail = OWN
     sums, weight = sums_of_alike(torch.cat([colour, detail * luma]), colour, scale * root, radius)
     colour = sums / weight
@@ -66,7 +44,7 @@ def _averaged_colour(colour: Tensor, luma: Tensor, beta: Tensor, counts: Tensor,
     values = torch.cat([recorded * counts, counts])
     sums, _ = sums_of_alike(torch.cat([colour, detail * luma]), values, scale * root, radius, step=2)
     enough = share * sums[2:] / (sums[2:] + 1)
-    return torch.lerp(colour, sums[:2] / (sums[2:] + 1e-6), enough)
+    return from_luma_chroma(luma, torch.lerp(colour, sums[:2] / (sums[2:] + 1e-6), enough))
 
 
 def sums_of_alike(

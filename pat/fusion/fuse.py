@@ -14,7 +14,7 @@ from arraygeom import ReceptiveField, Rig
 from ..media.images import Images
 from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
-from ..support.memory import give_back, limited, parse_bytes
+from ..support.memory import limited, parse_bytes
 from .checks import check_bands, warn_of_confidence, warn_of_grey
 from .corrections import Corrections, expected_work, find_corrections
 from .inputs import FrameInputs, background_filled, frame_inputs
@@ -127,26 +127,22 @@ def fuse(
     inputs = inputs._replace(inputs=fused)
     with limited(limit):
         state = network.prepare(inputs.inputs)
-    LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
-    with torch.set_grad_enabled(differentiable):
-        wrapped = quiet.wrapped(network)
-        frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
-        frame, matched = quiet.split(frame, len(inputs.inputs.betas))
-    warn_of_confidence(network, frame, inputs)
-    if limit is not None:
-        give_back()
-    frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
-    if luminance != "alpha":
-        frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
-    del inputs, fused, state  # the segments and matches of a large frame: what follows needs memory, too
-    if limit is not None:
-        give_back()
-    steps = steps_for(network, normalise=match_levels)
-    frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
-    LOG.info("back to the pixels of %s", alpha)
-    for back in undo:
-        frame = back(frame)
-    return frame if differentiable else Frame(*(part.detach() for part in frame))
+        LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
+        with torch.set_grad_enabled(differentiable):
+            wrapped = quiet.wrapped(network)
+            frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
+            frame, matched = quiet.split(frame, len(inputs.inputs.betas))
+        warn_of_confidence(network, frame, inputs)
+        frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
+        if luminance != "alpha":
+            frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
+        del inputs, fused, state  # the segments and matches of a large frame: what follows needs memory, too
+        steps = steps_for(network, normalise=match_levels)
+        frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+        LOG.info("back to the pixels of %s", alpha)
+        for back in undo:
+            frame = back(frame)
+        return frame if differentiable else Frame(*(part.detach() for part in frame))
 
 
 def corrections_of(

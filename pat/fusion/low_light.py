@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from arraygeom import sample
 
 from ..media.colour import luminance
+from ..networks.collaborative import luma_refined, without_noise
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
 from ..networks.pieces import tiles_of
 from ..networks.protocol import FusionNetwork, FusionOutput, Inputs
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
-from .averaging import Noises, averaged_with_alike
+from .averaging import averaged_with_alike
 from .results import Frame
 from .steps import FusionStep, Radiometry
 from .views import Views
@@ -152,9 +153,9 @@ def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"
     """An image without noise of this standard deviation; bands other than three are denoised one by one."""
     network = shipped_denoiser()
     if image.shape[1] == 3:
-        return _in_pieces(partial(over_flips, network.colour), image, deviation)
+        return _in_pieces(partial(without_noise, network.colour), image, deviation)
     bands = zip(image.split(1, 1), deviation.split(1, 1))
-    return torch.cat([_in_pieces(partial(over_flips, network.band), *band) for band in bands], 1)
+    return torch.cat([_in_pieces(partial(without_noise, network.band), *band) for band in bands], 1)
 
 
 @torch.no_grad()
@@ -168,14 +169,15 @@ def jointly_denoised(
     def joint(part: Tensor, *seen: Tensor) -> Tensor:
         return over_flips(lambda x, *s: network(x, NoisyView(*s[:3]), NoisyView(*s[3:6]), s[6]), part, *seen)
 
-    noise = Noises(float(alpha.deviation.mean()), float(beta.deviation.mean()))
+    deviation = float(beta.deviation.mean())
 
     def averaged(part: Tensor, *seen: Tensor) -> Tensor:
-        own, other, counts = (image[0] for image in seen)
-        return averaged_with_alike(part[0], own, other, counts, noise)[None]
+        other, counts, own, noise = (image[0] for image in seen)
+        coloured = averaged_with_alike(part[0], other, counts, deviation) if deviation else part[0]
+        return luma_refined(coloured, own, noise)[None]
 
     fused = _in_pieces(joint, image[None], *alpha, *beta, confidence)
-    return _in_pieces(averaged, fused, alpha.recorded, beta.recorded, confidence)[0]
+    return _in_pieces(averaged, fused, beta.recorded, confidence, alpha.recorded, alpha.deviation)[0]
 
 
 def warped(betas: Sequence[NoisyView], found: Sequence[Found]) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:

@@ -20,7 +20,6 @@ from arraygeom.pixels import HW
 
 from ..networks.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
 from ..networks.protocol import FusionNetwork, Inputs, State
-from ..support.memory import give_back
 from ..support.tensor_files import write_tensors
 from .inputs import FrameInputs, depth_and_confidence
 from .results import Frame
@@ -110,7 +109,7 @@ def tiles_within(
 
     if max(memory(one), matching) <= left:
         return [one]
-    most = left / network.bytes_per_pixel
+    most = left / network.working_bytes(1, [0])
     for sides in sides_by_work(frame.hw, halo, network.multiple, most) if matching <= left else ():
         tiles = list(tiles_of(frame.hw, sides, halo))
         if all(memory(tile) <= left for tile in sorted(tiles, key=lambda tile: -area(tile.outer))):
@@ -122,8 +121,8 @@ def tiles_within(
 
 def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
     """Bytes that a tile takes: those for its part of alpha and for the part of each beta that its segments touch."""
-    betas = sum(area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas)
-    return network.bytes_per_pixel * (area(tile.outer) + betas)
+    betas = [area(inputs.touched(beta, tile.outer, 16)) for beta in inputs.betas]
+    return network.working_bytes(area(tile.outer), betas)
 
 
 def held_memory(frame: FrameInputs, state: float, *, whole_frame: bool) -> float:
@@ -217,10 +216,7 @@ def fused_in_tiles(
     """The frame put together from its tiles, or from a folder where finished tiles are."""
 
     def make(tile: Tile) -> Frame:
-        found = fuse_tile(network, frame, state, tile)
-        if len(tiles) > 1:
-            give_back()
-        return found
+        return fuse_tile(network, frame, state, tile)
 
     shown = progress(tiles, len(tiles)) if progress else tiles
     if not store or len(tiles) == 1:

@@ -241,6 +241,15 @@ def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None
         _log_level(level)
 
 
+def decoded_photograph(path: Path, flags: int, *, least: int = 1) -> NDArray | None:
+    """What OpenCV makes of an image file; None for what is none, or has a side under `least` or too many pixels."""
+    content = path.read_bytes()
+    header = image_header(content)
+    if header is None or min(header.hw) < least or header.hw[0] * header.hw[1] > MOST_PIXELS:
+        return None
+    return decoded(content, flags)
+
+
 def _opaque(values: NDArray, label: str) -> NDArray:
     if values.ndim == 2 or values.shape[2] == 3:
         return values

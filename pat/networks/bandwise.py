@@ -33,7 +33,6 @@ class BandwisePAT(nn.Module):
     joins_bands: JoinsBands = "all"
     halo = GuidedPAT.halo
     beta_halo = GuidedPAT.beta_halo
-    bytes_per_pixel = GuidedPAT.bytes_per_pixel
 
     def __init__(self, config: BandwisePATConfig = BandwisePATConfig()) -> None:
         super().__init__()
@@ -41,6 +40,10 @@ class BandwisePAT(nn.Module):
         self.single = GuidedPAT(GuidedPATConfig(**asdict(config)))
         if config.head_dim and self.single.head.last.bias is not None:
             nn.init.zeros_(self.single.head.last.bias)
+
+    def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
+        """As of the network inside."""
+        return self.single.working_bytes(alpha, betas)
 
     def prepare(self, inputs: Inputs) -> Prepared:
         """For each beta how its bands are combined and normalised, and by that its semi-global matches."""
@@ -87,7 +90,7 @@ class BandwisePAT(nn.Module):
         its difference from alpha differs even between similar pixels.
         """
         estimate = self.single.estimate(own, alpha, beta, found, guide=mix.of)
-        base = found.colour[:, 0]
+        base = found.colour[:, 0].to(alpha)
         bands = [
             regressed + self.single.blended(own, regressed, [estimate.beyond(base, i)])
             for i, regressed in enumerate((alpha + base).split(1, 1))

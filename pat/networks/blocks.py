@@ -7,7 +7,14 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import pixel_unshuffle
 from torch.utils._pytree import tree_map
+
+from arraygeom.compiled import compiled, separate_cache
+from arraygeom.fields.protocol import compilable
+
+COLUMNS = 32
+"""Columns whose channels are interleaved at a time: they stay in a core's first cache."""
 
 
 class ResidualBlock(nn.Module):
@@ -56,9 +63,43 @@ def channels_last(x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:
     return x.contiguous(memory_format=torch.channels_last)
 
 
-def stacked(*parts: Float[Tensor, "b _ h w"]) -> Float[Tensor, "b d h w"]:
-    """The channels of all parts, `channels_last`."""
-    return torch.cat([channels_last(part) for part in parts], 1)
+def plain(x: Tensor) -> bool:
+    """Whether compiled loops of float32 can take a tensor: nothing asks for its gradient."""
+    return x.dtype == torch.float32 and compilable(x) and not x.requires_grad
+
+
+def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
+    """The channels of all parts, `channels_last`. Of parts of twice the size the 2x2 pixels become channels, as by
+    `pixel_unshuffle`."""
+    h, w = (min(part.shape[side] for part in parts) for side in (-2, -1))
+    if not all(map(plain, parts)):
+        same = (part if part.shape[-1] == w else pixel_unshuffle(part, 2) for part in parts)
+        return torch.cat([channels_last(part) for part in same], 1)
+    counts = [part.shape[1] * (part.shape[-1] // w) ** 2 for part in parts]
+    out = torch.empty(len(parts[0]), h, w, sum(counts))
+    for part, target in zip(parts, out.split(counts, -1)):
+        if part.shape[-1] == w:
+            target.copy_(part.movedim(1, -1))
+        else:
+            for image, of in zip(part.numpy(), target.numpy()):
+                _unshuffle(image, of)
+    return out.movedim(-1, 1)
+
+
+@compiled(nogil=True, cache=True)
+def _unshuffle(image, out):
+    """The 2x2 pixels of images (c, 2 h, 2 w) as channels of `out` (h, w, 4 c), a few columns at a time."""
+    channels, (height, width) = len(image), out.shape[:2]
+    for y in range(height):
+        for left in range(0, width, COLUMNS):
+            for c in range(channels):
+                above, below, k = image[c, 2 * y], image[c, 2 * y + 1], 4 * c
+                for x in range(left, min(left + COLUMNS, width)):
+                    out[y, x, k], out[y, x, k + 1] = above[2 * x], above[2 * x + 1]
+                    out[y, x, k + 2], out[y, x, k + 3] = below[2 * x], below[2 * x + 1]
+
+
+separate_cache(_unshuffle)
 
 
 def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:

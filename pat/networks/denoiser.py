@@ -82,17 +82,30 @@ class ColourDenoising(nn.Module):
         """Of any size."""
         h, w = image.shape[-2:]
         enough = (0, -w % MULTIPLE, 0, -h % MULTIPLE)
-        axes = image.new_tensor(OPPONENT)
-        bands = pad(torch.einsum("ij,bjhw->bihw", axes, image - 0.5), enough, mode="replicate")
-        noise = torch.einsum("ij,bjhw->bihw", axes.square(), deviation.square()).sqrt()
-        noise = pad(noise, enough, mode="replicate")
+        bands = pad(opponent(image - 0.5), enough, mode="replicate")
+        noise = pad(opponent_deviation(deviation), enough, mode="replicate")
         blurred = avg_pool2d(pad(bands, (BLUR,) * 4, mode="replicate"), 2 * BLUR + 1, 1)
         share = noise.square() / (noise.square() + COLOUR_NOISE**2)
         share = torch.cat([torch.zeros_like(share[:, :1]), share[:, 1:]], 1)
         base = torch.lerp(bands, blurred, share)
         given = [pixel_unshuffle(bands, 2), SCALE * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)]
         found = pixel_shuffle(self.network(torch.cat(given, 1)).float(), 2)
-        return 0.5 + torch.einsum("ji,bjhw->bihw", axes, base - noise * found)[..., :h, :w]
+        return 0.5 + rgb_of_opponent(base - noise * found)[..., :h, :w]
+
+
+def opponent(rgb: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    """Brightness and two colour differences, on orthogonal axes of unit length."""
+    return torch.einsum("ij,bjhw->bihw", rgb.new_tensor(OPPONENT), rgb)
+
+
+def opponent_deviation(deviation: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    """The standard deviation of `opponent` bands from those of independent red, green and blue."""
+    return torch.einsum("ij,bjhw->bihw", deviation.new_tensor(OPPONENT).square(), deviation.square()).sqrt()
+
+
+def rgb_of_opponent(bands: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
+    """The inverse of `opponent`."""
+    return torch.einsum("ji,bjhw->bihw", bands.new_tensor(OPPONENT), bands)
 
 
 class LowLightNetwork(nn.Module):

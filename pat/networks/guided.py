@@ -8,34 +8,38 @@ pixels of high confidence to the others, and adds it to alpha.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn.functional import avg_pool2d, pixel_shuffle, pixel_unshuffle
+from torch.nn.functional import avg_pool2d, conv2d, pixel_shuffle, pixel_unshuffle
 
 from arraygeom import Local, Pair, Segments, View, lazily
+from arraygeom.fields.grid import Box
 
-from ..attention import Attended, attend, attend_with_statistics
+from ..attention import attend, attend_with_statistics
 from ..media.colour import luminance
-from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
+from .blocks import ResidualBlock, channels_last, conv, enlarge, plain, stacked
 from .configs import GuidedPATConfig
-from .matching import semi_global_matching
-from .pieces import Prepared, prepared
+from .matching import matched
+from .pieces import Prepared, from_pieces, prepared, whole
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import (
     FINE,
+    Extent,
     HalfSizeMatches,
     Normalisations,
     SemiGlobalMatches,
-    along,
     matches,
 )
 from .several import agreed, can_agree
 from .warped import FILLS, diffused_from, likeness, matched_colours
+from .windows import attend_to_windows
 
 COARSE = 4
 """Context is computed at a quarter of the size."""
@@ -52,6 +56,9 @@ LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
 LIKEST = 3.0
 """How much more a beta's colour counts, as a logit, where it is as bright as alpha than where it is unlike it."""
+PARALLAX = 2.0
+"""The power of a beta's parallax by which the odds that its colour is right fall: what it sees past depth's edges, and
+how far a wrong depth displaces it, grow with parallax."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
 
@@ -59,26 +66,31 @@ NOWHERE = -10.0
 class BetaEstimate(NamedTuple):
     """The colour of alpha's view according to one beta.
 
+    attended: (B, 2, H, W), position, deviation: (B, H, W), and peak: (B, H, W), as of `Attended`.
     colour: (B, C, H, W), its bands minus alpha, attended and matched, mixed.
     diffused: (B, fills, C, H, W), the same diffused within alpha from pixels of high weight.
     logit: (B, 1, H, W), of the confidence that `colour` is of the point that alpha sees.
     choice: (B, 1 + fills, H, W), logits of the alternatives where it is not: propagated, or each of `diffused`.
     position: (B, 2, H, W), the semi-global match in beta, pixels; beyond beta's edge where the segment is cut there.
     likeness: (B, 1, H, W), of alpha's brightness and that attended in beta, 0 to 1.
+    prior: how much more its colour counts than another beta's, as a logit.
     """
 
-    attended: Attended
+    attended: Tensor
+    deviation: Tensor
+    peak: Tensor
     colour: Tensor
     diffused: Tensor
     logit: Tensor
     choice: Tensor
     position: Tensor
     likeness: Tensor
+    prior: float = 0.0
 
     @property
     def confidence(self) -> Float[Tensor, "b h w"]:
         """That `colour` is of the point that alpha sees, 0 to 1."""
-        return self.logit[:, 0].sigmoid() * (self.attended.peak > 0)
+        return self.logit[:, 0].sigmoid() * (self.peak > 0)
 
     @property
     def blending(self) -> Float[Tensor, "b 1 h w"]:
@@ -114,7 +126,6 @@ class GuidedPAT(nn.Module):
     halo = 640
     """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
     beta_halo = 96
-    bytes_per_pixel = 190.0
 
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
@@ -129,35 +140,53 @@ class GuidedPAT(nn.Module):
             self.propagate = UNet(w4 + 2 * c.bands, c.widths[1:], w2)
             self.head = Head(4 * (1 + 3 * c.bands) + 2 * w2, c.head_dim, c.bands)
 
+    def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
+        """In the head; or around attention, which comes for one beta after the other; and the estimates of others."""
+        most = max(betas, default=0)
+        return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
+
     def prepare(self, inputs: Inputs) -> Prepared:
         """Semi-global matches of each beta, and how its whole image is normalised.
 
         Betas that each have all bands agree on depth, and share the colour that is diffused.
         """
-        found = prepared(inputs, _normalisations, lambda found: (brightness, found), _matches)
-        if not can_agree(inputs) or self._in_parts(inputs):
-            return found
-        return replace(found, matches=self._shared(inputs, found))
+        shares = can_agree(inputs) and not self._in_parts(inputs)
+        match = partial(_matches, coloured=not shares)
+        found = prepared(inputs, _normalisations, lambda found: (brightness, found), match)
+        return self._shared(inputs, found) if shares else found
 
     def _in_parts(self, inputs: Inputs) -> bool:
         """Whether each beta has some of the bands, in order; else those with all of them show the same colours."""
         return all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
 
     @torch.no_grad()
-    def _shared(self, inputs: Inputs, found: Prepared) -> tuple[SemiGlobalMatches, ...]:
+    def _shared(self, inputs: Inputs, found: Prepared) -> Prepared:
         """The matches with the depth on which all betas agree, and colour diffused from all that have all bands."""
-        alpha, agreement = inputs.alpha, agreed(inputs, found.matches)
-        colours = [
-            matched_colours(alpha, brightness(b.image), b.image, b.field.straight, *where, normalisations.whole)
-            for b, where, normalisations in zip(inputs.betas, agreement, found.common)
-        ]
-        full = [(m, w) for m, w in colours if m.shape[1] == self.config.bands]
-        weights = torch.stack([weight for _, weight in full])
-        mixed = (weights * torch.stack([m for m, _ in full])).sum(0) / weights.sum(0)
-        diffused = diffused_from(mixed, alpha, weights.amax(0))
-        return tuple(
-            SemiGlobalMatches(*where, matched, diffused if matched.shape[1] == self.config.bands else own.colour)
-            for where, (matched, _), own in zip(agreement, colours, found.matches)
+        matches, prior = agreed(inputs, found.matches), _priors(inputs)
+        full = [beta.image.shape[1] == self.config.bands for beta in inputs.betas]
+
+        def colours(box: Box) -> list[Tensor]:
+            large = box != whole(inputs.hw).outer
+            ones = [inputs.of_beta(i).cut(box) if large else inputs.of_beta(i) for i in range(len(full))]
+            alpha = ones[0].alpha
+            alone = [_colours(alpha, o.betas[0], m.cut(box), n) for o, m, n in zip(ones, matches, found.common)]
+            counting = [(c, w * math.exp(p)) for (c, w), p, counts in zip(alone, prior, full) if counts]
+            weights = torch.stack([weight for _, weight in counting])
+            mixed = sum(weight * colour for colour, weight in counting) / weights.sum(0)
+            shared = diffused_from(mixed, alpha, torch.stack([w for (_, w), c in zip(alone, full) if c]).amax(0))
+            fills = [shared, *(diffused_from(m, alpha, w) for (m, w), counts in zip(alone, full) if not counts)]
+            parts = fills + [colour for colour, _ in alone]
+            return [part.half() for part in parts] if large else parts
+
+        shared, *parts = from_pieces(inputs.hw, inputs.multiple, colours)
+        fills, matched = iter(parts[: -len(full)]), parts[-len(full) :]
+        return replace(
+            found,
+            prior=prior,
+            matches=tuple(
+                one._replace(matched=m, colour=shared if counts else next(fills))
+                for one, m, counts in zip(matches, matched, full)
+            ),
         )
 
     def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
@@ -191,21 +220,21 @@ class GuidedPAT(nn.Module):
         state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
         alpha, own = inputs.alpha, self.encoder(inputs.alpha)
         known = zip(inputs.betas, state.matches, state.common)
-        return own, [self.estimate(own, alpha, b, _with_gradient(alpha, b, found, n)) for b, found, n in known]
+        found = [self.estimate(own, alpha, b, _with_gradient(alpha, b, found, n)) for b, found, n in known]
+        return own, [e._replace(prior=prior) for e, prior in zip(found, state.prior)] if state.prior else found
 
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
     ) -> Float[Tensor, "b c h w"]:
         """What all bands have more than alpha: where the betas see it, where not, and what the head adds."""
-        confidence = torch.cat([s.blending.expand_as(s.colour) for s in estimates], 1)
-        colour = torch.cat([s.colour for s in estimates], 1)
-        rest = torch.cat([self._unseen(own, s) for s in estimates], 1)
-        blend = torch.lerp(rest, colour, confidence)
+        confidence = _joined([s.blending.expand_as(s.colour) for s in estimates])
+        colour = _joined([s.colour for s in estimates])
+        blend = torch.lerp(_joined([self._unseen(own, s) for s in estimates]), colour, confidence)
         if not self.config.head_dim:
             return blend
         rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), COARSE)
         context = self.propagate(stacked(own.quarter, rough))
-        return blend + HEAD_SHARE * self.head(torch.cat([alpha, blend, colour, confidence], 1), own.half, context)
+        return blend + HEAD_SHARE * self.head(alpha, blend, colour, confidence, own.half, enlarge(context))
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are similar in
@@ -215,8 +244,8 @@ class GuidedPAT(nn.Module):
         colour = avg_pool2d(estimate.colour * confidence, COARSE) / (weight + LEAST_WEIGHT)
         for step in self.propagation:
             colour, weight = step(own.quarter, colour, weight)
-        choices = torch.cat([enlarge(colour, COARSE)[:, None], estimate.diffused], 1)
-        return (estimate.choice.softmax(1)[:, :, None] * choices).sum(1)
+        choices = enlarge(colour, COARSE), *estimate.diffused.to(colour).unbind(1)
+        return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
     def estimate(
         self,
@@ -230,23 +259,22 @@ class GuidedPAT(nn.Module):
         """The estimate of one beta of any bands; `guide` is what of these is compared with alpha."""
         of, exactly = guide or brightness, alpha.dtype if self.training else torch.float64
         segments = _in_type(beta.field.straight, exactly)
-        attended = self._attended(own, self.encoder(of(beta.image)), beta.image, segments, found)
-        value = attended.value
-        facts = [of(value) - alpha, attended.peak[:, None], attended.deviation[:, None]]
+        extent = Extent.of(segments)
+        position = matches(segments, found.disparity, beyond_edge=True, extent=extent).movedim(-1, 1)
+        window = window_around(found.disparity, segments, self.config.window, extent)
+        del extent
+        other = self.encoder(of(beta.image))
+        value, attended, deviation, peak = attend_with_statistics(
+            self._key(own), self._key(other), beta.image, window, samples=self.config.taps
+        )
+        del other, window
+        facts = [of(value) - alpha, peak[:, None], deviation[:, None]]
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
-        logit = torch.where(attended.peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, found.matched, (exact + EXACT_OFFSET).sigmoid())
-        position = matches(segments, found.disparity, beyond_edge=True).movedim(-1, 1)
+        logit = torch.where(peak[:, None] > 0, logit, NOWHERE)
+        colour = torch.lerp(value - alpha, found.matched.to(value), (exact + EXACT_OFFSET).sigmoid())
         alike = likeness(facts[0], LIKENESS)
-        return BetaEstimate(attended, colour, found.colour, logit, choice, position, alike)
-
-    def _attended(
-        self, own: Encoded, other: Encoded, bands: Tensor, segments: Segments, found: SemiGlobalMatches
-    ) -> Attended:
-        """Beta's bands around the matches."""
-        window = window_around(found.disparity, segments, self.config.window)
-        return attend_with_statistics(self._key(own), self._key(other), bands, window, samples=self.config.taps)
+        return BetaEstimate(attended, deviation, peak, colour, found.colour, logit, choice, position, alike)
 
     def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
@@ -254,14 +282,26 @@ class GuidedPAT(nn.Module):
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
         rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, COARSE)], 1)
         context = self.judge(stacked(own.quarter, rough))
-        return self.confidence(stacked(enlarge(context), own.half, matched, pixel_unshuffle(facts, 2)))
+        return self.confidence(stacked(enlarge(context), own.half, matched, facts))
 
     def _key(self, features: Encoded) -> Tensor:
         """What queries and keys are at full size; the channels are beside each other, as attention wants them."""
-        x = self.fine_key(features.half)
-        b, c, h, w = x.shape
-        pixels = x.view(b, c // 4, 2, 2, h, w).permute(0, 4, 2, 5, 3, 1)
+        weight, bias = (p.unflatten(0, (-1, 2, 2)).movedim(0, 2).flatten(0, 2) for p in self.fine_key.parameters())
+        x = conv2d(features.half, weight, bias).movedim(1, -1)
+        b, h, w, c = x.shape
+        pixels = x.unflatten(-1, (2, c // 2)).movedim(3, 2)
         return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
+
+
+def _priors(inputs: Inputs) -> tuple[float, ...]:
+    """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
+    straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
+    lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
+    return tuple(PARALLAX * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
+
+
+def _joined(bands: list[Tensor]) -> Tensor:
+    return torch.cat(bands, 1) if len(bands) > 1 else bands[0]
 
 
 def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]) -> FusionOutput:
@@ -269,7 +309,7 @@ def output_of(image: Float[Tensor, "b c h w"], estimates: Sequence[BetaEstimate]
     return FusionOutput(
         image,
         [s.position for s in estimates],
-        [s.attended.deviation for s in estimates],
+        [s.deviation for s in estimates],
         [s.confidence for s in estimates],
     )
 
@@ -282,17 +322,19 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
     if len(estimates) == 1:
         return estimates[0]
     logits = torch.stack([e.logit for e in estimates])
-    weights = (logits + LIKEST * torch.stack([e.likeness for e in estimates])).softmax(0)
+    weights = torch.stack([e.logit + LIKEST * e.likeness + e.prior for e in estimates]).softmax(0)
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         return sum(w * p for w, p in zip(weights, parts)) + torch.zeros_like(parts[0])
 
     first = estimates[0]
-    peak = torch.stack([e.attended.peak for e in estimates]).amax(0)
+    shared = all(e.diffused is first.diffused for e in estimates)
     return BetaEstimate(
-        first.attended._replace(peak=peak),
+        first.attended,
+        first.deviation,
+        torch.stack([e.peak for e in estimates]).amax(0),
         mean([e.colour for e in estimates]),
-        mean([e.diffused.transpose(0, 1) for e in estimates]).transpose(0, 1),
+        first.diffused if shared else mean([e.diffused.transpose(0, 1) for e in estimates]).transpose(0, 1),
         logits.amax(0),
         mean([e.choice for e in estimates]),
         first.position,
@@ -337,14 +379,20 @@ class Propagation(nn.Module):
         view = View(hw=(features.shape[-2], features.shape[-1]))
         query = torch.cat([self.query(features), torch.ones_like(weight)], 1)
         key = torch.cat([self.key(features), (weight + LEAST_WEIGHT).log()], 1)
-        look = lazily(self.field, Pair(view, view))
-        found = attend(query, key, torch.cat([colour, weight], 1), look, interpolation="nearest")
+        value = torch.cat([colour, weight], 1)
+        if all(plain(part) for part in (query, key, value)):
+            found = attend_to_windows(query, key, value, self.field.size, round(self.field.spacing))
+        else:
+            found = attend(query, key, value, lazily(self.field, Pair(view, view)), interpolation="nearest")
         return found[:, :-1], found[:, -1:]
 
 
-def window_around(disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float) -> Segments:
+def window_around(
+    disparity: Float[Tensor, "b 1 h w"], segments: Segments, window: float, extent: Extent | None = None
+) -> Segments:
     """The parts of segments (B or 1, 2 h, 2 w) up to `window` pixels from the match at `disparity` from their end."""
-    middle, step = matches(segments, disparity), window * along(segments)
+    extent = extent or Extent.of(segments)
+    middle, step = matches(segments, disparity, extent=extent), window * extent.towards
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
@@ -352,12 +400,17 @@ def _with_gradient(
     alpha: Tensor, beta: Beta, found: SemiGlobalMatches, normalisations: Normalisations
 ) -> SemiGlobalMatches:
     """The same matches; if the segments or images have a gradient, with colours that have it too."""
-    segments = beta.field.straight
-    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (segments.end, beta.image, alpha))):
+    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (beta.field.straight.end, beta.image, alpha))):
         return found
-    where = found.disparity, found.facts
-    matched, _ = matched_colours(alpha, brightness(beta.image), beta.image, segments, *where, normalisations.whole)
-    return found._replace(matched=matched)
+    return found._replace(matched=_colours(alpha, beta, found, normalisations)[0])
+
+
+def _colours(
+    alpha: Tensor, beta: Beta, found: SemiGlobalMatches, normalisations: Normalisations
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+    """A beta's bands minus alpha at its matches, and their weight."""
+    where = beta.field.straight, found.disparity, found.facts
+    return matched_colours(alpha, brightness(beta.image), beta.image, *where, normalisations.whole)
 
 
 def _in_type(segments: Segments, kind: torch.dtype) -> Segments:
@@ -370,13 +423,18 @@ def _normalisations(inputs: Inputs) -> Normalisations:
     return Normalisations.of(inputs.alpha, brightness(inputs.betas[0].image))
 
 
-def _matches(inputs: Inputs, normalisations: Normalisations, half: HalfSizeMatches | None) -> SemiGlobalMatches:
-    """The matches of the one beta."""
-    (beta,) = inputs.betas
-    segments, blocks = beta.field.straight, None if half else beta.field.of_blocks(FINE)
-    return semi_global_matching(
-        inputs.alpha, brightness(beta.image), beta.image, segments, blocks, normalisations, half
-    )
+def _matches(
+    inputs: Inputs, normalisations: Normalisations, half: HalfSizeMatches | None, *, coloured: bool
+) -> SemiGlobalMatches:
+    """The matches of the one beta; if they are not to be coloured, with colours of no bands."""
+    alpha, (beta,) = inputs.alpha, inputs.betas
+    blocks = None if half else beta.field.of_blocks(FINE)
+    where = matched(alpha, brightness(beta.image), beta.field.straight, blocks, normalisations, half)
+    found = SemiGlobalMatches(*where, alpha[:, :0], alpha[:, None, :0])
+    if not coloured:
+        return found
+    colour, weight = _colours(alpha, beta, found, normalisations)
+    return found._replace(matched=colour, colour=diffused_from(colour, alpha, weight))
 
 
 class Encoder(nn.Module):
@@ -428,6 +486,6 @@ class Head(nn.Module):
         self.last = nn.Conv2d(width, 4 * bands, 3, padding=1)
         nn.init.zeros_(self.last.weight)
 
-    def forward(self, fine: Tensor, half: Tensor, context: Tensor) -> Tensor:
-        """(B, bands, H, W), from images at full size, features at 1/2 and the context at 1/4."""
-        return pixel_shuffle(self.last(self.start(stacked(pixel_unshuffle(fine, 2), half, enlarge(context)))), 2)
+    def forward(self, *parts: Tensor) -> Tensor:
+        """(B, bands, H, W), from images at full size, features and context at 1/2."""
+        return pixel_shuffle(self.last(self.start(stacked(*parts))), 2)

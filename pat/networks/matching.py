@@ -28,11 +28,11 @@ from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
     FINE,
+    Extent,
     HalfSizeMatches,
     Normalisation,
     Normalisations,
     SemiGlobalMatches,
-    along,
     filled,
     geometry_of,
     inner_and_outer,
@@ -147,8 +147,9 @@ def precise(
     near = consistent & ((disparity - rough).abs() < SAME)
     start = torch.where(near, (disparity + rough) / 2, disparity)
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
-    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start)[0].split(1, 1)
-    towards = along(segments).movedim(-1, 1).to(other)
+    extent = Extent.of(segments)
+    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start, extent)[0].split(1, 1)
+    towards = extent.towards.movedim(-1, 1).to(other)
     mean = partial(box_mean, radius=2 * STEP_RADIUS)
     rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
     rise, rest = rise - mean(rise), rest - mean(rest)

@@ -34,7 +34,6 @@ class PAT(nn.Module):
     multiple = 1
     equal_resolution = False
     joins_bands: JoinsBands = "no"
-    bytes_per_pixel = 1600.0
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
@@ -59,6 +58,10 @@ class PAT(nn.Module):
             image = image + self._enlarged(inputs.alpha)
         _, position, deviation, confidence = (list(part) for part in zip(*attended))
         return FusionOutput(image, position, deviation, confidence)
+
+    def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
+        """Features of all views, measured."""
+        return 1600.0 * (alpha + sum(betas))
 
     def prepare(self, inputs: Inputs) -> None:
         """Nothing: each part of a frame is fused by itself."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import torch
@@ -14,7 +14,6 @@ from torch import Tensor
 from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
-from ..support.memory import give_back
 from .protocol import Inputs
 from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches, matched_at_half_size
 
@@ -91,42 +90,54 @@ def matched_in_pieces(
 
     `brightness` makes of beta's bands what alpha is compared with; `normalisations` are those of whole images.
     """
-    pieces = matching_pieces(inputs.hw, inputs.multiple)
-    if len(pieces) == 1:
+    if len(matching_pieces(inputs.hw, inputs.multiple)) == 1:
         return match(inputs, None)
     (beta,) = inputs.betas
     half = matched_at_half_size(inputs.alpha, brightness(beta.image), beta.field.of_blocks(FINE), normalisations.half)
-    give_back()
+    parts = from_pieces(inputs.hw, inputs.multiple, lambda box: match(inputs.cut(box), half.cut(box)).stored())
+    return SemiGlobalMatches(*parts)
+
+
+def from_pieces(hw: HW, multiple: int, make: Callable[[Box], Iterable[Tensor]]) -> list[Tensor]:
+    """Planes put together from the inner parts of the pieces in which a frame is matched. `make` gives those of a box;
+    they may be smaller than it by whole factors."""
     found: list[Tensor] = []
-    for inner, outer in pieces:
-        top, bottom, left, right = inner
-        part = match(inputs.cut(outer), half.cut(outer))
-        part = part.cut((top - outer[0], bottom - outer[0], left - outer[2], right - outer[2])).stored()
-        steps = [(bottom - top) // p.shape[-2] for p in part]
-        found = found or [p.new_empty(*p.shape[:-2], *(n // s for n in inputs.hw)) for p, s in zip(part, steps)]
-        for target, p, s in zip(found, part, steps):
-            target[..., top // s : bottom // s, left // s : right // s] = p
-        del part, p
-        give_back()
-    return SemiGlobalMatches(*found)
+    for inner, outer in matching_pieces(hw, multiple):
+        parts = list(make(outer))
+        if inner == outer:
+            return parts
+        steps = [(outer[1] - outer[0]) // part.shape[-2] for part in parts]
+        found = found or [p.new_empty(*p.shape[:-2], *(n // s for n in hw)) for p, s in zip(parts, steps)]
+        for target, part, s in zip(found, parts, steps):
+            top, bottom, left, right = (n // s for n in inner)
+            y, x = top - outer[0] // s, left - outer[2] // s
+            target[..., top:bottom, left:right] = part[..., y : y + bottom - top, x : x + right - left]
+        del parts, part
+    return found
 
 
 @dataclass(frozen=True)
 class Prepared:
-    """The matches of each beta, and what else holds for a whole beta (`common`, one for each)."""
+    """The matches of each beta, and what else holds for a whole beta: `common`, one for each, and `prior`, the logits
+    by which colours of some count more than those of others."""
 
     matches: tuple[SemiGlobalMatches, ...]
     common: tuple[Any, ...]
+    prior: tuple[float, ...] = ()
 
     @property
     def nbytes(self) -> int:
         """Memory held, of a large frame: as `stored`."""
-        colours = sum(found.matched.numel() + found.colour.numel() for found in self.matches)
-        return 2 * colours + sum(found.disparity.nbytes + found.facts.nbytes for found in self.matches)
+        colours = {id(part): part.numel() for found in self.matches for part in (found.matched, found.colour)}
+        return 2 * sum(colours.values()) + sum(found.disparity.nbytes + found.facts.nbytes for found in self.matches)
 
     def cut(self, box: Box) -> Prepared:
-        """Of a part of alpha."""
-        return Prepared(tuple(found.cut(box) for found in self.matches), self.common)
+        """Of a part of alpha. Colour that several share, they share there too."""
+        parts, shared = [found.cut(box) for found in self.matches], dict[int, Tensor]()
+        for found, part in zip(self.matches, parts):
+            shared.setdefault(id(found.colour), part.colour)
+        matches = (part._replace(colour=shared[id(found.colour)]) for found, part in zip(self.matches, parts))
+        return replace(self, matches=tuple(matches))
 
 
 @torch.no_grad()

@@ -21,7 +21,7 @@ class Beta:
     """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
 
     `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
-    `track` gives the tracks of alpha's pixels (*n, 2) in the whole image of a calibrated beta; None for parts.
+    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta.
     """
 
     image: Float[Tensor, "b c h w"]
@@ -78,7 +78,19 @@ class Inputs:
     def _cut(self, beta: Beta, box: Box) -> Beta:
         y0, y1, x0, x1 = self.touched(beta, box)
         offset = (beta.offset[0] + x0, beta.offset[1] + y0)
-        return Beta(beta.image[..., y0:y1, x0:x1], beta.field.cut(box, (x0, y0)), offset)
+        track = beta.track and _part_of(beta.track, (box[2], box[0]), (x0, y0))
+        return Beta(beta.image[..., y0:y1, x0:x1], beta.field.cut(box, (x0, y0)), offset, track)
+
+
+def _part_of(
+    track: Callable[[Tensor], Track], own: tuple[int, int], other: tuple[int, int]
+) -> Callable[[Tensor], Track]:
+    """The tracks of a part of alpha in a part of beta, which begin at these pixels (x, y)."""
+
+    def shifted(v: Tensor) -> Tensor:
+        return torch.cat([v[..., :2] - v.new_tensor(other) * v[..., 2:], v[..., 2:]], -1)
+
+    return lambda x: Track(*map(shifted, track(x + x.new_tensor(own))))
 
 
 def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
@@ -160,8 +172,6 @@ class FusionNetwork(Protocol):
     """How far around a pixel alpha's image, and the fields of its pixels, can matter, pixels."""
     beta_halo: int
     """How far around the segments beta's image can matter, pixels."""
-    bytes_per_pixel: float
-    """Working memory for each pixel of alpha and of the betas, measured."""
     multiple: int
     """Images are padded to multiples of this, and cut at them."""
     equal_resolution: bool
@@ -169,6 +179,10 @@ class FusionNetwork(Protocol):
     joins_bands: JoinsBands
     """Which co-located betas are to come as one of several bands: none, those that follow each other (where the order
     of the bands matters), or all."""
+
+    def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
+        """Memory that fusing so many pixels of alpha with so many of each beta takes, beside the inputs, measured."""
+        ...
 
     def prepare(self, inputs: Inputs) -> State | None:
         """What must be known of whole images (of whole multiples) before parts of them are fused, if anything."""

@@ -71,11 +71,10 @@ class SemiGlobalMatches(NamedTuple):
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        colours = (part[whole].to(self.disparity) for part in (self.matched, self.colour))
-        return SemiGlobalMatches(self.disparity[whole], self.facts[half], *colours)
+        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
 
     def stored(self) -> SemiGlobalMatches:
-        """The same with colours as float16, which `cut` reads; differences from alpha are rounded by 1e-4 at most."""
+        """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
         return self._replace(matched=self.matched.half(), colour=self.colour.half())
 
 
@@ -277,17 +276,35 @@ def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
 
 
 def matches(
-    segments: Segments, disparity: Float[Tensor, "b 1 _ _"], *, beyond_edge: bool = False
+    segments: Segments,
+    disparity: Float[Tensor, "b 1 _ _"],
+    *,
+    beyond_edge: bool = False,
+    extent: Extent | None = None,
 ) -> Float[Tensor, "b h w 2"]:
     """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels.
 
-    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`.
+    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is the
+    segments', if it is known.
     """
-    length = length_of(segments)
+    length, towards = extent or Extent.of(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
         disparity = interpolate(disparity, scale_factor=FINE, mode="bilinear")
     far = disparity[:, 0].to(length).clamp(min=0)
-    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * along(segments, length)
+    return segments.end + (far if beyond_edge else far.minimum(length))[..., None] * towards
+
+
+class Extent(NamedTuple):
+    r"""Lengths of segments (\*n), and unit vectors from end to start (\*n, 2)."""
+
+    length: Tensor
+    towards: Tensor
+
+    @classmethod
+    def of(cls, segments: Segments) -> Extent:
+        """That of segments."""
+        length = length_of(segments)
+        return cls(length, along(segments, length))
 
 
 def length_of(segments: Segments) -> Float[Tensor, "*n"]:

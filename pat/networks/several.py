@@ -7,6 +7,10 @@ pixel is in every beta, and, by a depth buffer, which betas see it.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import cv2
@@ -17,11 +21,14 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.epipolar import Track
+from arraygeom.epipolar import FRONT, Track
+from arraygeom.fields.grid import Box
+from arraygeom.pixels import HW
 
 from ..media.colour import to_bytes
+from .pieces import from_pieces
 from .protocol import Beta, Inputs
-from .semi_global import CONSISTENT, DISPARITY_FILL, FINE, SemiGlobalMatches, along, enlarged, filled
+from .semi_global import CONSISTENT, DISPARITY_FILL, FINE, Extent, SemiGlobalMatches, enlarged, filled
 
 SUPPORT = 1.5
 """A beta supports an inverse depth that is less than this many of its pixels from its own match."""
@@ -29,7 +36,12 @@ FARTHEST = 8.0
 """A difference of disparities of this many half-size pixels is 1 in the facts, as in semi-global matching."""
 
 
-class MatchedBeta(NamedTuple):
+STRIP = 1 << 16
+"""Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's cache."""
+
+
+@dataclass(frozen=True)
+class MatchedBeta:
     """One beta at alpha's pixels, (h, w): segments, tracks, matches and their facts."""
 
     segments: Segments
@@ -39,44 +51,72 @@ class MatchedBeta(NamedTuple):
     hw: tuple[int, int]
 
     @classmethod
-    def of(cls, beta: Beta, found: SemiGlobalMatches) -> MatchedBeta:
-        """Of a beta with a track, and its own matches."""
-        pixels, disparity = beta.field.straight, found.disparity[0, 0]
-        segments = Segments(pixels.start[0].double(), pixels.end[0].double(), pixels.valid[0])
+    def of(cls, beta: Beta, found: SemiGlobalMatches, rows: tuple[int, int]) -> MatchedBeta:
+        """Of a beta with a track and its own matches, at some of alpha's rows: from an even one to an even one."""
+        top, bottom = rows
+        pixels, disparity = beta.field.straight, found.disparity[0, 0, top:bottom]
+        start, end = (x[0, top:bottom].double() for x in (pixels.start, pixels.end))
         assert beta.track is not None
-        track = beta.track(pixel_grid((disparity.shape[0], disparity.shape[1]), dtype=torch.float64))
+        x = pixel_grid((bottom - top, disparity.shape[1]), dtype=torch.float64, device=end.device)
+        x = x + end.new_tensor([0.0, top])
         size = (beta.image.shape[-2], beta.image.shape[-1])
-        facts = enlarged(found.facts)[0]
-        return cls(segments, track, disparity.to(segments.end), facts.to(segments.end), size)
+        facts = enlarged(found.facts[0, :, top // FINE : bottom // FINE])
+        segments = Segments(start, end, pixels.valid[0, top:bottom])
+        return cls(segments, beta.track(x), disparity.to(end), facts.to(end), size)
+
+    @cached_property
+    def extent(self) -> Extent:
+        """That of the segments."""
+        return Extent.of(self.segments)
+
+    @cached_property
+    def _end(self) -> Float[Tensor, "h w"]:
+        """How far along their own directions the segments' ends are from beta's first pixel."""
+        (x, y), (u, v) = self.segments.end.unbind(-1), self.extent.towards.unbind(-1)
+        return torch.addcmul(x * u, y, v)
 
     @property
     def inverse_depth(self) -> tuple[Float[Tensor, "h w"], Bool[Tensor, "h w"]]:
         """Of the matches, and where these are consistent and have one."""
-        found = depth_from_track(self.track, self.segments.end + self.disparity[..., None] * along(self.segments))
+        found = depth_from_track(self.track, self.segments.end + self.disparity[..., None] * self.extent.towards)
         known = found.valid & self.segments.valid & (self.facts[0] < CONSISTENT)
         return torch.where(known, 1 / torch.where(known, found.depth, 1.0), 0.0), known
 
+    def _seen(self, inverse_depth: Float[Tensor, "h w"]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+        """Beta's pixels as by `Track.at`, x and y apart, which takes a fraction of the time."""
+        x, y, z = (torch.addcmul(p, inverse_depth, d) for p, d in zip(self.track.a.unbind(-1), self.track.b.unbind(-1)))
+        z = torch.where(z > FRONT, z, 1.0)
+        return x / z, y / z
+
     def disparity_of(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
         """How far along its segment from the end the point of an inverse depth is, pixels; not clipped."""
-        return ((self.track.at(inverse_depth) - self.segments.end) * along(self.segments)).sum(-1)
+        (x, y), (u, v) = self._seen(inverse_depth), self.extent.towards.unbind(-1)
+        return torch.addcmul(x * u, y, v) - self._end
 
     def differs(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
         """Pixels from the match to the point of an inverse depth."""
         return (self.disparity_of(inverse_depth) - self.disparity).abs()
 
-    def hidden(self, inverse_depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-        """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the image.
+    def depth_buffer(self) -> Float[Tensor, "n"]:
+        """The nearest inverse depth at each pixel of half of beta's size (alpha's pixels leave no holes in it), row by
+        row, and one more for what is outside: all empty."""
+        return self.disparity.new_zeros(math.prod(-(-n // FINE) for n in self.hw) + 1)
 
-        By a depth buffer of half of beta's size: alpha's pixels leave no holes in it.
-        """
-        x = self.track.at(inverse_depth)
+    def enter(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> None:
+        """Enter points into a depth buffer."""
+        buffer.scatter_reduce_(0, self._index(inverse_depth).flatten(), inverse_depth.flatten(), "amax")
+
+    def hidden(self, inverse_depth: Float[Tensor, "h w"], buffer: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
+        """By how many pixels the nearest point seen at the same pixel of beta differs; infinite outside the image."""
+        index = self._index(inverse_depth)
+        apart = self.disparity_of(buffer[index]) - self.disparity_of(inverse_depth)
+        return torch.where(index < len(buffer) - 1, apart, torch.inf)
+
+    def _index(self, inverse_depth: Tensor) -> Tensor:
         rows, columns = (-(-n // FINE) for n in self.hw)
-        column, row = ((x[..., i] + 0.5).div(FINE).floor().long() for i in range(2))
+        column, row = ((x + 0.5).div_(FINE).floor_().long() for x in self._seen(inverse_depth))
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows) & self.segments.valid
-        index = torch.where(inside, row * columns + column, rows * columns).flatten()
-        nearest = inverse_depth.new_zeros(rows * columns + 1)
-        nearest = nearest.scatter_reduce(0, index, inverse_depth.flatten(), "amax")[index].view_as(inverse_depth)
-        return torch.where(inside, self.disparity_of(nearest) - self.disparity_of(inverse_depth), torch.inf)
+        return torch.where(inside, row * columns + column, rows * columns)
 
 
 def can_agree(inputs: Inputs) -> bool:
@@ -88,46 +128,91 @@ def can_agree(inputs: Inputs) -> bool:
     return len(betas) > 1 and one and all(beta.track is not None for beta in betas)
 
 
-def agreed(inputs: Inputs, found: tuple[SemiGlobalMatches, ...]) -> list[tuple[Tensor, Tensor]]:
-    """`disparity` and `facts` (at half the size) of each beta, from the inverse depths on which the matches agree."""
-    views = [MatchedBeta.of(beta, matches) for beta, matches in zip(inputs.betas, found)]
-    inverse_depth, facts, known = _chosen(views)
-    guide = to_bytes(inputs.alpha[0, 0])
-    scale = max(float(inverse_depth.max()), 1e-9)
-    plane = (inverse_depth / scale).cpu().numpy().astype(np.float32)
-    certain = known.cpu().numpy()
-    smooth = filled(plane[None], certain.astype(np.float32) + 1e-5, guide, DISPARITY_FILL)[0]
-    median = cv2.medianBlur(np.where(certain, plane, smooth), 5)
-    inverse_depth = torch.from_numpy(median).to(inverse_depth) * scale
-    return [_of_view(view, inverse_depth, facts, known, inputs.alpha) for view in views]
+class Agreement(NamedTuple):
+    """What the matches of all betas agree on, at alpha's pixels.
+
+    inverse_depth: (1, h, w); known: (1, h, w), whether any match is consistent; facts: (2, h / 2, w / 2), margin and
+    cost of the matches that were taken.
+    """
+
+    inverse_depth: Tensor
+    known: Tensor
+    facts: Tensor
+
+    @classmethod
+    def of(cls, views: Sequence[MatchedBeta], like: Tensor) -> Agreement:
+        """The inverse depth that is supported best, in the type of another tensor."""
+        proposals = [view.inverse_depth for view in views]
+        weights = torch.stack([known * (0.1 + view.facts[1]) for view, (_, known) in zip(views, proposals)])
+        support = torch.stack([_supported(views, weights, w) for w, _ in proposals])  # proposal, beta, h, w
+        total = torch.where(torch.stack([known for _, known in proposals]), support.sum(1), -1.0)
+        best = total.argmax(0)[None, None].expand(1, *support.shape[1:])
+        counts = support.gather(0, best)[0]
+        precise = counts * torch.stack([view.extent.length.square() + 1 for view in views])
+        depths = torch.stack([w for w, _ in proposals])
+        inverse_depth = (precise * depths).sum(0) / precise.sum(0).clamp(min=1e-12)
+        taken = counts > 0
+        margin = torch.where(taken, torch.stack([v.facts[1] for v in views]), 0.0).amax(0)
+        cost = torch.where(taken, torch.stack([v.facts[2] for v in views]), 1.0).amin(0)
+        facts = avg_pool2d(torch.stack([margin, cost]), FINE)
+        return cls(inverse_depth[None].to(like), taken.any(0)[None], facts.to(like))
 
 
-def _of_view(
-    view: MatchedBeta, inverse_depth: Tensor, facts: Tensor, known: Tensor, like: Tensor
-) -> tuple[Float[Tensor, "1 1 h w"], Float[Tensor, "1 3 h2 w2"]]:
-    disparity = view.disparity_of(inverse_depth).clamp(min=0).minimum(view.segments.length)
-    unlike = (view.hidden(inverse_depth) / (FINE * FARTHEST)).clamp(0, 1)
-    unlike = torch.where(known, unlike, 1.0)
-    return disparity[None, None].to(like), avg_pool2d(torch.cat([unlike[None], facts])[None].to(like), FINE)
+def agreed(inputs: Inputs, found: Sequence[SemiGlobalMatches]) -> list[SemiGlobalMatches]:
+    """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
+
+    def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
+        return MatchedBeta.of(inputs.betas[i], found[i], rows)
+
+    betas, strips = range(len(found)), _strips(inputs.hw)
+    parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
+    agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
+    del parts
+    return [_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas]
 
 
-def _chosen(views: list[MatchedBeta]) -> tuple[Float[Tensor, "h w"], Float[Tensor, "2 h w"], Bool[Tensor, "h w"]]:
-    """The inverse depth that is supported best, margin and cost of its matches, and where any match is consistent."""
-    proposals = [view.inverse_depth for view in views]
-    weights = torch.stack([known * (0.1 + view.facts[1]) for view, (_, known) in zip(views, proposals)])
-    support = torch.stack([_supported(views, weights, w) for w, _ in proposals])  # proposal, beta, h, w
-    total = torch.where(torch.stack([known for _, known in proposals]), support.sum(1), -1.0)
-    best = total.argmax(0)[None, None].expand(1, *support.shape[1:])
-    counts = support.gather(0, best)[0]
-    precise = counts * torch.stack([view.segments.length.square() + 1 for view in views])
-    depths = torch.stack([w for w, _ in proposals])
-    inverse_depth = (precise * depths).sum(0) / precise.sum(0).clamp(min=1e-12)
-    taken = counts > 0
-    margin = torch.where(taken, torch.stack([v.facts[1] for v in views]), 0.0).amax(0)
-    cost = torch.where(taken, torch.stack([v.facts[2] for v in views]), 1.0).amin(0)
-    return inverse_depth, torch.stack([margin, cost]), taken.any(0)
+def _strips(hw: HW) -> list[tuple[int, int]]:
+    """Even numbers of rows that are compared at a time."""
+    rows = max(STRIP // hw[1] // FINE, 1) * FINE
+    return [(top, min(top + rows, hw[0])) for top in range(0, hw[0], rows)]
 
 
-def _supported(views: list[MatchedBeta], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:
+def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
+    """Inverse depth diffused to where no match is consistent, and without outliers."""
+
+    def of(box: Box) -> list[Tensor]:
+        part = (..., slice(box[0], box[1]), slice(box[2], box[3]))
+        plane, known = (x[part].cpu().numpy() for x in (agreement.inverse_depth, agreement.known))
+        guide = to_bytes(inputs.alpha[0, 0][part])
+        smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
+        median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
+        return [torch.from_numpy(median)[None].to(inputs.alpha)]
+
+    return agreement._replace(inverse_depth=from_pieces(inputs.hw, inputs.multiple, of)[0])
+
+
+def _of_beta(
+    at: Callable[[tuple[int, int]], MatchedBeta],
+    agreement: Agreement,
+    strips: list[tuple[int, int]],
+    own: SemiGlobalMatches,
+) -> SemiGlobalMatches:
+    """The matches of the beta that is `at` some rows."""
+    buffer = at(strips[0]).depth_buffer()
+    for top, bottom in strips:
+        at((top, bottom)).enter(agreement.inverse_depth[0, top:bottom].to(buffer), buffer)
+    disparity, facts = torch.empty_like(own.disparity), torch.empty_like(own.facts)
+    for top, bottom in strips:
+        view, half = at((top, bottom)), slice(top // FINE, bottom // FINE)
+        inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
+        disparity[0, 0, top:bottom] = view.disparity_of(inverse_depth).clamp(min=0).minimum(view.extent.length)
+        unlike = (view.hidden(inverse_depth, buffer) / (FINE * FARTHEST)).clamp(0, 1)
+        unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
+        facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
+        facts[0, 1:, half] = agreement.facts[:, half]
+    return own._replace(disparity=disparity, facts=facts)
+
+
+def _supported(views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:
     """The weights of the betas whose matches are near a proposed inverse depth."""
     return torch.stack([w * (view.differs(inverse_depth) < SUPPORT) for view, w in zip(views, weights)])

@@ -20,7 +20,7 @@ from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
 from . import semi_global_kernels as kernels
-from .semi_global import CONSISTENT, Normalisation, enlarged, matches, numpy_of, smoothed
+from .semi_global import CONSISTENT, Extent, Normalisation, enlarged, matches, numpy_of, smoothed
 
 LIKENESS = 0.08
 """Difference of brightness at which the weight of a match falls to 1 / e."""
@@ -90,10 +90,13 @@ def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: 
 
 
 def at_matches(
-    beta: Float[Tensor, "b c hb wb"], segments: Segments, disparity: Float[Tensor, "b 1 _ _"]
+    beta: Float[Tensor, "b c hb wb"],
+    segments: Segments,
+    disparity: Float[Tensor, "b 1 _ _"],
+    extent: Extent | None = None,
 ) -> tuple[Float[Tensor, "b c h w"], Bool[Tensor, "b 1 h w"]]:
     """What beta shows at the matches, at its edge where these are beyond it, and where they are not."""
-    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity).to(beta)
+    hw, middle = (beta.shape[-2], beta.shape[-1]), matches(segments, disparity, extent=extent).to(beta)
     position = middle.reshape(len(beta), -1, 2)
     inside = position.clamp(min=0).minimum(position.new_tensor([hw[1] - 1, hw[0] - 1]))
     values = sample(beta, inside, interpolation="bicubic").values

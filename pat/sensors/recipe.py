@@ -82,13 +82,10 @@ def _step(entry: Any, where: str) -> Step:
     if name not in STEPS:
         raise ValueError(f"{where}: no step is called '{name}'{near(name, STEPS)}")
     kind = STEPS[name]
-    if isinstance(options, Mapping) and not _is_band(kind, options):
+    is_band = kind is Spectral and isinstance(options, Mapping) and options and "response" not in options
+    if isinstance(options, Mapping) and not is_band:
         return from_document(kind, dict(options), f"{where}.{name}")
     first = next((f.name for f in fields(kind)), None)  # type: ignore[arg-type]
     if first is None:
         raise ValueError(f"{where}.{name}: takes no options, got {options!r}")
     return from_document(kind, {first: options}, f"{where}.{name}")
-
-
-def _is_band(kind: type[Step], options: Mapping[str, Any]) -> bool:
-    return kind is Spectral and "response" not in options and bool(options)

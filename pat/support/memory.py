@@ -60,8 +60,9 @@ _LIMIT: ContextVar[float | None] = ContextVar("limit", default=None)
 def limited(limit: float | None) -> Iterator[None]:
     """Within this, `how_many_fit` knows how many bytes the process may take in all, and freed memory is returned to the
     system when the process comes near that; None: no limit."""
-    token, done = _LIMIT.set(limit), Event()
-    if limit is not None:
+    before, done = _LIMIT.get(), Event()
+    token = _LIMIT.set(limit)
+    if limit is not None and limit != before:
         Thread(target=_return_near, args=(NEAR * limit, done), daemon=True).start()
     try:
         yield
@@ -91,7 +92,9 @@ def how_many_fit(nbytes: float) -> int | None:
     limit = _LIMIT.get()
     if limit is None:
         return None
-    give_back()
+    room = ROOM * limit - nbytes * (os.cpu_count() or 1)
+    if resident() > room:
+        give_back()
     return max(int((ROOM * limit - resident()) // nbytes), 1)
 
 

@@ -19,8 +19,7 @@ from arraygeom.pose import Pose
 from arraygeom.rig import Rig
 
 from ..media.colour import linear_from_srgb
-from ..media.headers import image_header
-from ..media.images import MOST_PIXELS, decoded
+from ..media.images import decoded_photograph
 from .furnish import Setting, furnished, seeded, vec
 from .landscape import landscape
 from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
@@ -149,11 +148,7 @@ def _bright_one(rng: Generator, files: tuple[str, ...]) -> str:
 @lru_cache(maxsize=4096)
 def _blackness(file: str) -> float:
     """The share of pixels that are nearly black; 1 for what is no image, or one too large."""
-    content = Path(file).read_bytes()
-    header = image_header(content)
-    if header is None or header.hw[0] * header.hw[1] > MOST_PIXELS:
-        return 1.0
-    small = decoded(content, cv2.IMREAD_REDUCED_GRAYSCALE_8)
+    small = decoded_photograph(Path(file), cv2.IMREAD_REDUCED_GRAYSCALE_8)
     return 1.0 if small is None else float((small < 24).mean())
 
 

@@ -25,7 +25,7 @@ from .layers import Layers, draw_layers
 from .outlines import outlines
 from .photos import PhotoBank
 from .rig_distribution import RigDistribution
-from .rigs import RigBatch
+from .rigs import RigBatch, random_rigs
 
 _FAINT = 1 / 256
 _MAX_OVERSAMPLING = 4
@@ -75,7 +75,7 @@ class LayeredScenes:
 
     def sample(self, batch: int, generator: Generator) -> ArrayBatch:
         """Random scenes seen by random rigs."""
-        return self.render(self.rigs.sample(batch, self.hw, generator), generator)
+        return self.render(random_rigs(self.rigs, batch, self.hw, generator), generator)
 
     @torch.no_grad()
     def render(self, rigs: RigBatch, generator: Generator, *, oversampling: int = 1) -> ArrayBatch:

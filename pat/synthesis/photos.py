@@ -15,8 +15,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from ..media.headers import image_header
-from ..media.images import MOST_PIXELS, decoded
+from ..media.images import decoded_photograph
 from .patterns import patterns, recoloured
 
 LEVELS = 6
@@ -142,11 +141,7 @@ def _cached(path: str | Path) -> list[np.ndarray]:
 
 def _decoded(path: Path) -> np.ndarray | None:
     """RGB bytes, or None for a file that is no image, or one too small or too large to be a texture."""
-    content = path.read_bytes()
-    header = image_header(content)
-    if header is None or not (min(header.hw) >= _MULTIPLE and header.hw[0] * header.hw[1] <= MOST_PIXELS):
-        return None
-    image = decoded(content, cv2.IMREAD_COLOR)
+    image = decoded_photograph(path, cv2.IMREAD_COLOR, least=_MULTIPLE)
     if image is None or min(image.shape[:2]) < _MULTIPLE:
         return None
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)

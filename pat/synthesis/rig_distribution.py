@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
-
-if TYPE_CHECKING:
-    from torch import Generator
-
-    from .rigs import RigBatch
+from typing import Literal
 
 Range = tuple[float, float]
 
@@ -44,9 +39,3 @@ class RigDistribution:
     rotation: float = 4.0
     toe_in: Range = (0.0, 1.0)
     decentring: float = 0.1
-
-    def sample(self, batch: int, hw: tuple[int, int], generator: Generator) -> RigBatch:
-        """`batch` rigs, alpha's images being of height and width `hw`, alpha's frame being the world."""
-        from .rigs import random_rigs
-
-        return random_rigs(self, batch, hw, generator)

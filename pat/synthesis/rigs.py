@@ -26,7 +26,7 @@ class RigBatch:
 
 
 def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator) -> RigBatch:
-    """What `RigDistribution.sample` draws."""
+    """`batch` rigs, alpha's images being of height and width `hw`, alpha's frame being the world."""
     near = log_uniform(rigs.near, (batch,), generator)
     far = near * log_uniform(rigs.depth_ratio, (batch,), generator)
     alpha = _alpha(rigs, batch, hw, generator)

@@ -41,9 +41,8 @@ class SystemScene(LayeredScenes):
         self, rig: Rig, alpha: str, *, depths: tuple[float, float], layers: int, photos: Path | None, seed: int
     ) -> None:
         self.rig, self.alpha, self.seed = rig, alpha, seed
-        super().__init__(
-            _textures(photos, seed), RigDistribution(), hw=rig[alpha].hw, layers=(layers, layers), seed=seed
-        )
+        bank = PhotoBank.load(photos, seed=seed) if photos else sample_photographs(count=10, seed=seed)
+        super().__init__(bank, RigDistribution(), hw=rig[alpha].hw, layers=(layers, layers), seed=seed)
         near, far = (torch.tensor([d], dtype=torch.float64) for d in depths)
         rigs = RigBatch([self.camera(name) for name in (alpha, *rig.betas(alpha))], near, far)
         self.scene = draw_layers(rigs, self.layers, self.photos, len(self.outlines), self.generator("scene"))
@@ -107,7 +106,3 @@ class SystemScene(LayeredScenes):
         image, _ = self.seen(self.alpha, self.painted([(i + 1) / 32 for i in range(count)]))
         index = (image[0, 0] * 32).round().long().clamp(1, count) - 1
         return torch.bincount(index.flatten(), minlength=count) / index.numel()
-
-
-def _textures(photos: Path | None, seed: int) -> PhotoBank:
-    return PhotoBank.load(photos, seed=seed) if photos else sample_photographs(count=10, seed=seed)

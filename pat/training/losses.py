@@ -35,14 +35,9 @@ def structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
     return 1 - similarity.mean()
 
 
-def image_and_structure_loss(image: Tensor, ground_truth: Tensor) -> Tensor:
-    """`image_loss` and `structure_loss` together."""
-    return image_loss(image, ground_truth) + structure_loss(image, ground_truth)
-
-
 IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
     "psnr": image_loss,
-    "psnr-ssim": image_and_structure_loss,
+    "psnr-ssim": lambda image, ground_truth: image_loss(image, ground_truth) + structure_loss(image, ground_truth),
     "mse": mse_loss,
 }
 
@@ -73,7 +68,7 @@ def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
     """Position error where beta sees the point, pixels, and error of the confidence; 0 without ground truth."""
     total = given.ground_truth.new_zeros(())
     for match, ground_truth, visible in zip(seen, given.position, given.visible):
-        off = (match.attended.position - ground_truth.movedim(-1, 1)).abs().sum(1)
+        off = (match.attended - ground_truth.movedim(-1, 1)).abs().sum(1)
         total = total + 0.02 * (off.clamp(max=6.0) * visible).sum() / visible.sum().clamp(min=1)
         good = (visible & (off.detach() < 1.5)).to(off)
         total = total + 0.05 * binary_cross_entropy_with_logits(match.logit[:, 0], good)

@@ -14,7 +14,8 @@ from torch import Generator, Tensor, nn
 from arraygeom import Epipolar, sample
 from arraygeom.fields.grid import FieldOnGrid
 from pat.media.colour import luminance
-from pat.networks.denoiser import LowLightNetwork, NoisyView, over_flips
+from pat.networks.collaborative import without_noise
+from pat.networks.denoiser import LowLightNetwork, NoisyView
 from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import NoiseLevel, generator_for
 from pat.synthesis.layered import LayeredScenes
@@ -124,4 +125,4 @@ def windows_of(groups: Sequence[Tensor], batch: int, side: int, g: Generator) ->
 
 def _view(denoiser: nn.Module, ideal: Tensor, level: NoiseLevel, g: Generator) -> NoisyView:
     recorded, deviation = noisy(ideal, level, g)
-    return NoisyView(recorded, over_flips(denoiser, recorded, deviation), deviation)
+    return NoisyView(recorded, without_noise(denoiser, recorded, deviation), deviation)

@@ -131,7 +131,8 @@ class SampleSource:
     def steps(self, groups: list[int], *, start: int = 0) -> Iterator[list[Sample]]:
         """The samples of these groups, step by step, from step `start` on."""
         for step, planned in enumerate(plan(self.config, self.seed)):
-            self._forget(planned.dropped)
+            for key in [key for key in self.cache if key[0] == planned.dropped]:
+                del self.cache[key]
             if step >= start:
                 yield [self.sample(planned, step, group) for group in groups]
 
@@ -149,10 +150,6 @@ class SampleSource:
             crops = self.folders[planned.kind]
             return crops.sample(self.config.batch, g, number=planned.scenes, betas=planned.betas)
         return self.makers[planned.kind, planned.betas].sample(self.config.batch, g)
-
-    def _forget(self, scenes: int | None) -> None:
-        for key in [key for key in self.cache if key[0] == scenes]:
-            del self.cache[key]
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:

@@ -1,9 +1,10 @@
 """Compiled functions where nothing can be kept."""
 
 import pytest
-from numba.core import caching
 
 from arraygeom import compiled as module
+
+caching = pytest.importorskip("numba.core.caching")
 
 
 def test_without_a_folder_that_can_be_written_each_process_compiles_and_says_so(monkeypatch):

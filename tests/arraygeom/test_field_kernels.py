@@ -1,9 +1,12 @@
 """The compiled loops of the explicit fields against their readable forms."""
 
+import sys
+
 import pytest
 import torch
 
 from arraygeom import Curved, Distortion, NearestVoxels, Pair, pixel_grid
+from arraygeom.compiled import can_compile
 from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_curved import fisheye_rig
 from tests.benchmarks.bench_fields import pairs
@@ -41,6 +44,23 @@ def test_curved_positions_are_those_of_the_formulas(name, monkeypatch):
     assert torch.equal(compiled.mask, expected.mask)
     assert 0.5 < compiled.mask.float().mean() < 1
     assert (compiled.xy - expected.xy).abs().max() < 1e-9
+
+
+@pytest.mark.parametrize("field", [Curved(40, nodes=24), NearestVoxels(24, 12)], ids=repr)
+def test_without_numba_the_formulas_are_used(field, monkeypatch):
+    pair = pair_with("none")
+    x = pixel_grid(pair.alpha.hw, dtype=torch.float64)[::43, ::47].reshape(-1, 2)
+    expected = field(pair, x)
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(sys.modules, "arraygeom.fields.kernels", raising=False)
+    monkeypatch.delitem(sys.modules, "arraygeom.fields.curve_kernels", raising=False)
+    can_compile.cache_clear()
+    try:
+        found = field(pair, x)
+    finally:
+        can_compile.cache_clear()
+    assert torch.equal(found.mask, expected.mask)
+    assert (found.xy - expected.xy).abs().max() < 1e-9
 
 
 def test_where_a_gradient_is_asked_for_the_formulas_are_used():

@@ -157,7 +157,7 @@ BOUGUET = {"fc": [[800.0], [802.0]], "cc": [[320.5], [238.0]], "kc": [[-0.2], [0
 
 
 def test_bouguets_results(tmp_path):
-    from scipy.io import savemat
+    savemat = pytest.importorskip("scipy.io").savemat
 
     om = np.array([[0.01], [0.1], [-0.02]])
     numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
@@ -189,7 +189,7 @@ def test_bouguets_results(tmp_path):
 
 
 def test_a_rotation_vector_of_no_rotation(tmp_path):
-    from scipy.io import savemat
+    savemat = pytest.importorskip("scipy.io").savemat
 
     numbers = {f"{key}_{side}": value for key, value in BOUGUET.items() for side in ("left", "right")}
     savemat(tmp_path / "a.mat", {**numbers, "om": [0, 1e300, 0], "T": [1.0, 0, 0], "nx": 640, "ny": 480})

@@ -166,7 +166,7 @@ def _run_faults(out: Path, versions: list[dict[str, bytes]]) -> list[str]:
     """Checkpoints and images are whole, and the lines of steps those of a run that nobody killed."""
     checkpoints = list((out / "checkpoints").glob("step-*.safetensors"))
     faults = [f"torn: {file.name}" for file in checkpoints if read_checkpoint(file) is None]
-    faults += [f"torn: {f.name}" for f in out.glob("images/*.png") if cv2.imread(str(f)) is None]
+    faults += [f"torn: {f.name}" for f in out.glob("images/step-*.png") if cv2.imread(str(f)) is None]
     steps = (out / "steps.csv").read_bytes() if (out / "steps.csv").exists() else b""
     return faults + ([] if versions[0]["steps"].startswith(steps) else ["other steps"])
 

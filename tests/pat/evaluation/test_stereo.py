@@ -113,10 +113,13 @@ def test_tables_hold_every_row(tmp_path):
 class Matcher:
     """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_resolution, joins_bands = 0, 2, 1, 1.0, True, "no"
+    halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
 
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
+
+    def working_bytes(self, alpha, betas):
+        return 0.0
 
     def prepare(self, inputs):
         return None
@@ -209,7 +212,10 @@ def test_controls_fall_on_real_pairs(shared_data):
 class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
-    halo, beta_halo, multiple, bytes_per_pixel, equal_resolution, joins_bands = 0, 2, 1, 1.0, True, "no"
+    halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
+
+    def working_bytes(self, alpha, betas):
+        return 0.0
 
     def prepare(self, inputs):
         return None

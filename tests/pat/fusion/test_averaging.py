@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch.nn.functional import pad
 
-from pat.fusion.averaging import Noises, averaged_with_alike, sums_of_alike
+from pat.fusion.averaging import averaged_with_alike, sums_of_alike
 from pat.media.colour import from_luma_chroma, luminance
 from pat.sensors import generator_for
 
@@ -54,10 +54,10 @@ def test_images_smaller_than_what_is_around_them_are_mirrored():
 
 
 def test_colour_noise_is_averaged_within_what_is_alike():
-    """Noise of colour goes, the edge stays, and so does luma where alpha has no noise."""
+    """Noise of colour goes, the edge stays, and so does luma."""
     clean, noisy = two_colours()
     nothing = torch.zeros(1, 48, 64)
-    quiet = averaged_with_alike(noisy, luminance(clean), clean, nothing, Noises(0.0, 0.01))
+    quiet = averaged_with_alike(noisy, clean, nothing, 0.01)
     assert (quiet - clean).square().mean() < 0.1 * (noisy - clean).square().mean()
     torch.testing.assert_close(luminance(quiet), luminance(noisy))
 
@@ -70,15 +70,7 @@ def test_what_beta_recorded_counts_as_far_as_it_is_confident():
 
     def error(confidence):
         counts = torch.full((1, 48, 64), confidence)
-        made = averaged_with_alike(off, luminance(clean), beta, counts, Noises(0.0, 0.05))
+        made = averaged_with_alike(off, beta, counts, 0.05)
         return float((made - clean).square().mean())
 
     assert error(1.0) < 0.3 * error(0.0)
-
-
-def test_luma_is_drawn_to_what_alpha_recorded():
-    clean, _ = two_colours()
-    alpha = luminance(clean) + 0.1 + noise_of((1, 48, 64), 3, 0.05)
-    made = averaged_with_alike(clean, alpha, clean, torch.ones(1, 48, 64), Noises(0.05, 0.0))
-    assert float(luminance(made - clean).mean()) == pytest.approx(0.02, abs=0.003)
-    torch.testing.assert_close(made - luminance(made), clean - luminance(clean))

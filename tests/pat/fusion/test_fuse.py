@@ -172,7 +172,7 @@ def test_memory_decides_the_tiles():
     assert tiles_within(network, frame, None) == [Tile((0, 3000, 0, 4000), (0, 3000, 0, 4000))]
     tiles = tiles_within(network, frame, 2.0**31)
     area = max((t.outer[1] - t.outer[0]) * (t.outer[3] - t.outer[2]) for t in tiles)
-    assert area * network.bytes_per_pixel <= 2**31
+    assert network.working_bytes(area, [0]) <= 2**31
     assert sum((t.inner[1] - t.inner[0]) * (t.inner[3] - t.inner[2]) for t in tiles) == math.prod(hw)
     with pytest.raises(ValueError, match="need at least 80 MiB"):
         tiles_within(network, frame, 2.0**20)
@@ -187,7 +187,7 @@ def test_tiles_are_those_with_the_least_work():
 
     frame = alpha_alone(hw)
     ours = tiles_within(network, frame, limit)
-    side = int(math.sqrt(limit / SLACK / network.bytes_per_pixel)) - 2 * MAX_HALO
+    side = int(math.sqrt(limit / SLACK / network.working_bytes(1, [0]))) - 2 * MAX_HALO
     assert work(ours) < 0.95 * work(tiles_of(hw, side, MAX_HALO))
     assert all(working_memory(network, frame.inputs, t) <= limit for t in ours)
 

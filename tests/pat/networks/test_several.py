@@ -1,5 +1,6 @@
 """Several RGB betas of one scene: what one cannot see another can."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -12,9 +13,10 @@ from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.media.colour import luminance
-from pat.networks.guided import combined
+from pat.networks import pieces, several
+from pat.networks.guided import BetaEstimate, combined
 from pat.networks.pieces import tiles_of
-from pat.networks.several import SUPPORT, MatchedBeta
+from pat.networks.several import SUPPORT, MatchedBeta, can_agree
 from pat.networks.weights import load_weights
 
 H, W = 96, 192
@@ -86,6 +88,24 @@ def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(networ
     assert combined([dark, dark._replace(colour=bright.colour)]).colour.mean() == pytest.approx(0.5)
 
 
+def test_of_betas_alike_that_with_less_parallax_counts_more(network, scene):
+    """The odds fall with the square of the parallax; betas at the same distance count the same."""
+    rig, images, _ = scene
+    wider = Rig({**rig.cameras, "far": camera(-0.5)}, depth=(NEAR, FAR))
+    views = Views.of(wider, images | {"far": seen_from(-0.5)}, alpha="mono")
+    left, right, distant = network.prepare(frame_inputs(network, views).inputs).prior
+    assert left == pytest.approx(right, abs=0.05)
+    assert max(left, right) == 0
+    assert distant - left == pytest.approx(-2 * math.log(2), abs=0.25)
+
+    def estimate(value, prior):
+        one = torch.zeros(1, 1, 2, 2)
+        empty = one[:, 0]
+        return BetaEstimate(one, empty, empty, one + value, one[None], one, one, one, one, prior)
+
+    assert combined([estimate(1.0, 0.0), estimate(0.0, -2 * math.log(2))]).colour.mean() == pytest.approx(0.8)
+
+
 def test_the_order_of_the_betas_does_not_matter(network, scene):
     rig, images, _ = scene
     turned = Rig({n: rig[n] for n in ("mono", "right", "left")}, depth=(NEAR, FAR))
@@ -104,6 +124,40 @@ def test_tiles_of_several_betas_are_as_the_whole(network, scene, monkeypatch):
     whole = fuse(network, rig, images, alpha="mono").image
     monkeypatch.setattr(module, "plan_frame", lambda *a, **k: plan(*a, **k)._replace(tiles=tiles))
     assert (fuse(network, rig, images, alpha="mono").image - whole).abs().max() < 1e-5
+
+
+def test_strips_change_nothing_and_pieces_little(network, scene, monkeypatch):
+    rig, images, _ = scene
+    whole = fuse(network, rig, images, alpha="mono").image
+    monkeypatch.setattr(several, "STRIP", 10 * W)
+    assert (fuse(network, rig, images, alpha="mono").image - whole).abs().max() < 1e-6
+    monkeypatch.setattr(pieces, "MATCHED_AT_ONCE", 15_000)
+    monkeypatch.setattr(pieces, "MATCHING_HALO", 32)
+    assert len(pieces.matching_pieces((H, W), network.multiple)) > 1
+    found = fuse(network, rig, images, alpha="mono").image
+    assert ((found - whole).abs().amax(0) > 0.02).float().mean() < 0.05
+
+
+def test_a_part_of_the_inputs_has_the_tracks_of_the_whole(network, scene):
+    rig, images, _ = scene
+    inputs = frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
+    part = inputs.cut((16, 64, 48, 144))
+    assert can_agree(part)
+    x = torch.tensor([[3.0, 5.0], [60.0, 20.0]], dtype=torch.float64)
+    depths = torch.tensor([1 / NEAR, 1 / FAR], dtype=torch.float64)
+    for own, of_part in zip(inputs.betas, part.betas):
+        there = own.track(x + torch.tensor([48.0, 16.0])).at(depths) - torch.tensor(of_part.offset)
+        torch.testing.assert_close(of_part.track(x).at(depths), there)
+
+
+def test_shared_colour_counts_once(network, scene):
+    rig, images, _ = scene
+    state = network.prepare(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs)
+    one, other = state.matches
+    assert one.colour is other.colour
+    assert state.nbytes == H * W * (2 * (4 + 3) + 2 * 2 * 3 + 2 * 6)
+    one, other = state.cut((0, 32, 0, 64)).matches
+    assert one.colour is other.colour
 
 
 def test_a_band_camera_beside_a_colour_camera_gives_better_depth(network, scene):
@@ -144,7 +198,9 @@ def test_the_depth_buffer_finds_what_is_hidden():
     view = MatchedBeta(segments, track, torch.zeros(hw).double(), torch.zeros(3, *hw).double(), (H, W))
     depths = far.clone()
     depths[1, 7] = 1 / NEAR
-    found = view.hidden(depths)
+    buffer = view.depth_buffer()
+    view.enter(depths, buffer)
+    found = view.hidden(depths, buffer)
     assert found[1, 7] == 0
     column = (track.at(depths)[1, 7, 0] + 0.5).div(2).floor()
     same = ((track.at(depths)[1, :, 0] + 0.5).div(2).floor() == column) & (depths[1] < 0.4)

@@ -1,0 +1,46 @@
+"""arraygeom's tests, run with nothing but the packages that it needs, and pytest's."""
+
+import os
+import re
+import subprocess
+import sys
+from importlib.metadata import distribution
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+NEEDED = ("torch", "kornia", "numpy", "PyYAML", "jaxtyping", "pytest", "pytest-timeout", "hypothesis")
+
+
+def with_requirements(names):
+    """The distributions of these names and all that they require, by normalised name."""
+    found, left = {}, list(names)
+    while left:
+        name = left.pop()
+        key = re.sub(r"[-_.]+", "-", name).lower()
+        if key not in found:
+            found[key] = distribution(name)
+            requirements = map(Requirement, found[key].requires or ())
+            left += [r.name for r in requirements if r.marker is None or r.marker.evaluate({"extra": ""})]
+    return found.values()
+
+
+def link_packages(folder):
+    """A folder of links to them in this environment."""
+    for one in with_requirements(NEEDED):
+        for top in {file.parts[0] for file in one.files or ()} - {"..", "__pycache__"}:
+            if not (folder / top).exists():
+                (folder / top).symlink_to(one.locate_file(top))
+
+
+@pytest.mark.slow
+def test_the_tests_of_arraygeom_need_torch_kornia_numpy_yaml_and_jaxtyping(tmp_path):
+    link_packages(tmp_path)
+    command = [sys.executable, "-S", "-m", "pytest", "-m", "not slow", "-p", "no:cacheprovider", "tests/arraygeom"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-4000:]
+    blocked = subprocess.run([sys.executable, "-S", "-c", "import numba"], env=environment, capture_output=True)
+    assert blocked.returncode != 0, "numba is there all the same"
