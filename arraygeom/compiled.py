@@ -9,16 +9,23 @@ from importlib.util import find_spec
 from typing import Any
 from uuid import uuid4
 
+from .linked import options_of_linked
+
 
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
 
-    Where there is no folder that can be written, what `cache` asks to keep is compiled by each process.
+    With `cache` it is called from Python; without, by compiled functions alone. Where there is no folder that can be
+    written, what `cache` asks to keep is compiled by each process.
     """
     from numba import njit
 
     if function is None:
         return lambda function: compiled(function, **options)
+    if options.get("cache"):
+        options["no_cfunc_wrapper"] = True
+    elif options.get("inline") != "always":
+        options |= options_of_linked()
     try:
         return njit(inspect.unwrap(function), **options)
     except RuntimeError as error:
