@@ -1,7 +1,7 @@
 """Compiled functions that compiled functions alone call: their code is optimised and translated with the callers'.
 
 numba would do both for each function by itself, and again for each caller after the code is linked into it: attention's
-fifty took 2.7 times as long to compile.
+fifty took two and a half times as long to compile.
 """
 
 from __future__ import annotations
