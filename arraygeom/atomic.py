@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -88,3 +89,28 @@ def write_text(path: str | Path, text: str) -> None:
     """Write a text file atomically. Missing folders are made."""
     with write_atomically(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def alone(lock: Path, longest: float) -> Iterator[None]:
+    """A block that one process is in at a time, or one that has waited so many seconds for the others, or that cannot
+    lock the file. The system unlocks what a process that ended had locked."""
+    try:
+        import fcntl
+
+        file = lock.open("a")
+    except (ImportError, OSError):
+        yield
+        return
+    with file:
+        end = time.monotonic() + longest
+        while time.monotonic() < end:
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                time.sleep(0.01)
+                continue
+            except OSError:  # not on every network's drive
+                pass
+            break
+        yield

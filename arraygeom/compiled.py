@@ -6,26 +6,60 @@ import inspect
 import warnings
 from functools import cache
 from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 from uuid import uuid4
+
+from .atomic import alone
+from .linked import options_of_linked
+
+COMPILED = "arraygeom:compiled"
+LONGEST = 60.0
+"""Seconds for which a process waits for another that compiles what it needs, before it does so, too."""
 
 
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
 
-    Where there is no folder that can be written, what `cache` asks to keep is compiled by each process.
+    With `cache` it is called from Python; without, by compiled functions alone. Where there is no folder that can be
+    written, what `cache` asks to keep is compiled by each process.
     """
     from numba import njit
 
     if function is None:
         return lambda function: compiled(function, **options)
+    if options.get("cache"):
+        options["no_cfunc_wrapper"] = True
+    elif options.get("inline") != "always":
+        options |= options_of_linked()
     try:
-        return njit(inspect.unwrap(function), **options)
+        entry = njit(inspect.unwrap(function), **options)
     except RuntimeError as error:
         if not options.pop("cache", False) or "no locator" not in str(error):
             raise
         _warn_of_no_folder()
         return njit(inspect.unwrap(function), **options)
+    if options.get("cache"):
+        _one_process_at_a_time(entry)
+    return entry
+
+
+def _one_process_at_a_time(entry: Any) -> None:
+    """Let other processes wait for the one that compiles an entry point, and then load what it kept.
+
+    What is not kept yet is an event of the kind `COMPILED`, for numba's listeners.
+    """
+    from numba.core.event import trigger_event
+
+    compile_entry, lock = entry.compile, Path(cache_file(entry)._index_path).with_suffix(".lock")
+
+    def compile_alone(signature: Any) -> Any:
+        if is_kept(entry, signature):
+            return compile_entry(signature)
+        with trigger_event(COMPILED), alone(lock, LONGEST):
+            return compile_entry(signature)
+
+    entry.compile = compile_alone
 
 
 @cache
@@ -61,6 +95,11 @@ def cache_file(entry: Any) -> Any:
 def cache_folder(entry: Any) -> str | None:
     """The folder in which an entry point is kept; None where it is not."""
     return None if cache_file(entry) is None else entry._cache._cache_path
+
+
+def is_kept(entry: Any, signature: Any) -> bool:
+    """Whether an entry point's code for such arguments is in the cache."""
+    return entry._cache._index_key(signature, entry.targetctx.codegen()) in cache_file(entry)._load_index()
 
 
 def separate_cache(entry: Any) -> None:

@@ -122,6 +122,7 @@ def imported_at_once(path: Path) -> set[str]:
 GEOMETRY_NEEDS = {"torch", "kornia", "numpy", "yaml", "jaxtyping", *sys.stdlib_module_names}
 GEOMETRY_MAY_USE = {
     "compiled.py": {"numba"},
+    "linked.py": {"numba"},
     "opencv.py": {"cv2"},
     "matfile.py": {"scipy"},
     "viz.py": {"matplotlib", "plotly"},

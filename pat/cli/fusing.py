@@ -135,6 +135,7 @@ class Fuse:
         if self.classical and not self.report:
             raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
+        options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
             self._with_rig() if self._rig_given() else self._without_rig()
 
@@ -395,6 +396,7 @@ class Demo:
 
     def run(self) -> None:
         """Write the images, and print the scores of alpha alone, the baseline and the fusion."""
+        options.compile_at_once()
         from arraygeom.atomic import write_text
         from arraygeom.compiled import numba_loaded
 
@@ -431,6 +433,7 @@ class WarmUp:
 
     def run(self) -> None:
         """Compile the kernels by fusing the sample array once."""
+        options.compile_at_once()
         from arraygeom.compiled import cache_folder
 
         from ..attention.kernels import forward

@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from functools import cache
 from itertools import takewhile
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
@@ -311,21 +312,34 @@ def working(title: str) -> Iterator[Callable[[str], None]]:
 
 @cache
 def say_when_compiling() -> None:
-    """Say once, in one line, that numba compiles kernels, before it does: that takes up to a minute."""
+    """Say once, in one line, that kernels are compiled, before they are, and have a second process help: that takes
+    some seconds."""
     from numba.core import event
 
-    class Compiling(event.Listener):
-        said = False
+    from arraygeom.compiled import COMPILED
 
+    from ..fusion.compiling import compile_beside
+
+    first = Lock()
+
+    class Compiling(event.Listener):
         def on_start(self, event: object) -> None:
-            if not self.said:
-                self.said = True
+            if first.acquire(blocking=False):
                 say("compiling kernels for this machine, once (`pat warm-up` does so beforehand)")
+                compile_beside()
 
         def on_end(self, event: object) -> None:
             pass
 
-    event.register("numba:compile", Compiling())
+    event.register(COMPILED, Compiling())
+
+
+def compile_at_once() -> None:
+    """Begin to compile kernels, in a second process, where none seem to be."""
+    from ..fusion.compiling import compile_beside, seems_compiled
+
+    if not seems_compiled():
+        compile_beside()
 
 
 def print_json(document: Any) -> None:

@@ -184,11 +184,12 @@ def _sweep(way, guide, runs, cost, small, large, total, paths, fewest):
 
 
 @compiled(nogil=True, cache=True)
-def band_winners(total, low, high, end, along, length, rows, columns, disparity, unlike):
+def band_winners(total, costs, low, high, end, along, length, rows, columns, disparity, unlike):
     """Each pixel's best label, to a fraction (disparity), and its distance from the best label of all alpha pixels that
-    match the same pixel of beta (unlike, 0 to 1)."""
+    match the same pixel of beta (unlike, 0 to 1). `costs` is `total` seen as int32: the order of positive floats is
+    that of their bits."""
     height, width, _ = total.shape
-    costs, nowhere = total.view(np.int32), rows * columns  # the order of positive floats is that of their bits
+    nowhere = rows * columns
     claims = np.full(nowhere + 1, NOTHING)
     matched, at = np.empty((height, width), np.int32), np.empty(LANES, np.int32)
     for y in range(height):

@@ -10,11 +10,9 @@ from torch import Tensor, nn
 from torch.nn.functional import pixel_unshuffle
 from torch.utils._pytree import tree_map
 
-from arraygeom.compiled import compiled, separate_cache
 from arraygeom.fields.protocol import compilable
 
-COLUMNS = 32
-"""Columns whose channels are interleaved at a time: they stay in a core's first cache."""
+from .kernels import unshuffle
 
 
 class ResidualBlock(nn.Module):
@@ -82,24 +80,8 @@ def stacked(*parts: Float[Tensor, "b _ _ _"]) -> Float[Tensor, "b d h w"]:
             target.copy_(part.movedim(1, -1))
         else:
             for image, of in zip(part.numpy(), target.numpy()):
-                _unshuffle(image, of)
+                unshuffle(image[:, ::2], image[:, 1::2], of)
     return out.movedim(-1, 1)
-
-
-@compiled(nogil=True, cache=True)
-def _unshuffle(image, out):
-    """The 2x2 pixels of images (c, 2 h, 2 w) as channels of `out` (h, w, 4 c), a few columns at a time."""
-    channels, (height, width) = len(image), out.shape[:2]
-    for y in range(height):
-        for left in range(0, width, COLUMNS):
-            for c in range(channels):
-                above, below, k = image[c, 2 * y], image[c, 2 * y + 1], 4 * c
-                for x in range(left, min(left + COLUMNS, width)):
-                    out[y, x, k], out[y, x, k + 1] = above[2 * x], above[2 * x + 1]
-                    out[y, x, k + 2], out[y, x, k + 3] = below[2 * x], below[2 * x + 1]
-
-
-separate_cache(_unshuffle)
 
 
 def enlarge(x: Float[Tensor, "b d h w"], factor: int = 2) -> Float[Tensor, "b d h*{factor} w*{factor}"]:

@@ -192,7 +192,7 @@ def _block(views: tuple, box: tuple, found: NDArray, unlike: NDArray) -> None:
     total = np.empty(cost.shape, np.float32)
     kernels.band_aggregate(cost, a, lo, hi, *PENALTIES, total)
     d, f = np.empty(a.shape, np.float32), np.empty(a.shape, np.float32)
-    kernels.band_winners(total, lo, hi, e, u, n, *other.shape, d, f)
+    kernels.band_winners(total, total.view(np.int32), lo, hi, e, u, n, *other.shape, d, f)
     inside = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
     found[inner], unlike[inner] = d[inside], f[inside]
 

@@ -42,7 +42,10 @@ def census(image, out):
         bits[:] = 0
         for dy in range(-3, 4):
             above = image[min(max(y + dy, 0), height - 1)]
-            row[:3], row[3:-3], row[-3:] = above[0], above, above[-1]
+            for x in range(3):
+                row[x], row[width + 3 + x] = above[0], above[width - 1]
+            for x in range(width):
+                row[x + 3] = above[x]
             for dx in range(7):
                 if dx != 3 or dy != 0:
                     for x in range(width):
@@ -149,7 +152,7 @@ def aggregate(cost, guide, total):
         _sweep(cost, guide, total, way)
 
 
-@compiled(inline="always")
+@compiled
 def _sweep(cost, guide, total, way):
     """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the row, and
     from three of the row before. With `way` 1 rows and columns are taken from the last.
@@ -233,10 +236,9 @@ def winners(total, end, along, length, cut, rows, columns, top, left, claims, di
 
 
 @compiled(nogil=True, cache=True)
-def regression(brightness, totals, products, band, floor, out):
-    """A band of `pat.networks.semi_global._diffused`, from smoothed sums of weights, and of weights times brightness,
-    its square and each band (totals), and brightness times each band (products)."""
-    total, first, second, colour, product = totals[0], totals[1], totals[2], totals[3 + band], products[band]
+def regression(brightness, total, first, second, colour, product, floor, along, mean_colour):
+    """A band of `pat.networks.warped.diffused`, from smoothed sums of weights (total), and of weights times brightness,
+    its square, the band (colour), and brightness times the band (product)."""
     height, width = brightness.shape
     for y in range(height):
         for x in range(width):
@@ -245,7 +247,7 @@ def regression(brightness, totals, products, band, floor, out):
             variance = max(second[y, x] * share - mean * mean, np.float32(0))
             slope = (product[y, x] * share - middle * mean) / (variance + floor)
             beyond = min(max(brightness[y, x] - mean, -MOST_BEYOND), MOST_BEYOND)
-            out[0, band, y, x], out[1, band, y, x] = middle + slope * beyond, middle
+            along[y, x], mean_colour[y, x] = middle + slope * beyond, middle
 
 
 @compiled(inline="always")

@@ -222,11 +222,11 @@ def _diffused(
     The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no beta sees
     has colour that varies with brightness as it does nearby.
     """
-    bands = len(colour)
     totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, how)
     products = smoothed([weight * brightness * p for p in colour], guide, how)
     out = np.empty((FILLS, *colour.shape), np.float32)
-    in_parallel([partial(kernels.regression, brightness, totals, products, i, FLOOR, out) for i in range(bands)])
+    planes = zip(totals[3:], products, *out)
+    in_parallel([partial(kernels.regression, brightness, *totals[:3], c, p, FLOOR, *o) for c, p, *o in planes])
     return out
 
 

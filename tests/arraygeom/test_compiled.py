@@ -1,8 +1,14 @@
-"""Compiled functions where nothing can be kept."""
+"""Compiled functions: those that only compiled ones call, and where nothing can be kept."""
+
+import errno
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
 import pytest
 
 from arraygeom import compiled as module
+from arraygeom import linked
 
 caching = pytest.importorskip("numba.core.caching")
 
@@ -15,3 +21,93 @@ def test_without_a_folder_that_can_be_written_each_process_compiles_and_says_so(
     module.separate_cache(double)
     assert double(21) == 42
     assert module.cache_folder(double) is None
+
+
+@module.compiled
+def half(x):
+    return x / 2
+
+
+@module.compiled
+def halves(x):
+    return half(x), half(x + 1)
+
+
+def sum_of_halves(x):
+    a, b = halves(x)
+    return a + b
+
+
+@pytest.fixture
+def entry(monkeypatch, tmp_path):
+    """`sum_of_halves`, compiled anew."""
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path))
+    return module.compiled(sum_of_halves, cache=True)
+
+
+def test_what_compiled_functions_alone_call_becomes_machine_code_only_within_them(entry, monkeypatch):
+    from numba.core.codegen import JITCodeLibrary
+
+    names, finalize = [], JITCodeLibrary._finalize_specific
+    monkeypatch.setattr(JITCodeLibrary, "_finalize_specific", lambda self: (names.append(self.name), finalize(self))[1])
+    assert entry(4.0) == 4.5
+    assert names.count("sum_of_halves") == 1
+    assert not {"half", "halves"} & {*names}
+
+
+def test_called_from_python_such_a_function_raises(entry):
+    entry(4.0)
+    for number in (4.0, 4):
+        with pytest.raises(TypeError):
+            half(number)
+
+
+def test_one_process_compiles_and_others_wait_for_it(entry):
+    fcntl = pytest.importorskip("fcntl")
+    lock = Path(module.cache_file(entry)._index_path).with_suffix(".lock")
+    with lock.open("a") as file, ThreadPoolExecutor() as beside:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        waiting = beside.submit(entry, 4.0)
+        time.sleep(0.3)
+        assert not waiting.done()
+        assert not [*lock.parent.glob("*.nbc")]
+        fcntl.flock(file, fcntl.LOCK_UN)
+        assert waiting.result() == 4.5
+
+
+def test_a_process_that_has_waited_long_compiles_itself(entry, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setattr(module, "LONGEST", 0.1)
+    with Path(module.cache_file(entry)._index_path).with_suffix(".lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        assert entry(4.0) == 4.5
+
+
+def test_where_files_cannot_be_locked_each_process_compiles(entry, monkeypatch):
+    fcntl = pytest.importorskip("fcntl")
+
+    def refused(*_):
+        raise OSError(errno.ENOLCK, "no locks")
+
+    monkeypatch.setattr(fcntl, "flock", refused)
+    assert entry(4.0) == 4.5
+
+
+def test_what_is_kept_is_loaded_without_waiting(entry):
+    fcntl = pytest.importorskip("fcntl")
+    entry(4.0)
+    assert module.is_kept(entry, entry.signatures[0])
+    again = module.compiled(sum_of_halves, cache=True)
+    with Path(module.cache_file(entry)._index_path).with_suffix(".lock").open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        begin = time.monotonic()
+        assert again(4.0) == 4.5
+        assert time.monotonic() - begin < 10
+    assert again.stats.cache_hits
+
+
+def test_another_numba_compiles_it_as_any_other(monkeypatch):
+    from numba.core.compiler import Compiler
+
+    monkeypatch.setattr(linked, "_INTERNAL", ("no_such_name",))
+    assert linked._linked_compiler.__wrapped__() is Compiler
