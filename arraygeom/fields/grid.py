@@ -100,6 +100,15 @@ class FieldOnGrid:
         blocks = self.blocks and grid(self.blocks, BLOCK)
         return replace(self, at=lambda x: moved(self.at(x), x), pixels=grid(self.straight, 1), blocks=blocks)
 
+    def any_valid(self, hw: HW) -> bool:
+        """Whether any of alpha's h x w pixels has somewhere to look in beta; every eighth row and column counts."""
+        h, w = hw
+        if self.pixels is not None:
+            return bool(self.pixels.valid[..., :h:8, :w:8].any())
+        found = self.at(pixel_grid(hw)[::8, ::8].reshape(-1, 2))
+        assert isinstance(found, Positions)
+        return bool(found.mask.any())
+
     @property
     def large(self) -> bool:
         """Whether segments are stored as float32."""

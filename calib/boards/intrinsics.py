@@ -145,10 +145,18 @@ def check_tilts(name: str, poses: Mapping[FrameKey, Pose], board: Board) -> None
 
 
 def board_pose(camera: Camera, found: Detection, board: Board) -> Pose:
-    """`cam_from_board` of one image, for a camera whose intrinsics are known."""
+    """`cam_from_board` of one image, for a camera whose intrinsics are known.
+
+    Raises ValueError for fewer than four points in front of the camera, as a lens far from the true one may see them.
+    """
     directions, valid = camera.rays(torch.from_numpy(found.x))
     rays = directions.numpy()
     usable = valid.numpy() & (rays[:, 2] > 0.05 * np.linalg.norm(rays, axis=1))
+    if usable.sum() < 4:
+        raise ValueError(
+            f"only {usable.sum()} of {len(usable)} points of a board are in front of {camera}: a pose needs four; "
+            "check its lens and focal length"
+        )
     flat = rays[usable, :2] / rays[usable, 2:]
     points = board.points[found.ids[usable]]
     method = cv2.SOLVEPNP_IPPE if board.flat else cv2.SOLVEPNP_SQPNP

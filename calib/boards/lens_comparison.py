@@ -84,7 +84,7 @@ def _fold_errors(name: str, views: BoardViews, board: Board, lens: Lens, fold: i
 
 
 def _frame_error(fit: SingleCalibration, key: FrameKey, views: BoardViews, board: Board) -> float:
-    """Of one frame, with the board's pose fitted to it; infinite where the lens does not reach."""
+    """Of one frame, with the board's pose fitted to it. Raises ValueError as `board_pose`."""
     camera, found, solved = fit.camera, views.seen[key], fit.fit.problem
     pose = board_pose(camera, found, board)
     part = board.part[found.ids[:1]]

@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from arraygeom.segments import sample_fractions
 from arraygeom.threads import in_parallel
 from pat.attention import kernels
-from pat.attention.reference import EDGE_SLACK, SamplePositions
+from pat.attention.reference import EDGE_SLACK, SamplePositions, accumulated, channels_last
 
 PIECE_SAMPLES = 2**15
 """Samples that a thread takes at a time: a fraction of a millisecond."""
@@ -39,7 +39,7 @@ def forward(
     """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
     the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest weights."""
     b, _, ha, wa = query.shape
-    counted = _accumulated(query)
+    counted = accumulated(query)
     out = _new(b, ha, wa, value.shape[1], dtype=query.dtype)
     statistics = _new(*((b, ha, wa, 4) if measured else (0,)), dtype=counted)
     logsum = _new(b, ha, wa, dtype=counted)
@@ -67,9 +67,9 @@ def backward(
     the channels are, for the additions to beta's pixels.
     """
     b, d, ha, wa = query.shape
-    counted = _accumulated(query)
+    counted = accumulated(query)
     call = _call(query, key, value, positions, bias, nearest)
-    upstream = _flat(_channels_last(cotangents[0]))
+    upstream = _flat(channels_last(cotangents[0]))
     statistics, statistics_upstream = (
         t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous())
     )
@@ -114,15 +114,6 @@ def backward(
     return *images, points_out, bias_out
 
 
-def _accumulated(tensor: Tensor) -> torch.dtype:
-    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
-
-
-def _channels_last(image: Tensor) -> Tensor:
-    """(b, d, h, w) to (b, h, w, d); a copy only if it does not lie in memory like that."""
-    return image.permute(0, 2, 3, 1).contiguous()
-
-
 def _flat(tensor: Tensor) -> np.ndarray:
     """The numbers as the kernels know them: bfloat16 as uint16, float16 as int16."""
     seen = {torch.bfloat16: torch.uint16, torch.float16: torch.int16}.get(tensor.dtype, tensor.dtype)
@@ -163,18 +154,18 @@ def _geometry(positions: SamplePositions, query: Tensor, key: Tensor, nearest: b
 
 
 def _number(like: Tensor) -> type:
-    return np.float64 if _accumulated(like) == torch.float64 else np.float32
+    return np.float64 if accumulated(like) == torch.float64 else np.float32
 
 
 def _call(
     query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
 ) -> kernels.Call:
     return kernels.Call(
-        _flat(_channels_last(query)),
-        _flat(_channels_last(key)),
-        _flat(_channels_last(value)),
+        _flat(channels_last(query)),
+        _flat(channels_last(key)),
+        _flat(channels_last(value)),
         geometry=_geometry(positions, query, key, nearest),
-        bias=_flat(_bias(bias, _accumulated(query))),
+        bias=_flat(_bias(bias, accumulated(query))),
         biased=bias is not None,
         channels=query.shape[1],
         value_channels=value.shape[1],

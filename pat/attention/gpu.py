@@ -22,7 +22,7 @@ import triton.language as tl
 from torch import Tensor
 
 from arraygeom.segments import sample_fractions
-from pat.attention.reference import EDGE_SLACK, LEAST_DEVIATION, SamplePositions
+from pat.attention.reference import EDGE_SLACK, LEAST_DEVIATION, SamplePositions, accumulated, channels_last
 
 PIXELS = 8
 """Alpha pixels of one program."""
@@ -43,7 +43,7 @@ def forward(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """As `cpu.forward`, with the sample of the largest weight (b, ha, wa)."""
     b, _, ha, wa = query.shape
-    counted = _accumulated(query)
+    counted = accumulated(query)
     out = query.new_empty(b, ha, wa, value.shape[1])
     statistics = query.new_empty(b, ha, wa, 4, dtype=counted)
     logsum = query.new_empty(b, ha, wa, dtype=counted)
@@ -66,8 +66,8 @@ def backward(
 ) -> tuple[Tensor, ...]:
     """As `cpu.backward`; `saved` are statistics, logsum, the best samples, and the values."""
     b, _, ha, wa = query.shape
-    counted = _accumulated(query)
-    upstream = _channels_last(cotangents[0])
+    counted = accumulated(query)
+    upstream = channels_last(cotangents[0])
     statistics, statistics_upstream = (
         t.contiguous() if t.numel() else t.new_zeros(b, ha, wa, 4) for t in (saved[0], cotangents[1].to(counted))
     )
@@ -81,7 +81,7 @@ def backward(
     inputs, options = _call(query, key, value, positions, bias, nearest)
     _backward[_programs(query)](
         *inputs,
-        *(statistics, saved[1], saved[2], _channels_last(saved[3]), upstream, statistics_upstream, scales),
+        *(statistics, saved[1], saved[2], channels_last(saved[3]), upstream, statistics_upstream, scales),
         *(query_out, *images, points_out, bias_out),
         **options,
         WANTS_BIAS=wanted[4],
@@ -112,15 +112,7 @@ def _scales(query: Tensor, key: Tensor, value: Tensor, upstream: Tensor, statist
     by_weight = pull * value.abs().amax().double() * value.shape[1]
     by_weight = by_weight + statistics_upstream.abs().amax().double() * (3 * diagonal + 1)
     most = torch.stack([2 * by_weight * query.abs().amax().double(), pull]) * pixels
-    return torch.exp2(FIXED_BITS - most.clamp(min=1e-30).log2().ceil()).to(_accumulated(query))
-
-
-def _accumulated(tensor: Tensor) -> torch.dtype:
-    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
-
-
-def _channels_last(image: Tensor) -> Tensor:
-    return image.permute(0, 2, 3, 1).contiguous()
+    return torch.exp2(FIXED_BITS - most.clamp(min=1e-30).log2().ceil()).to(accumulated(query))
 
 
 def _programs(query: Tensor) -> tuple[int]:
@@ -130,9 +122,9 @@ def _programs(query: Tensor) -> tuple[int]:
 def _call(
     query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
 ) -> tuple:
-    counted = _accumulated(query)
+    counted = accumulated(query)
     inputs = (
-        *(_channels_last(t) for t in (query, key, value)),
+        *(channels_last(t) for t in (query, key, value)),
         positions.points.contiguous(),
         positions.mask.contiguous().view(torch.uint8),
         sample_fractions(positions.samples, like=positions.points),

@@ -73,16 +73,16 @@ def attend(
     query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
 ) -> Attended:
     """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
-    accumulate = torch.float64 if query.dtype == torch.float64 else torch.float32
+    counted = accumulated(query)
     with torch.autocast(query.device.type, enabled=False):
-        key, value = (pixels(plane.to(accumulate)) for plane in (key, value))
+        key, value = (channels_last(plane.to(counted)) for plane in (key, value))
         bands = [
             _band(
-                query[:, :, top:bottom].to(accumulate).permute(0, 2, 3, 1),
+                query[:, :, top:bottom].to(counted).permute(0, 2, 3, 1),
                 key,
                 value,
                 positions.rows(top, bottom),
-                None if bias is None else bias[:, top:bottom].to(accumulate),
+                None if bias is None else bias[:, top:bottom].to(counted),
                 nearest,
             )
             for top, bottom in _bands(query, key, value, positions.samples)
@@ -99,8 +99,13 @@ def _bands(query: Tensor, key: Tensor, value: Tensor, samples: int) -> list[tupl
     return [(top, min(top + rows, ha)) for top in range(0, ha, rows)]
 
 
-def pixels(image: Tensor) -> Tensor:
-    """Channels last: (b, d, h, w) to (b, h, w, d)."""
+def accumulated(tensor: Tensor) -> torch.dtype:
+    """The type of sums of such numbers."""
+    return torch.float64 if tensor.dtype == torch.float64 else torch.float32
+
+
+def channels_last(image: Tensor) -> Tensor:
+    """(b, d, h, w) to (b, h, w, d); a copy only if it does not lie in memory like that."""
     return image.permute(0, 2, 3, 1).contiguous()
 
 

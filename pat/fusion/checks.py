@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Rig
-
 from ..networks.bandwise import BandwisePAT
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from .inputs import FrameInputs
 from .results import Frame
+from .views import Views
 
 LOW_CONFIDENCE = 0.3
 UNFIT_CONFIDENCE = 0.21
@@ -34,30 +33,34 @@ class LowConfidenceWarning(UserWarning):
     exit_status = 3
 
 
-def check_bands(network: FusionNetwork, rig: Rig, bands: Mapping[str, int]) -> None:
-    """Refuse betas, given by the number of bands of each, whose bands are not those that the network makes.
+def check_bands(network: FusionNetwork, views: Views) -> None:
+    """Refuse betas whose bands are not those that the network makes; warn of those whose three bands are equal.
 
     Raises ValueError that says which weights to take.
     """
+    _refuse_bands(network, views)
+    for name in views.betas:
+        image = views.images[name]
+        if len(image) == 3 and equal_bands(image):
+            warnings.warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3)
+
+
+def _refuse_bands(network: FusionNetwork, views: Views) -> None:
     wanted = network.config.bands if isinstance(network, GuidedPAT) else None
+    bands = {name: len(views.images[name]) for name in views.betas}
     total = sum(bands.values())
     if wanted is None or total == wanted or wanted in bands.values():
         return
     listed = ", ".join(f"'{name}' {count}" for name, count in bands.items())
     advice = ""
     if wanted == 3 and total == 1:
-        said = ", and the rig says that it is in colour" if rig[next(iter(bands))].sensor.response == "rgb" else ""
+        sensor = views.rig[next(iter(bands))].sensor
+        said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
         advice = f"its image is grey{said}: give one in colour, or "
     raise ValueError(
         f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights make {wanted}: "
         f"{advice}take the weights mono-spectral, which fuse any number of bands"
     )
-
-
-def warn_of_grey(name: str, image: Float[Tensor, "c h w"]) -> None:
-    """Warn of a beta's image with three equal bands: it has no colour to give."""
-    if len(image) == 3 and equal_bands(image):
-        warnings.warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3)
 
 
 def equal_bands(image: Float[Tensor, "c h w"]) -> bool:

@@ -15,9 +15,10 @@ from ..media.images import Images
 from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes
-from .checks import check_bands, warn_of_confidence, warn_of_grey
+from .checks import check_bands, warn_of_confidence
 from .corrections import Corrections, expected_work, find_corrections
-from .inputs import FrameInputs, background_filled, frame_inputs
+from .depth import background_filled
+from .inputs import prepared
 from .low_light import Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
 from .response import Given
@@ -28,7 +29,6 @@ from .views import Views
 
 LOG = logging.getLogger(__name__)
 
-Undo = Callable[[Frame], Frame]
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
@@ -108,10 +108,10 @@ def fuse(
         raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
     check_luminance(network, luminance, noisy=noise is not None)
     limit = None if max_memory is None else parse_bytes(max_memory)
-    quiet = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
-    views = quiet.views
-    inputs, undo = _prepared(network, views, match_levels)
-    betas, quiet = views.betas, quiet.without_images()
+    views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
+    check_bands(network, views)
+    betas, steps = views.betas, steps_for(network, normalise=match_levels)
+    inputs, undo = prepared(network, views, steps)
     del views  # whose images are there again, padded
     LOG.info("planning")
     before = 0.0 if corrections else expected_work(inputs, response, align=align)
@@ -129,16 +129,15 @@ def fuse(
         state = network.prepare(inputs.inputs)
         LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
         with torch.set_grad_enabled(differentiable):
-            wrapped = quiet.wrapped(network)
+            wrapped = low_light.wrapped(network)
             frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
-            frame, matched = quiet.split(frame, len(inputs.inputs.betas))
+            frame, matched = low_light.split(frame, len(inputs.inputs.betas))
         warn_of_confidence(network, frame, inputs)
         frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
         del inputs, fused, state  # the segments and matches of a large frame: what follows needs memory, too
-        steps = steps_for(network, normalise=match_levels)
-        frame = quiet.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+        frame = low_light.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
         for back in undo:
             frame = back(frame)
@@ -162,18 +161,7 @@ def corrections_of(
 
     Arguments and errors are as of `fuse`.
     """
-    views = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise).views
-    return find_corrections(network, _prepared(network, views, match_levels)[0], response, align=align)
-
-
-def _prepared(network: FusionNetwork, views: Views, normalise: bool) -> tuple[FrameInputs, list[Undo]]:
-    """The network's inputs, and how the frame is taken back to the views, the last step first."""
-    check_bands(network, views.rig, {name: len(views.images[name]) for name in views.betas})
-    for name in views.betas:
-        warn_of_grey(name, views.images[name])
-    undo: list[Undo] = []
-    LOG.info("preparing %d images", len(views.betas) + 1)
-    for step in steps_for(network, normalise=normalise):
-        views, back = step.do(views)
-        undo.insert(0, back)
-    return frame_inputs(network, views), undo
+    views, _ = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
+    check_bands(network, views)
+    inputs, _ = prepared(network, views, steps_for(network, normalise=match_levels))
+    return find_corrections(network, inputs, response, align=align)

@@ -6,11 +6,11 @@ import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import torch
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor
 
 from arraygeom import sample
 
@@ -18,7 +18,8 @@ from ..media.colour import luminance
 from ..networks.collaborative import luma_refined, without_noise
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
 from ..networks.pieces import tiles_of
-from ..networks.protocol import FusionNetwork, FusionOutput, Inputs
+from ..networks.positions import Found, WithPositions, split
+from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
 from .averaging import averaged_with_alike
@@ -44,26 +45,16 @@ def shipped_denoiser() -> LowLightNetwork:
     return load_denoiser()
 
 
-class Found(NamedTuple):
-    """Where alpha's pixels are in a beta, (H, W, 2), and with what confidence, (H, W)."""
-
-    position: Tensor
-    confidence: Tensor
-
-
 @dataclass(frozen=True)
-class DenoisedViews:
-    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but unbiased."""
+class LowLight:
+    """Views as given, without noise, and those that had some: (1, C, H, W) by camera, as recorded but unbiased.
+
+    If no view had noise, nothing is asked of them, and they are without images.
+    """
 
     given: Views
     views: Views
     noisy: Mapping[str, NoisyView]
-
-    def without_images(self) -> DenoisedViews:
-        """The same, if no view had noise, without images: nothing more is asked of them."""
-        if self.noisy:
-            return self
-        return DenoisedViews(replace(self.given, images={}), replace(self.views, images={}), {})
 
     def wrapped(self, network: FusionNetwork) -> FusionNetwork:
         """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""
@@ -73,9 +64,8 @@ class DenoisedViews:
         """The frame that a `wrapped` network made of so many betas, and what its further bands say of each of them."""
         if not self.noisy:
             return frame, []
-        bands = len(frame.image) - 3 * betas
-        further = frame.image[bands:].split(3)
-        return frame._replace(image=frame.image[:bands]), [Found(f[:2].movedim(0, -1), f[2]) for f in further]
+        image, found = split(frame.image, betas)
+        return frame._replace(image=image), found
 
     def corrected(
         self, frame: Frame, found: Sequence[Found], steps: Sequence[FusionStep], *, keep_alpha: bool = False
@@ -87,29 +77,24 @@ class DenoisedViews:
         """
         if not self.noisy:
             return frame
-        (h, w), alpha, image = frame.image.shape[-2:], self.views.alpha, frame.image
-        views = self.prepared(steps)
-        own = NoisyView(*(part[..., :h, :w] for part in views[alpha]))
-        if all(len(self.views.images[name]) == 3 for name in self.views.betas) and len(found) == len(views) - 1:
-            betas = [view for name, view in views.items() if name != alpha]
+        alpha, image, views = self.views.alpha, frame.image, self.prepared(steps)
+        given = self._stepped(self.given.images, steps)[alpha] if keep_alpha else None
+        own = views.pop(alpha)
+        betas = list(views.values())
+        if all(view.recorded.shape[1] == 3 for view in betas):
             image = jointly_denoised(image, own, betas, found)
             if keep_alpha or alpha not in self.noisy:
                 image = image - luminance(image - frame.image)
-        if keep_alpha:
-            recorded = self._stepped(self.given.images, steps)[alpha]
-            image = image + recorded - own.denoised[0]
-        return frame._replace(image=image)
+        return frame._replace(image=image if given is None else image + given - own.denoised[0])
 
     def prepared(self, steps: Sequence[FusionStep]) -> dict[str, NoisyView]:
-        """Every view, alpha first, as recorded, denoised, and its deviation, after the steps before it is fused.
+        """Every view as recorded, denoised, and its deviation, after the steps before it is fused.
 
         Except for `Radiometry`: values keep their scale.
         """
         views = {name: self._noisy(name) for name in self.views.images}
         parts = [self._stepped({name: view[i][0] for name, view in views.items()}, steps) for i in range(3)]
-        return {
-            name: NoisyView(*(part[name][None] for part in parts)) for name in (self.views.alpha, *self.views.betas)
-        }
+        return {name: NoisyView(*(part[name][None] for part in parts)) for name in parts[0]}
 
     def _stepped(self, images: Mapping[str, Tensor], steps: Sequence[FusionStep]) -> Mapping[str, Tensor]:
         views = self.views.replace(images)
@@ -122,8 +107,8 @@ class DenoisedViews:
         return self.noisy.get(name) or NoisyView(image, image, torch.zeros_like(image))
 
 
-def denoised_views(views: Views, noise: Noise | None) -> DenoisedViews:
-    """Every view with noticeable noise without it; without `noise` all as they are.
+def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
+    """Views without noticeable noise, and what was recorded; without `noise` all as they are.
 
     Raises ValueError for a camera that is not among the views.
     """
@@ -135,7 +120,11 @@ def denoised_views(views: Views, noise: Noise | None) -> DenoisedViews:
             if noise != "estimate":
                 warn_of_noise(name, views.images[name], view)
             noisy[name] = view
-    return DenoisedViews(views, views.replace({name: view.denoised[0] for name, view in noisy.items()}), noisy)
+    if not noisy:
+        without = replace(views, images={})
+        return views, LowLight(without, without, {})
+    denoised = views.replace({name: view.denoised[0] for name, view in noisy.items()})
+    return denoised, LowLight(views, denoised, noisy)
 
 
 def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
@@ -217,25 +206,3 @@ def _in_pieces(work: Callable[..., Tensor], *images: Tensor) -> Tensor:
         part = work(*(image[..., y0:y1, x0:x1] for image in images))
         whole[..., top:bottom, left:right] = part[..., top - y0 : bottom - y0, left - x0 : right - x0]
     return whole
-
-
-class WithPositions(nn.Module):
-    """A network whose image has further bands: the position (x, y) in each whole beta, and its confidence."""
-
-    def __init__(self, network: FusionNetwork) -> None:
-        super().__init__()
-        self.network = network
-
-    def __getattr__(self, name: str) -> Any:
-        """What the fusion asks of networks is that of the network inside."""
-        inside = self.__dict__["_modules"].get("network") or self.__dict__.get("network")
-        return inside if name == "network" else getattr(inside, name)
-
-    def forward(self, inputs: Inputs, state: Any = None) -> FusionOutput:
-        """Fuse; the image must be of alpha's size."""
-        found = self.network(inputs, state)
-        further = [found.image]
-        for beta, position, confidence in zip(inputs.betas, found.position, found.confidence):
-            corner = position.new_tensor(beta.offset)[:, None, None]
-            further += [(position + corner).to(found.image), confidence[:, None].to(found.image)]
-        return found._replace(image=torch.cat(further, 1))

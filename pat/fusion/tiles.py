@@ -21,7 +21,8 @@ from arraygeom.pixels import HW
 from ..networks.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
 from ..networks.protocol import FusionNetwork, Inputs, State
 from ..support.tensor_files import write_tensors
-from .inputs import FrameInputs, depth_and_confidence
+from .depth import depth_and_confidence
+from .inputs import FrameInputs
 from .results import Frame
 
 MAX_HALO = 224

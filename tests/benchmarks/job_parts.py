@@ -17,7 +17,7 @@ from typing import Any
 
 STAGES = {
     "read": ["pat.media.images.read_image", "pat.cli.options.load_rig"],
-    "views": ["pat.fusion.fuse._prepared"],
+    "views": ["pat.fusion.fuse.prepared"],
     "field": ["arraygeom.fields.grid.FieldOnGrid.of"],
     "plan": ["pat.fusion.fuse.plan_frame"],
     "pre-pass": ["pat.fusion.fuse.find_corrections"],

@@ -13,6 +13,7 @@ from calib.boards.adequacy import (
     uncertainty,
 )
 from calib.boards.camera_parameters import camera_jacobian, parameter_names
+from calib.boards.intrinsics import board_pose
 from calib.boards.lens_comparison import LensComparison, compare_lenses
 from calib.boards.report import by_cameras
 from calib.boards.rig import calibrate
@@ -81,6 +82,14 @@ def test_the_simplest_of_equal_lenses_is_advised():
     assert LensComparison({**errors, "rational": 0.8 * base}).advised == "rational"
     assert "brown-conrady 1.0" in LensComparison(errors).advice
     assert "too few frames" in LensComparison({}).advice
+
+
+def test_a_lens_that_sees_the_board_behind_it_gives_no_pose():
+    """One line, by which the comparison of lenses leaves a model out that came out wrong."""
+    seen = next(iter(see(Rig({"cam": TRUE}), board_poses(1), noise=0.2)["cam"].seen.values()))
+    wrong = camera(60.0, (480, 640), lens=(0.0, 0.0, 0.0, 0.0), model="kannala-brandt", offset=(1e3, 0.0))
+    with pytest.raises(ValueError, match=r"only \d+ of \d+ points of a board are in front of Camera: 640x480"):
+        board_pose(wrong, seen, BOARD)
 
 
 @pytest.mark.slow

@@ -77,7 +77,7 @@ def test_a_hanging_worker_is_ended(tmp_path):
     outcome = make(tmp_path, 3, {"3": "hang"}, timeout=0.3, crashes=2)
     assert (outcome.state, outcome.crashes) == ("given up", 2)
     assert "took longer than 0.3 s" in reason(tmp_path, 3)["reason"]
-    assert time.monotonic() - started < 50
+    assert time.monotonic() - started < 300
 
 
 def test_what_would_befall_every_scene_stops_the_job(tmp_path):
@@ -187,7 +187,7 @@ def children(pid: int) -> list[int]:
 
 def wait_for_the_end_of(pids: list[int]) -> None:
     """Workers die with their parent; the kernel needs a moment."""
-    end = time.monotonic() + 30
+    end = time.monotonic() + 300
     while any(Path(f"/proc/{pid}").exists() for pid in pids):
         assert time.monotonic() < end, "a worker outlived its parent"
         time.sleep(0.01)

@@ -5,7 +5,8 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
-from pat.fusion.inputs import Placement, background_filled, depth_and_confidence
+from pat.fusion.depth import background_filled, depth_and_confidence
+from pat.fusion.inputs import Placement
 from pat.networks.protocol import Beta, FusionOutput, Inputs
 
 NEAR, FAR, HW = 1.4, 20.0, (12, 40)

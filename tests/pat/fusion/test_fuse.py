@@ -27,9 +27,9 @@ from arraygeom import (
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
 from pat.evaluation.metrics import score
-from pat.fusion.fuse import _prepared, fuse
-from pat.fusion.inputs import FrameInputs
-from pat.fusion.steps import quarter_turns, resolution_ratio, without_lenses
+from pat.fusion.fuse import fuse
+from pat.fusion.inputs import FrameInputs, prepared
+from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
 from pat.media.colour import linear_from_srgb, luminance
@@ -450,7 +450,8 @@ def test_an_image_that_is_not_needed_again_is_not_kept():
     images = {"mono": texture(1, hw), "colour": texture(3, beta_hw)}
     views = Views.of(rig_of(hw, beta_hw), images, alpha="mono")
     kept = weakref.ref(images["mono"])
-    inputs, undo = _prepared(network_of("GuidedPAT"), views, False)
+    network = network_of("GuidedPAT")
+    inputs, undo = prepared(network, views, steps_for(network, normalise=False))
     del views, images
     assert undo
     assert inputs.hw == hw

@@ -6,6 +6,7 @@ import torch
 
 from arraygeom import Segments, pixel_grid
 from pat.media.colour import luminance
+from pat.networks import warped
 from pat.networks.matching import semi_global_matching
 from pat.networks.warped import LIKENESS, _diffused, colour_noise, explained_share, match_weight
 from tests.pat.networks.matched_scenes import beside, blurred, faint
@@ -53,6 +54,29 @@ def test_a_match_has_the_detail_that_beta_lost():
     here = in_place((48, 64))
     left, lost = (e[..., 6:-6, 6:-6].abs().mean() for e in chroma_errors(alpha, beta, ground_truth, here))
     assert left < 0.8 * lost
+
+
+def test_of_a_beta_far_less_sharp_more_around_a_pixel_says_what_detail_it_lost(monkeypatch):
+    """Within 5 x 5 pixels a beta reduced 8 times shows one value."""
+    g = torch.Generator().manual_seed(7)
+    alpha = sum(enlarged(torch.rand(1, 1, 96 // s, 128 // s, generator=g), s) for s in (2, 4, 8, 16)) / 4
+    ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
+    beta = torch.cat([blurred(band, 4.0) for band in ground_truth.split(1, 1)], 1)
+    left = []
+    for factor in (warped.RADIUS_OF_BLUR, 0.0):
+        monkeypatch.setattr(warped, "RADIUS_OF_BLUR", factor)
+        left.append(chroma_errors(alpha, beta, ground_truth, in_place((96, 128)))[0][..., 8:-8, 8:-8].abs().mean())
+    assert left[0] < 0.9 * left[1]
+
+
+def test_each_of_a_batch_has_the_window_of_its_own_blur():
+    g = torch.Generator().manual_seed(8)
+    colour, brightness, alpha = (torch.rand(2, c, 24, 32, generator=g) for c in (3, 1, 1))
+    both = warped._each_detailed(colour, brightness, alpha, [2, 6])
+    for i, radius in enumerate((2, 6)):
+        one = (x[i : i + 1] for x in (colour, brightness, alpha))
+        assert torch.equal(warped._detailed(*one, warped.SATURATED, radius), both[i : i + 1])
+    assert not torch.equal(both, warped._each_detailed(colour, brightness, alpha, [2, 2]))
 
 
 def test_colour_that_does_not_follow_brightness_is_left_alone():

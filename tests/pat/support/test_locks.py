@@ -19,7 +19,7 @@ from pathlib import Path
 from pat.support.locks import folder_lock
 with folder_lock(Path(sys.argv[1])):
     print("held", flush=True)
-    time.sleep(60)
+    time.sleep(3600)
 """
 
 

@@ -2,11 +2,12 @@
 
 import subprocess
 import sys
+import threading
 
 import numpy as np
 import pytest
 
-from pat.support.memory import ROOM, give_back, how_many_fit, limited, parse_bytes, resident, watch_peak
+from pat.support.memory import ROOM, give_back, how_many_fit, limited, parse_bytes, peak_memory, resident, watch_peak
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -38,12 +39,27 @@ def test_bytes_are_read():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="read from /proc")
-def test_the_peak_of_a_process_is_its_own_not_that_of_its_parent():
+def test_the_peak_of_a_process_is_its_own_not_that_of_its_parent(monkeypatch):
     held = np.ones(2**26)  # 512 MiB resident here while the other starts
-    code = "import time; held = bytearray(100 << 20); del held; time.sleep(2)"
-    process = subprocess.Popen([sys.executable, "-I", "-S", "-c", code])
-    peak = watch_peak(process.pid, every=0.01)()
-    assert process.wait() == 0
+    code = "held = bytearray(100 << 20); del held; print(flush=True); input()"
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    looked = threading.Semaphore(0)
+
+    def noted(pid):
+        found = peak_memory(pid)
+        looked.release()
+        return found
+
+    monkeypatch.setattr("pat.support.memory.peak_memory", noted)
+    with subprocess.Popen([sys.executable, "-I", "-S", "-c", code], **pipes) as process:
+        peak = watch_peak(process.pid, every=0.01)
+        process.stdout.readline()
+        while looked.acquire(blocking=False):
+            pass
+        assert all(looked.acquire(timeout=300) for _ in range(2))  # the second is after it had its memory
+        process.communicate("\n")
+        peak = peak()
+    assert process.returncode == 0
     assert held.nbytes == 2**29
     assert 100 * 2**20 < peak < 200 * 2**20
     assert watch_peak(process.pid)() == 0
@@ -69,7 +85,7 @@ first = kept()
 with limited(100 * begin):
     far = kept(2)
 with limited((begin + 240 * 2**20) / NEAR):
-    near = kept(300)
+    near = kept(3000)
 print(round(first), round(far), round(near), round(kept(2)))
 """
 

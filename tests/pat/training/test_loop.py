@@ -65,7 +65,7 @@ def test_samples_are_made_and_matched_ahead(folder):
             yield group
 
     given = next(made := made_ahead(source(), network))[0]
-    assert asked.wait(60)
+    assert asked.wait(600)
     made.close()
     objective = Objective(network, config.loss)
     assert given.state is not None

@@ -1,0 +1,119 @@
+"""From the positions that a network finds in the betas to depth at alpha's pixels."""
+
+from __future__ import annotations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from arraygeom import Segments, depth_from_track, pixel_grid
+from arraygeom.epipolar import Depth, Track
+from arraygeom.pixels import HW
+
+from ..networks.protocol import FusionOutput, Inputs
+from .inputs import Placement
+
+UNSEEN = 1e-4
+"""At confidences up to this beta does not see the point: then its position gives no depth."""
+
+
+def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
+    """Positions of some of alpha's pixels, those beyond an end of their segment moved along it to that end."""
+    h, w = which.shape
+    start, end, valid = (t[0, :h, :w][which] for t in (segments.start, segments.end, segments.valid))
+    start, end = start.to(where), end.to(where)
+    way = end - start
+    length2 = way.square().sum(-1)
+    share = ((where - start) * way).sum(-1) / length2.clamp(min=1e-12)
+    beyond = valid & (length2 > 1e-6) & ((share < 0) | (share > 1))
+    moved = where + (share.clamp(0, 1) - share)[..., None] * way
+    return torch.where(beyond[..., None], moved, where)
+
+
+def depth_and_confidence(
+    output: FusionOutput, part: Inputs, placements: list[Placement], hw: HW, corner: tuple[int, int]
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """Depth from the calibrated betas, weighted by confidence in inverse depth (NaN: unknown); the image's confidence.
+
+    A position whose depth is beyond the bounds that were searched counts as the end of its segment: a pixel beyond the
+    far end may otherwise stand for any distance.
+    `corner` is the (x, y) of the part's first pixel in alpha; `hw` the size of the part without padding.
+    """
+    h, w = hw
+    like = output.position[0]
+    x = (pixel_grid(hw, dtype=like.dtype, device=like.device) + like.new_tensor(corner)).reshape(-1, 2)
+    total, weights = like.new_zeros(2, h, w)
+    for beta, place, position, confidence in zip(part.betas, placements, output.position, output.confidence):
+        if not place.has_depth:
+            continue
+        pair, track, offset = place.pair, place.track(x), like.new_tensor(beta.offset)
+        where = position[0, :, :h, :w].movedim(0, -1)
+        found = depth_from_track(track, (where + offset).reshape(-1, 2))
+        if beta.field.pixels is not None and pair.depth is not None:
+            near, far = (bound.to(found.depth) for bound in pair.depth)
+            beyond = ~(found.valid & (found.depth >= near) & (found.depth <= far))
+            if bool(beyond.any()):
+                moved = _within(where.reshape(-1, 2)[beyond], beta.field.pixels, beyond.view(h, w))
+                there = depth_from_track(Track(*(v.expand_as(track.a)[beyond] for v in track)), moved + offset)
+                found = Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
+        valid = found.valid.reshape(h, w)
+        weight = torch.where(valid & (confidence[0, :h, :w] > UNSEEN), confidence[0, :h, :w], 0.0)
+        total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
+        weights = weights + weight
+    known = weights > 0
+    depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
+    overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
+    return depth.to(output.image), overall[0, :h, :w]
+
+
+ROWS = 512
+"""Rows whose depth is filled at a time."""
+LOST = 0.3
+"""Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
+
+ONE_SIDE = 0.9
+"""Length of the sum of all betas' segments, over the sum of their lengths, from which all count as on one side."""
+
+
+def background_filled(
+    depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"], inputs: Inputs
+) -> Float[Tensor, "h w"]:
+    """Depth whose values of low confidence are the farther of the nearest confident ones to either side.
+
+    What a beta does not see is occluded: farther away than what is beside it. Along rows, or along columns if the betas
+    are above or below alpha. What is unknown stays NaN. Betas on several sides see what is occluded in one of them:
+    depth is then as it is.
+    """
+    steps = [beta.field.pixels for beta in inputs.betas if beta.field.pixels is not None]
+    if not steps:
+        return depth
+    every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
+    apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
+    if apart.sum(0).norm() < ONE_SIDE * apart.norm(dim=1).sum():
+        return depth
+    across, down = apart.sum(0).abs().tolist()
+    if across < down:
+        return _filled_along_rows(depth.mT, confidence.mT).mT
+    return _filled_along_rows(depth, confidence)
+
+
+def _filled_along_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Some rows at a time: what is computed on the way is seven times as large."""
+    return torch.cat([_filled_rows(*part) for part in zip(depth.split(ROWS), confidence.split(ROWS))])
+
+
+def _filled_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
+    known = (confidence >= LOST) & depth.isfinite()
+    before = _nearest_known(inverse, known)
+    after = _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1)
+    beside = torch.fmin(before, after)
+    found = torch.where(known | beside.isnan(), inverse, beside)
+    return torch.where(depth.isfinite() & (found > 0), 1 / found, depth)
+
+
+def _nearest_known(values: Float[Tensor, "h w"], known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Each pixel's nearest known value to the left, itself included; NaN if there is none."""
+    columns = torch.arange(values.shape[1], device=values.device).expand_as(values)
+    last = torch.where(known, columns, -1).cummax(1).values
+    return torch.where(last >= 0, values.gather(1, last.clamp(min=0)), torch.nan)
