@@ -117,14 +117,26 @@ class Diagnosis:
     repaired: Rig
 
     @property
+    def outside_depth_range(self) -> bool:
+        """Whether the rig fits but for its depth range, outside which most points lie."""
+        return self.before.misfit < HEALTHY_MISFIT and self.before.front >= 0.5 and self.before.inside < 0.5
+
+    @property
     def verdict(self) -> str:
         """The diagnosis in a sentence or two."""
+        excluded = (
+            f"the depth range excludes the scene: {self.before.inside:.0%} of the points lie within it, their median "
+            f"depth is {self.before.depth:.3g} m: correct `depth` in the rig file, or give --depth"
+        )
         if self.named.kind != "nothing":
             others = "".join(f"; or: {remedy.words}" for remedy in self.equal)
-            return f"likely mistake: {self.named.words}{others}"
+            range_alone = f"; or {excluded}" if self.named.kind == "units" and self.outside_depth_range else ""
+            return f"likely mistake: {self.named.words}{others}{range_alone}"
         if self.healthy:
             return "nothing wrong: the points lie on their lines to the accuracy of their positions"
         shifts = "; or: ".join(remedy.words for remedy in self.equal)
+        if self.outside_depth_range:
+            return excluded + (f". Or: {shifts}" if shifts else "")
         return (
             f"none of the usual mistakes, but the rig is {self.before.misfit:.2f} px off these images: "
             "it has drifted or was inaccurate from the beginning; `pat rig refine` may repair what can be observed"

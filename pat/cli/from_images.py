@@ -107,6 +107,9 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
 def files_of(path: Path) -> list[Path]:
     """The image files of a camera, of a file, a folder or a pattern. Raises FileNotFoundError if there are none."""
     if not path.is_dir() and not path.exists() and not any(c in path.name for c in "*?["):
+        _, _, file = str(path).partition("=")
+        if file and Path(file).exists():
+            raise FileNotFoundError(f"{path}: no such image: give {file} alone, cameras are called as their files are")
         raise FileNotFoundError(f"{path}: no such image: check the path")
     return find_images(path)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import shutil
 import sys
 import time
@@ -10,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import combinations
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -149,7 +151,9 @@ class Fuse:
             if not self.image:
                 raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
             return True
-        if self.image or len(self.given) < 2:
+        if self.image:
+            raise ValueError("--image NAME=FILE needs a rig: give --rig RIG, or the images alone, without names")
+        if len(self.given) < 2:
             raise ValueError(
                 "give two images or more, as `pat fuse mono.png colour.png`; or a rig, --alpha and each --image"
             )
@@ -168,6 +172,7 @@ class Fuse:
         if unknown := [path for path in self.given[1:] if path.stem not in rig.names]:
             raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
         found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
+        refuse_equal_files({name: paths[0] for name, paths in found.items()})
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
         if self.sequence:
             return self._many(rig, found, self.alpha)
@@ -183,11 +188,14 @@ class Fuse:
             self._one(views.developed, views, self.alpha, before_writing=compared.result)
 
     def _without_rig(self) -> None:
+        from ..support.locks import folder_lock
         from .from_images import camera_names, files_of, frames_of_videos
 
         with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
         if named := [option for option, value in with_rig.items() if value]:
             raise ValueError(f"{', '.join(named)}: needs a rig: give one with --rig RIG")
+        with folder_lock(self.out):  # finding the rig takes long: what cannot be written to is refused before
+            pass
         cameras = camera_names(self.given)
         noise = options.noise_of(self.noise)
         if isinstance(noise, dict) and (unknown := noise.keys() - cameras.keys()):
@@ -292,6 +300,10 @@ class Fuse:
                 frame, self.out, bits=self.bits, kind=self.kind, view=view, rig=found_rig, points=points
             )
             shutil.rmtree(store, ignore_errors=True)
+            if len(frame.image) not in (1, 3):
+                bands = [name for name in rig.betas(alpha) if name in images for _ in images[name]]
+                listed = ", ".join(f"fused_{i}.{self.kind} {name}" for i, name in enumerate(bands, 1))
+                self._note(f"bands at alpha's view: {listed}; fused.{self.kind} is their mean")
             if self.points:
                 self._note("points.ply: the pixels of known depth, in alpha's frame")
             if self.report:
@@ -459,6 +471,13 @@ def is_rig_file(path: Path) -> bool:
     """Whether a file is meant as a rig: neither a folder, nor a pattern, nor named as images and videos are."""
     suffixes = options.IMAGE_SUFFIXES | options.VIDEO_SUFFIXES
     return not (any(c in path.name for c in "*?[") or path.suffix.lower() in suffixes or path.is_dir())
+
+
+def refuse_equal_files(files: Mapping[str, Path]) -> None:
+    """Raise ValueError if two cameras are given one file, or a copy of it."""
+    for (a, first), (b, second) in combinations(files.items(), 2):
+        if first.is_file() and second.is_file() and filecmp.cmp(first, second, shallow=False):
+            raise ValueError(f"the images of '{a}' and '{b}' are the same image, {second}: give each camera its own")
 
 
 def warn_of_wrong_rig(views: ViewFiles) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
@@ -31,6 +32,9 @@ Noise = Literal["estimate"] | Mapping[str, NoiseLevel]
 
 LEAST_DEVIATION = 1.5 / 255
 """Images whose noise has a smaller standard deviation, in the mean, are left as they are."""
+FAR_MORE = 5.0
+"""Noise is warned of whose stated standard deviation is this many times what the image shows. Noise that a demosaicing
+has smoothed shows as half or less."""
 PIECE, HALO = 1024, 128
 """Sides of the pieces in which an image is denoised, and of what is seen around them, pixels."""
 
@@ -113,12 +117,28 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
         if name not in views.images:
             raise ValueError(f"noise of '{name}': there is no image of it, only of {', '.join(views.images)}")
         if (view := noisy_view(views.images[name], level)) is not None:
+            if noise != "estimate":
+                warn_of_noise(name, views.images[name], view)
             noisy[name] = view
     if not noisy:
         without = replace(views, images={})
         return views, LowLight(without, without, {})
     denoised = views.replace({name: view.denoised[0] for name, view in noisy.items()})
     return denoised, LowLight(views, denoised, noisy)
+
+
+def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> None:
+    """Warn if the noise that is stated of an image is far more than it shows."""
+    shown = NoiseLevel.estimated(image[None])
+    if shown == NoiseLevel():
+        return
+    stated, found = (255 * float(deviation.mean()) for deviation in (view.deviation, shown.deviation(image[None])))
+    if stated > FAR_MORE * max(found, 255 * LEAST_DEVIATION):
+        warnings.warn(
+            f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, its image shows {found:.1f}/255: "
+            "detail will be lost; state electrons at white, or have the noise estimated",
+            stacklevel=3,
+        )
 
 
 def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[str, NoiseLevel]:

@@ -24,6 +24,9 @@ from arraygeom.atomic import write_atomically
 from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
 
+FEW_BITS = (8, 10, 12)
+"""Bits of cameras that may be stored in 16 bits as they are."""
+
 _ROWS = 256
 """Rows processed at once, to limit memory."""
 
@@ -282,9 +285,17 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     if bits and bits > own:
         raise ValueError(f"{label}: has {own} bits a value, the rig says {bits}: correct 'bits', or give the raw file")
     planes = planes >> (16 - packed) if packed else planes
-    if planes.max() > white:
+    largest = int(planes.max())
+    if own == 16 and not bits and 0 < largest < 2 ** max(FEW_BITS):
+        needed = next(n for n in FEW_BITS if largest < 2**n)
+        warnings.warn(
+            f"{label}: has 16 bits a value, and none above {largest}, so it is nearly black: if its camera counts to "
+            f"{2**needed - 1}, state `bits: {needed}` in the rig file",
+            stacklevel=4,
+        )
+    if largest > white:
         raise ValueError(
-            f"{label}: has values up to {planes.max()}, the rig says {bits} bits (up to {white}): correct 'bits' "
+            f"{label}: has values up to {largest}, the rig says {bits} bits (up to {white}): correct 'bits' "
             "(16 if the camera shifts its values up)"
         )
     return planes.astype(np.float32) / np.float32(white)

@@ -506,7 +506,7 @@ def test_duplicate_cameras(name, change, tmp_path):
 def test_wrong_units_warn(tmp_path):
     file = FIXTURES / "kalibr.yaml"
     path = copied(file, tmp_path, file.read_text().replace("0.6, -0.1]", "0.6, -100.0]"))
-    with pytest.warns(RigFileWarning, match="cameras 100 m apart: is this file in millimetres"):
+    with pytest.warns(RigFileWarning, match="cameras 100 m apart: is this file in millimetres.*units: millimetres"):
         read_rig(path)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

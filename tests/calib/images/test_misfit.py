@@ -44,6 +44,19 @@ def test_points_behind_the_cameras_and_wrong_units_are_named():
         assert "`pat rig doctor` says: likely mistake: " in found.text
 
 
+def test_a_depth_range_without_the_scene_is_named_with_the_scenes_depth():
+    rig, images = rectified_pair(), rectified_images()
+    for depth, units in ((15.0, 20.0), False), ((200.0, 300.0), True):
+        found = find_misfit(rig.replace(depth=depth), images)
+        assert found is not None
+        assert found.outside > 0.9
+        said = re.search(r"the depth range excludes the scene: 0% .* median depth is ([\d.]+) m", found.text)
+        assert said is not None, found.text
+        assert 1.5 < float(said[1]) < 8
+        assert ("metres taken for centimetres" in found.text) == units
+        assert "drifted" not in found.text
+
+
 def test_nothing_is_said_where_nothing_can_be():
     rig, images = rectified_pair(), rectified_images()
     assert misfit_warning(rig, {"left": images["left"]}) is None

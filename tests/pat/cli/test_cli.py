@@ -421,8 +421,34 @@ def test_a_rig_that_does_not_fit_ends_with_status_3_and_strict_writes_nothing(sm
     assert not (small / "out").exists()
 
 
+def test_one_image_for_two_cameras_is_refused(small, capsys):
+    shutil.copy(small / "mono.png", small / "copy.png")
+    for name in ("mono.png", "copy.png"):
+        error = fails(arguments(small, colour=small / name), capsys)
+        assert f"the images of 'mono' and 'colour' are the same image, {small / name}: give each" in error
+        assert not (small / "out").exists()
+
+
+def test_bands_are_listed_with_their_files(small, capsys):
+    rig = Rig.load(small / "rig.yaml")
+    cameras = {"mono": rig["mono"], "nir": rig["colour"], "red": rig["colour"]}
+    Rig(cameras, depth=rig.depth).save(small / "rig.yaml")
+    for name, band in zip(("red", "nir"), read_image(small / "colour.png")):
+        write_image(small / f"{name}.png", band[None] * (0.5 if name == "nir" else 1))
+    given = [f"--image={name}={small / name}.png" for name in cameras]
+    rest = ["--alpha", "mono", "--weights", "mono-spectral", "--no-report", "-o", str(small / "out")]
+    main(["fuse", str(small / "rig.yaml"), *given, *rest])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "bands at alpha's view: fused_1.png nir, fused_2.png red; fused.png is their mean" in said
+    for name, file in (("nir", "fused_1.png"), ("red", "fused_2.png")):
+        other = {"nir": "red", "red": "nir"}[name]
+        fused, own, wrong = (read_image(small / path) for path in (f"out/{file}", f"{name}.png", f"{other}.png"))
+        assert (fused.mean() - own.mean()).abs() < (fused.mean() - wrong.mean()).abs()
+
+
 def test_bands_that_the_weights_do_not_make_are_refused_with_which_to_take(small, capsys):
-    error = fails(arguments(small, colour=small / "mono.png"), capsys)
+    write_image(small / "grey.png", read_image(small / "mono.png").flip(-1))
+    error = fails(arguments(small, colour=small / "grey.png"), capsys)
     assert "the betas have 1 band in all ('colour' 1), these weights make 3: its image is grey" in error
     assert "mono-spectral" in error
     assert not (small / "out").exists()

@@ -110,9 +110,19 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
         assert message in fails([mono, *(tmp_path / name for name in names), *out], capsys)
         assert not (tmp_path / "out").exists()
     assert "no camera 'tele'; the images' names are mono, colour" in fails([mono, colour, "--alpha", "tele"], capsys)
-    for noise, said in {"mono=-5": "must be more than 0, got -5", "tele=100": "--noise: no camera 'tele'"}.items():
+    for noise, said in {
+        "mono=-5": "must be 1 or more, such as 200, got -5",
+        "tele=100": "--noise: no camera 'tele'",
+    }.items():
         assert said in fails([mono, colour, "--noise", noise, *out], capsys)
     assert not (tmp_path / "out").exists()
+    named = f"mono={mono}"
+    assert f"give {mono} alone" in fails([named, colour, *out], capsys)
+    assert "--image NAME=FILE needs a rig" in fails(["--image", named, *out], capsys)
+    unwritable = ["-o", folder / "mono.png" / "out"]
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("pat.cli.from_images.array_of", None)  # the rig is not looked for
+        assert "mono.png" in fails([mono, colour, *unwritable], capsys)
     assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
 
 

@@ -1,5 +1,6 @@
 """Fusion of noisy views."""
 
+import warnings
 from functools import cache
 
 import pytest
@@ -144,6 +145,16 @@ def test_a_camera_without_an_image_is_named():
     views = Views.of(sample.rig, sample.images, alpha=ALPHA)
     with pytest.raises(ValueError, match="noise of 'nir'"):
         denoised_views(views, {"nir": NoiseLevel(0.01)})
+
+
+def test_noise_stated_far_beyond_what_the_image_shows_is_said():
+    sample, images, noise = in_low_light(200)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        denoised_views(Views.of(sample.rig, images, alpha=ALPHA), noise)
+    wrong = {ALPHA: NoiseLevel.of_electrons(2)}
+    with pytest.warns(UserWarning, match=f"noise of '{ALPHA}': a standard deviation of .* is stated, its image shows"):
+        denoised_views(Views.of(sample.rig, sample.images, alpha=ALPHA), wrong)
 
 
 def test_betas_are_mixed_by_confidence():

@@ -57,6 +57,18 @@ def test_sixteen_bits_are_scaled_by_65535(tmp_path):
     torch.testing.assert_close(read_image(tmp_path / "a.png"), torch.tensor([[[0, 1 / 255, 1]]]))
 
 
+@pytest.mark.parametrize(("largest", "bits"), [(200, 8), (1000, 10), (4095, 12)])
+def test_few_bits_in_sixteen_are_said_unless_they_are_stated(tmp_path, largest, bits):
+    cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, largest]], np.uint16))
+    with pytest.warns(UserWarning, match=f"none above {largest}, .*state `bits: {bits}`"):
+        read_image(tmp_path / "a.png")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read_image(tmp_path / "a.png", bits=bits)
+        cv2.imwrite(str(tmp_path / "a.png"), np.array([[0, 4096]], np.uint16))
+        read_image(tmp_path / "a.png")
+
+
 def test_values_outside_the_range_are_cut(tmp_path):
     write_image(tmp_path / "a.png", torch.tensor([[[-0.5, 1.5]]]))
     assert read_image(tmp_path / "a.png").tolist() == [[[0.0, 1.0]]]

@@ -79,7 +79,7 @@ def test_a_negative_level_is_refused(wrong):
 
 
 def test_what_is_no_level_is_refused():
-    with pytest.raises(ValueError, match="more than 0"):
+    with pytest.raises(ValueError, match="must be 1 or more"):
         NoiseLevel.of_electrons(0)
     with pytest.raises(ValueError, match="0 or more"):
         NoiseLevel.of_electrons(100, -2)
