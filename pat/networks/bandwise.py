@@ -8,18 +8,22 @@ nothing else.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
+from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from .configs import BandwisePATConfig, GuidedPATConfig
-from .guided import BetaEstimate, Encoded, GuidedPAT, output_of
-from .matching import semi_global_matching
+from .guided import BetaEstimate, Encoded, GuidedPAT, coloured_together, output_of
+from .matching import matched
 from .pieces import Prepared, prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches
-from .spectral_mix import SpectralMix, coarse_mix, semi_global_matching_of_bands
+from .several import can_agree
+from .spectral_mix import SpectralMix, coarse_mix, colours_of_bands
+from .warped import diffused_from, matched_colours
 
 COARSELY = 400_000
 """Pixels of alpha at most on which the bands' combination is found."""
@@ -46,8 +50,12 @@ class BandwisePAT(nn.Module):
         return self.single.working_bytes(alpha, betas)
 
     def prepare(self, inputs: Inputs) -> Prepared:
-        """For each beta how its bands are combined and normalised, and by that its semi-global matches."""
-        return prepared(inputs, self._combination, lambda found: (found[0].of, found[1]), _matches)
+        """For each beta how its bands are combined and normalised, and by that its semi-global matches; the depth is
+        that on which all agree."""
+        agree = can_agree(inputs)
+        match = partial(_matches, coloured=not agree)
+        found = prepared(inputs, self._combination, lambda found: (found[0].of, found[1]), match)
+        return coloured_together(inputs, found, _colours) if agree else found
 
     def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
         """The combination of the one beta's bands that is most like alpha, and how that is normalised."""
@@ -66,44 +74,63 @@ class BandwisePAT(nn.Module):
     def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
         state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
-        own = self.single.encoder(inputs.alpha)
+        own, estimates = self._estimates(inputs, state)
         parts = [
-            self._of_beta(own, inputs.alpha, beta, found, mix)
-            for beta, found, (mix, _) in zip(inputs.betas, state.matches, state.common)
+            self._of_beta(own, inputs.alpha, estimate, found, mix)
+            for estimate, found, (mix, _) in zip(estimates, state.matches, state.common)
         ]
-        estimates = [estimate for _, estimate in parts]
-        return output_of(torch.cat([image for image, _ in parts], 1), estimates), estimates
+        return output_of(torch.cat(parts, 1), estimates), estimates
 
     def matched(self, inputs: Inputs) -> FusionOutput:
         """Positions and their confidences alone: the image is alpha."""
-        state = self.prepare(inputs)
+        return output_of(inputs.alpha, self._estimates(inputs, self.prepare(inputs))[1])
+
+    def _estimates(self, inputs: Inputs, state: Prepared) -> tuple[Encoded, list[BetaEstimate]]:
+        """Alpha's features, and the estimate of each beta."""
         own, parts = self.single.encoder(inputs.alpha), zip(inputs.betas, state.matches, state.common)
         estimates = [self.single.estimate(own, inputs.alpha, b, found, guide=mix.of) for b, found, (mix, _) in parts]
-        return output_of(inputs.alpha, estimates)
+        return own, estimates
 
     def _of_beta(
-        self, own: Encoded, alpha: Tensor, beta: Beta, found: SemiGlobalMatches, mix: SpectralMix
-    ) -> tuple[Tensor, BetaEstimate]:
+        self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, found: SemiGlobalMatches, mix: SpectralMix
+    ) -> Tensor:
         """One beta's bands at alpha's view.
 
         The network's result for each is counted from its local regression on alpha: where a band is unlike alpha,
         its difference from alpha differs even between similar pixels.
         """
-        estimate = self.single.estimate(own, alpha, beta, found, guide=mix.of)
         base = found.colour[:, 0].to(alpha)
         bands = [
             regressed + self.single.blended(own, regressed, [estimate.beyond(base, i)])
             for i, regressed in enumerate((alpha + base).split(1, 1))
         ]
-        return mix.reconciled(torch.cat(bands, 1), alpha), estimate
+        return mix.reconciled(torch.cat(bands, 1), alpha)
 
 
 def _matches(
-    inputs: Inputs, combined: tuple[SpectralMix, Normalisations], half: HalfSizeMatches | None
+    inputs: Inputs, common: tuple[SpectralMix, Normalisations], half: HalfSizeMatches | None, *, coloured: bool
 ) -> SemiGlobalMatches:
-    """The matches of the one beta, once for all its bands."""
-    alpha, (beta,), (mix, normalisations) = inputs.alpha, inputs.betas, combined
-    segments, blocks = beta.field.straight, None if half else beta.field.of_blocks(FINE)
+    """The matches of the one beta, once for all its bands; if they are not to be coloured, with colours of no bands."""
+    alpha, (beta,), (mix, normalisations) = inputs.alpha, inputs.betas, common
+    blocks = None if half else beta.field.of_blocks(FINE)
+    where = matched(alpha, _guide(beta, mix), beta.field.straight, blocks, normalisations, half)
+    found = SemiGlobalMatches(*where, alpha[:, :0], alpha[:, None, :0])
+    if not coloured:
+        return found
+    colour, weight = _colours(alpha, beta, found, common)
+    return found._replace(matched=colour, colour=diffused_from(colour, alpha, weight))
+
+
+def _guide(beta: Beta, mix: SpectralMix) -> Tensor:
+    """What of a beta is compared with alpha."""
+    return beta.image if beta.image.shape[1] == 1 else mix.of(beta.image)
+
+
+def _colours(
+    alpha: Tensor, beta: Beta, found: SemiGlobalMatches, common: tuple[SpectralMix, Normalisations]
+) -> tuple[Tensor, Tensor]:
+    """The bands minus alpha at a beta's matches, and their weight."""
+    (mix, normalisations), where = common, (beta.field.straight, found.disparity, found.facts)
     if beta.image.shape[1] == 1:
-        return semi_global_matching(alpha, beta.image, beta.image, segments, blocks, normalisations, half)
-    return semi_global_matching_of_bands(alpha, beta.image, segments, blocks, mix, normalisations, half)
+        return matched_colours(alpha, beta.image, beta.image, *where, normalisations.whole)
+    return colours_of_bands(alpha, beta.image, *where, mix, normalisations.whole)

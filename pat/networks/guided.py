@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -148,46 +148,20 @@ class GuidedPAT(nn.Module):
     def prepare(self, inputs: Inputs) -> Prepared:
         """Semi-global matches of each beta, and how its whole image is normalised.
 
-        Betas that each have all bands agree on depth, and share the colour that is diffused.
+        Of several betas the depth is that on which all agree.
         """
-        shares = can_agree(inputs) and not self._in_parts(inputs)
-        match = partial(_matches, coloured=not shares)
+        agree = can_agree(inputs)
+        match = partial(_matches, coloured=not agree)
         found = prepared(inputs, _normalisations, lambda found: (brightness, found), match)
-        return self._shared(inputs, found) if shares else found
+        if not agree:
+            return found
+        parts = self._in_parts(inputs)
+        full = [not parts and beta.image.shape[1] == self.config.bands for beta in inputs.betas]
+        return coloured_together(inputs, found, _colours, full)
 
     def _in_parts(self, inputs: Inputs) -> bool:
         """Whether each beta has some of the bands, in order; else those with all of them show the same colours."""
         return all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
-
-    @torch.no_grad()
-    def _shared(self, inputs: Inputs, found: Prepared) -> Prepared:
-        """The matches with the depth on which all betas agree, and colour diffused from all that have all bands."""
-        matches, prior = agreed(inputs, found.matches), _priors(inputs)
-        full = [beta.image.shape[1] == self.config.bands for beta in inputs.betas]
-
-        def colours(box: Box) -> list[Tensor]:
-            large = box != whole(inputs.hw).outer
-            ones = [inputs.of_beta(i).cut(box) if large else inputs.of_beta(i) for i in range(len(full))]
-            alpha = ones[0].alpha
-            alone = [_colours(alpha, o.betas[0], m.cut(box), n) for o, m, n in zip(ones, matches, found.common)]
-            counting = [(c, w * math.exp(p)) for (c, w), p, counts in zip(alone, prior, full) if counts]
-            weights = torch.stack([weight for _, weight in counting])
-            mixed = sum(weight * colour for colour, weight in counting) / weights.sum(0)
-            shared = diffused_from(mixed, alpha, torch.stack([w for (_, w), c in zip(alone, full) if c]).amax(0))
-            fills = [shared, *(diffused_from(m, alpha, w) for (m, w), counts in zip(alone, full) if not counts)]
-            parts = fills + [colour for colour, _ in alone]
-            return [part.half() for part in parts] if large else parts
-
-        shared, *parts = from_pieces(inputs.hw, inputs.multiple, colours)
-        fills, matched = iter(parts[: -len(full)]), parts[-len(full) :]
-        return replace(
-            found,
-            prior=prior,
-            matches=tuple(
-                one._replace(matched=m, colour=shared if counts else next(fills))
-                for one, m, counts in zip(matches, matched, full)
-            ),
-        )
 
     def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
@@ -291,6 +265,46 @@ class GuidedPAT(nn.Module):
         b, h, w, c = x.shape
         pixels = x.unflatten(-1, (2, c // 2)).movedim(3, 2)
         return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
+
+
+@torch.no_grad()
+def coloured_together(
+    inputs: Inputs,
+    found: Prepared,
+    colours: Callable[[Tensor, Beta, SemiGlobalMatches, Any], tuple[Tensor, Tensor]],
+    full: Sequence[bool] | None = None,
+) -> Prepared:
+    """The matches with the depth on which all betas agree, coloured: `colours` gives a beta's bands minus alpha at its
+    matches, and their weight.
+
+    Betas that have all bands (`full`) share the colour that is diffused; any other has its own.
+    """
+    full = full or [False] * len(found.matches)
+    matches, prior = agreed(inputs, found.matches), _priors(inputs) if any(full) else ()
+
+    def of(box: Box) -> list[Tensor]:
+        large = box != whole(inputs.hw).outer
+        ones = [inputs.of_beta(i).cut(box) if large else inputs.of_beta(i) for i in range(len(full))]
+        alpha = ones[0].alpha
+        alone = [colours(alpha, o.betas[0], m.cut(box), n) for o, m, n in zip(ones, matches, found.common)]
+        shared = []
+        if any(full):
+            counting = [(c, w * math.exp(p)) for (c, w), p, counts in zip(alone, prior, full) if counts]
+            total = torch.stack([weight for _, weight in counting]).sum(0)
+            mixed = sum(weight * colour for colour, weight in counting) / total
+            shared = [diffused_from(mixed, alpha, torch.stack([w for (_, w), c in zip(alone, full) if c]).amax(0))]
+        fills = (diffused_from(c, alpha, w) for (c, w), counts in zip(alone, full) if not counts)
+        parts = [*shared, *fills, *(colour for colour, _ in alone)]
+        return [part.half() for part in parts] if large else parts
+
+    parts = from_pieces(inputs.hw, inputs.multiple, of)
+    matched, diffused = parts[-len(full) :], iter(parts[: -len(full)])
+    shared = [next(diffused)] if any(full) else []
+    coloured = (
+        one._replace(matched=m, colour=shared[0] if counts else next(diffused))
+        for one, m, counts in zip(matches, matched, full)
+    )
+    return replace(found, prior=prior, matches=tuple(coloured))
 
 
 def _priors(inputs: Inputs) -> tuple[float, ...]:

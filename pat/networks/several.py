@@ -36,8 +36,33 @@ FARTHEST = 8.0
 """A difference of disparities of this many half-size pixels is 1 in the facts, as in semi-global matching."""
 
 
+SAMPLED_ROWS, SAMPLED_COLUMNS = 64, 4
+"""In how many pairs of alpha's rows, and every how many columns, the depths of betas are compared."""
+TRIALS = 400
+"""Fits to four pixels each, of which that is taken with which most others agree (Fischler, Bolles 1981)."""
+MORE = 0.1
+"""By how much the share of pixels that agree has to rise for betas' depths to be brought together."""
 STRIP = 1 << 16
 """Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's cache."""
+
+
+class Ambiguity(NamedTuple):
+    """What may be between inverse depths that two betas give to alpha's pixels: own = scale other + plane (x, y, 1).
+
+    As far as it is known from the images alone, the geometry of two views is known up to this (Hartley, Zisserman 2004,
+    chapter 10). Cameras that were found by pairs do not agree on depth but by it.
+    """
+
+    scale: float
+    plane: tuple[float, float, float]
+
+    def of(self, track: Track, x: Float[Tensor, "*n 2"]) -> Track:
+        """A beta's tracks as functions of the other's inverse depth, of alpha's pixels `x`."""
+        px, py, p = self.plane
+        return Track(track.a + (px * x[..., :1] + py * x[..., 1:] + p) * track.b, self.scale * track.b)
+
+
+NO_AMBIGUITY = Ambiguity(1.0, (0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -51,7 +76,9 @@ class MatchedBeta:
     hw: tuple[int, int]
 
     @classmethod
-    def of(cls, beta: Beta, found: SemiGlobalMatches, rows: tuple[int, int]) -> MatchedBeta:
+    def of(
+        cls, beta: Beta, found: SemiGlobalMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
+    ) -> MatchedBeta:
         """Of a beta with a track and its own matches, at some of alpha's rows: from an even one to an even one."""
         top, bottom = rows
         pixels, disparity = beta.field.straight, found.disparity[0, 0, top:bottom]
@@ -62,7 +89,8 @@ class MatchedBeta:
         size = (beta.image.shape[-2], beta.image.shape[-1])
         facts = enlarged(found.facts[0, :, top // FINE : bottom // FINE])
         segments = Segments(start, end, pixels.valid[0, top:bottom])
-        return cls(segments, beta.track(x), disparity.to(end), facts.to(end), size)
+        track = beta.track(x) if ambiguity == NO_AMBIGUITY else ambiguity.of(beta.track(x), x)
+        return cls(segments, track, disparity.to(end), facts.to(end), size)
 
     @cached_property
     def extent(self) -> Extent:
@@ -161,14 +189,79 @@ class Agreement(NamedTuple):
 def agreed(inputs: Inputs, found: Sequence[SemiGlobalMatches]) -> list[SemiGlobalMatches]:
     """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
 
+    between = ambiguities(inputs, found)
+
     def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
-        return MatchedBeta.of(inputs.betas[i], found[i], rows)
+        return MatchedBeta.of(inputs.betas[i], found[i], rows, between[i])
 
     betas, strips = range(len(found)), _strips(inputs.hw)
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
     return [_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas]
+
+
+def ambiguities(inputs: Inputs, found: Sequence[SemiGlobalMatches]) -> list[Ambiguity]:
+    """Of each beta against the one whose matches tell most: none, unless clearly more pixels agree with one."""
+    step = max(inputs.hw[0] // SAMPLED_ROWS // FINE, 1) * FINE
+    rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
+    sampled = [_Sampled.of(inputs.betas[i], found[i], rows) for i in range(len(found))]
+    reference = max(sampled, key=lambda one: float((one.known * one.pixels_per_w).sum()))
+    columns = torch.arange(0, inputs.hw[1], SAMPLED_COLUMNS).to(reference.w)
+    y, x = torch.meshgrid(
+        reference.w.new_tensor([row for pair in rows for row in range(*pair)]), columns, indexing="ij"
+    )
+    return [NO_AMBIGUITY if one is reference else one.against(reference, x, y) for one in sampled]
+
+
+class _Sampled(NamedTuple):
+    """The inverse depths of a beta's matches at some of alpha's pixels, where they are known, and by how many of its
+    pixels a point moves if its inverse depth rises by one."""
+
+    w: Tensor
+    known: Tensor
+    pixels_per_w: Tensor
+
+    @classmethod
+    def of(cls, beta: Beta, found: SemiGlobalMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
+        parts = []
+        for pair in rows:
+            view = MatchedBeta.of(beta, found, pair)
+            w, known = view.inverse_depth
+            little = 1e-3 * w + 1e-9
+            rise = (view.disparity_of(w + little) - view.disparity_of(w)).abs() / little
+            parts.append([plane[:, ::SAMPLED_COLUMNS] for plane in (w, known, rise)])
+        return cls(*(torch.cat(planes) for planes in zip(*parts)))
+
+    def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
+        """The ambiguity with which most pixels agree."""
+        both = self.known & other.known
+        own, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
+        if len(own) < SAMPLED_ROWS:
+            return NO_AMBIGUITY
+        terms = torch.stack([w, x, y, torch.ones_like(x)], -1)
+        size = terms.abs().amax(0).clamp(min=1e-12)
+        terms = terms / size
+
+        def misses(solution: Tensor) -> Tensor:
+            return (terms @ solution - own[:, None]).abs() * rise[:, None]
+
+        g = torch.Generator().manual_seed(0)
+        some = torch.randint(len(own), (TRIALS, 4), generator=g).to(own.device)
+        trials, _ = torch.linalg.solve_ex(terms[some], own[some])
+        trials = trials[(trials[:, 0] > 0) & trials.isfinite().all(1)].T
+        same = size[0] * torch.eye(4).to(terms)[:, :1]
+        agree = float((misses(same) < SUPPORT).double().mean())
+        if not trials.shape[1]:
+            return NO_AMBIGUITY
+        best = trials[:, (misses(trials) < SUPPORT).sum(0).argmax()][:, None]
+        for _ in range(3):
+            weight = rise[:, None] * (misses(best) < SUPPORT)
+            best = torch.linalg.lstsq(terms * weight, own[:, None] * weight).solution
+        if float((misses(best) < SUPPORT).double().mean()) < agree + MORE or best[0] <= 0:
+            return NO_AMBIGUITY
+        scale, *plane = (best[:, 0] / size).tolist()
+        return Ambiguity(scale, (plane[0], plane[1], plane[2]))
 
 
 def _strips(hw: HW) -> list[tuple[int, int]]:

@@ -17,12 +17,9 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
-from .matching import matched
 from .semi_global import (
-    HalfSizeMatches,
     Normalisation,
     Normalisations,
-    SemiGlobalMatches,
     matched_at_half_size,
     reduced,
 )
@@ -30,7 +27,6 @@ from .warped import (
     MOST_DETAIL,
     at_matches,
     box_mean,
-    diffused_from,
     is_consistent,
     local_slope,
     match_weight,
@@ -118,21 +114,19 @@ def coarse_mix(
 
 
 @torch.no_grad()
-def semi_global_matching_of_bands(
+def colours_of_bands(
     alpha: Float[Tensor, "b 1 h w"],
     beta: Float[Tensor, "b c hb wb"],
     segments: Segments,
-    blocks: Segments | None,
+    disparity: Float[Tensor, "b 1 h w"],
+    facts: Float[Tensor, "b 3 h2 w2"],
     mix: SpectralMix,
-    normalisations: Normalisations,
-    half: HalfSizeMatches | None = None,
-) -> SemiGlobalMatches:
-    """`semi_global_matching` of alpha and the mix of the bands; all are warped to alpha's view."""
-    disparity, facts = matched(alpha, mix.of(beta), segments, blocks, normalisations, half)
+    normalisation: Normalisation,
+) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
+    """The bands minus alpha at matches that the mix has found, and their weight, 0 to 1."""
     values, valid = at_matches(beta, segments, disparity)
-    colours, unlike = _matched(values, alpha, mix, normalisations.whole)
-    weight = match_weight(unlike, is_consistent(facts), valid)
-    return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))
+    colours, unlike = _matched(values, alpha, mix, normalisation)
+    return colours, match_weight(unlike, is_consistent(facts), valid)
 
 
 def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Normalisation) -> tuple[Tensor, Tensor]:

@@ -8,6 +8,7 @@ import struct
 import sys
 import time
 import zlib
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,7 +59,9 @@ def test_the_sandbox_sees(case, verdict, tmp_path, monkeypatch):
 
 
 def test_the_sandbox_measures_the_memory_of_the_case(tmp_path):
-    peak = sandbox.ended(lambda: "read" if len(bytearray(200 << 20)) else "", tmp_path / "log").peak
+    """The most of some measurements: what the system takes of the parent's memory meanwhile lowers one."""
+    case = partial(sandbox.ended, lambda: "read" if len(bytearray(200 << 20)) else "", tmp_path / "log")
+    peak = max(case().peak for _ in range(5))
     assert 190 << 20 < peak < 230 << 20
 
 

@@ -208,3 +208,43 @@ def test_the_depth_buffer_finds_what_is_hidden():
     assert (found[1][same] > SUPPORT).all()
     assert (found[torch.tensor([0, 2, 3])] == 0).all()
     assert replace(segments, valid=~segments.valid).valid.sum() == 0
+
+
+def test_a_band_unlike_alpha_is_matched_through_one_that_is_like_it():
+    """Bright where alpha is dark and where it is bright, so that neither its sign nor its edges tell the depth."""
+
+    def unlike(image):
+        return (2 * luminance(image) - 1).abs().clamp(0, 1)
+
+    network, near = load_weights("mono-spectral"), {"alone": {}, "with": {"left": luminance(seen_from(-0.25))}}
+    cameras = {"mono": camera(0.0), "right": camera(0.25), "left": camera(-0.25)}
+    images = {"mono": luminance(seen_from(0.0)), "right": unlike(seen_from(0.25))}
+    found = {}
+    for name, more in near.items():
+        rig = Rig({n: cameras[n] for n in images | more}, depth=(NEAR, FAR))
+        frame = fuse(network, rig, images | more, alpha="mono")
+        found[name] = score(frame.image[:1].clamp(0, 1), unlike(seen_from(0.0))).psnr
+    assert found["with"] > found["alone"] + 3
+
+
+def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
+    """As cameras that are found by pairs: the right one is thought to be farther away, so its depths are too large."""
+    _, images, ground_truth = scene
+    cameras = {"mono": camera(0.0), "left": camera(-0.25), "right": camera(0.25)}
+    wrong = cameras | {"right": camera(0.4)}
+    true, found = (
+        fuse(network, Rig(c, depth=(NEAR, 2 * FAR)), images, alpha="mono").image.clamp(0, 1) for c in (cameras, wrong)
+    )
+    assert score(found, ground_truth).psnr > score(true, ground_truth).psnr - 0.5
+    inputs = frame_inputs(network, Views.of(Rig(wrong, depth=(NEAR, 2 * FAR)), images, alpha="mono")).inputs
+    alone = prepared_alone(network, inputs)
+    scales = sorted(a.scale for a in several.ambiguities(inputs, alone))
+    assert 1.0 in scales
+    assert scales[1] / scales[0] == pytest.approx(1.6, rel=0.05)
+    inputs = frame_inputs(network, Views.of(Rig(cameras, depth=(NEAR, FAR)), images, alpha="mono")).inputs
+    assert several.ambiguities(inputs, prepared_alone(network, inputs)) == [several.NO_AMBIGUITY] * 2
+
+
+def prepared_alone(network, inputs):
+    """Each beta's own matches."""
+    return [network.prepare(inputs.of_beta(i)).matches[0] for i in range(len(inputs.betas))]
