@@ -31,7 +31,7 @@ STAGES = {
 
 
 def scene(folder: Path, width: int, height: int, betas: int) -> None:
-    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera."""
+    """Rig and images: the sample array's, enlarged; `betas` copies of its colour camera, which differ by a pixel."""
     import cv2
 
     from arraygeom import Rig
@@ -44,7 +44,8 @@ def scene(folder: Path, width: int, height: int, betas: int) -> None:
         h, w = rig[name].hw
         hw = round(h * height / rig[ALPHA].hw[0]), round(w * width / rig[ALPHA].hw[1])
         image = cv2.resize(cv2.imread(str(SAMPLE / f"{name}.png")), hw[::-1], interpolation=cv2.INTER_CUBIC)
-        for copy in [name] if name == ALPHA else [f"{name}{i + 1}" for i in range(betas)]:
+        for i, copy in enumerate([name] if name == ALPHA else [f"{name}{i + 1}" for i in range(betas)]):
+            image[0, 0] = i
             cv2.imwrite(str(folder / f"{copy}.png"), image[..., 0] if name == ALPHA else image)
             cameras[copy] = rig[name].resize(hw)
     Rig(cameras, depth=rig.depth, name="benchmark").save(folder / "rig.yaml")
