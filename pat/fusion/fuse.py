@@ -116,7 +116,15 @@ def fuse(
     LOG.info("planning")
     before = 0.0 if corrections else expected_work(inputs, response, align=align)
     estimate = announce is not None
-    plan = plan_frame(network, inputs, limit=limit, estimate=estimate, stored=store is not None, before=before)
+    plan = plan_frame(
+        network,
+        inputs,
+        limit=limit,
+        estimate=estimate,
+        stored=store is not None,
+        before=before,
+        kept=low_light.kept(inputs.hw, len(betas)),
+    )
     if announce:
         announce(plan)
     found = corrections or find_corrections(network, inputs, response, align=align)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import sample
+from arraygeom.pixels import HW
 
 from ..media.colour import luminance
 from ..networks.collaborative import luma_refined, without_noise
@@ -35,6 +37,8 @@ LEAST_DEVIATION = 1.5 / 255
 FAR_MORE = 5.0
 """Noise is warned of whose stated standard deviation is this many times what the image shows. Noise that a demosaicing
 has smoothed shows as half or less."""
+FOUND_BYTES = 12.0
+"""Of a position in a beta and its confidence."""
 PIECE, HALO = 1024, 128
 """Sides of the pieces in which an image is denoised, and of what is seen around them, pixels."""
 
@@ -55,6 +59,16 @@ class LowLight:
     given: Views
     views: Views
     noisy: Mapping[str, NoisyView]
+
+    def kept(self, hw: HW, betas: int) -> float:
+        """Bytes that are held until the frame of this size is corrected: the views, and where its pixels are in each
+        beta."""
+        if not self.noisy:
+            return 0.0
+        images = [*self.given.images.values(), *self.views.images.values()]
+        parts = [part for view in self.noisy.values() for part in view]
+        found = math.prod(hw) * betas * FOUND_BYTES
+        return found + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
 
     def wrapped(self, network: FusionNetwork) -> FusionNetwork:
         """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""

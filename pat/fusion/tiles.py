@@ -74,17 +74,19 @@ def plan_frame(
     estimate: bool,
     stored: bool,
     before: float = 0.0,
+    kept: float = 0.0,
 ) -> Plan:
     """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a piece.
 
     `before` is the share of the frame's work that is done beforehand, by which the time is longer. `stored` says that
-    finished tiles are stored on disk until all are there. Raises ValueError as `tiles_within`.
+    finished tiles are stored on disk until all are there. `kept` are bytes that the caller holds beside the frame.
+    Raises ValueError as `tiles_within`.
     """
     pieces = matching_pieces(frame.hw, network.multiple)
     large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
     slow = math.prod(frame.hw) > ESTIMATED
     probe = Probe.of(network, frame) if (large and limit) or (slow and estimate) else None
-    held = held_memory(frame, probe.state if probe else 0.0, whole_frame=not stored)
+    held = kept + held_memory(frame, probe.state if probe else 0.0, whole_frame=not stored)
     matching = 0.0 if probe and not probe.state else MATCHING_BYTES * max(area(tile.outer) for tile in pieces)
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))

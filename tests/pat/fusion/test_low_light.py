@@ -157,6 +157,15 @@ def test_noise_stated_far_beyond_what_the_image_shows_is_said():
         denoised_views(Views.of(sample.rig, sample.images, alpha=ALPHA), wrong)
 
 
+def test_what_is_held_for_low_light_is_planned_for(network):
+    sample, images, noise = in_low_light(200)
+    plans = []
+    for given in (None, noise):
+        fuse(network, sample.rig, images, alpha=ALPHA, noise=given, announce=plans.append)
+    views = sum(image.nbytes for image in images.values())
+    assert plans[1].memory > plans[0].memory + 4 * views
+
+
 def test_betas_are_mixed_by_confidence():
     one, other = (NoisyView(*torch.full((3, 1, 3, 4, 5), value).unbind()) for value in (0.2, 0.8))
     where = torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="xy"), -1)
