@@ -41,7 +41,8 @@ SAMPLED_ROWS, SAMPLED_COLUMNS = 64, 4
 TRIALS = 400
 """Fits to four pixels each, of which that is taken with which most others agree (Fischler, Bolles 1981)."""
 MORE = 0.1
-"""By how much the share of pixels that agree has to rise for betas' depths to be brought together."""
+"""By how much the share of pixels that agree has to rise for betas' depths to be brought together: above that of the
+depths as they are, and above that of a plane, which is what wrong matches and a flat background agree with."""
 STRIP = 1 << 16
 """Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's cache."""
 
@@ -240,28 +241,36 @@ class _Sampled(NamedTuple):
         if len(own) < SAMPLED_ROWS:
             return NO_AMBIGUITY
         terms = torch.stack([w, x, y, torch.ones_like(x)], -1)
-        size = terms.abs().amax(0).clamp(min=1e-12)
-        terms = terms / size
 
-        def misses(solution: Tensor) -> Tensor:
-            return (terms @ solution - own[:, None]).abs() * rise[:, None]
+        def share(solution: Tensor) -> float:
+            return float(_agree(terms, own, rise, solution[:, None]).mean())
 
-        g = torch.Generator().manual_seed(0)
-        some = torch.randint(len(own), (TRIALS, 4), generator=g).to(own.device)
-        trials, _ = torch.linalg.solve_ex(terms[some], own[some])
-        trials = trials[(trials[:, 0] > 0) & trials.isfinite().all(1)].T
-        same = size[0] * torch.eye(4).to(terms)[:, :1]
-        agree = float((misses(same) < SUPPORT).double().mean())
-        if not trials.shape[1]:
+        best, flat = _most_agreed(terms, own, rise), _most_agreed(terms[:, 1:], own, rise)
+        without = max(share(torch.eye(4)[0].to(own)), share(torch.cat([torch.zeros_like(flat[:1]), flat])))
+        if best[0] <= 0 or share(best) < without + MORE:
             return NO_AMBIGUITY
-        best = trials[:, (misses(trials) < SUPPORT).sum(0).argmax()][:, None]
-        for _ in range(3):
-            weight = rise[:, None] * (misses(best) < SUPPORT)
-            best = torch.linalg.lstsq(terms * weight, own[:, None] * weight).solution
-        if float((misses(best) < SUPPORT).double().mean()) < agree + MORE or best[0] <= 0:
-            return NO_AMBIGUITY
-        scale, *plane = (best[:, 0] / size).tolist()
+        scale, *plane = best.tolist()
         return Ambiguity(scale, (plane[0], plane[1], plane[2]))
+
+
+def _most_agreed(terms: Float[Tensor, "n k"], own: Float[Tensor, " n"], rise: Tensor) -> Float[Tensor, " k"]:
+    """The factors of the terms with which most of what is measured agrees; then by least squares of that."""
+    n, k = terms.shape
+    size = terms.abs().amax(0).clamp(min=1e-12)
+    scaled = terms / size
+    some = torch.randint(n, (TRIALS, k), generator=torch.Generator().manual_seed(0)).to(own.device)
+    trials, _ = torch.linalg.solve_ex(scaled[some], own[some])
+    trials = torch.where(trials.isfinite().all(1, keepdim=True), trials, 0.0).T
+    best = trials[:, _agree(scaled, own, rise, trials).sum(0).argmax()][:, None]
+    for _ in range(3):
+        weight = rise[:, None] * _agree(scaled, own, rise, best)
+        best = torch.linalg.lstsq(scaled * weight, own[:, None] * weight).solution
+    return best[:, 0] / size
+
+
+def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
+    """1 where a solution is less than `SUPPORT` pixels from what is measured."""
+    return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < SUPPORT).to(own)
 
 
 def _strips(hw: HW) -> list[tuple[int, int]]:

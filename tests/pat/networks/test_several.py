@@ -248,3 +248,18 @@ def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
 def prepared_alone(network, inputs):
     """Each beta's own matches."""
     return [network.prepare(inputs.of_beta(i)).matches[0] for i in range(len(inputs.betas))]
+
+
+def test_a_plane_is_no_ambiguity():
+    """What most wrong matches agree with, and what a flat scene does: no reason to bring depths together."""
+    y, x = torch.meshgrid(torch.arange(64.0).double(), torch.arange(80.0).double(), indexing="ij")
+    g = torch.Generator().manual_seed(3)
+    depths = 0.1 + 0.3 * torch.rand(64, 80, generator=g, dtype=torch.float64)
+    known, rise = torch.ones(64, 80, dtype=torch.bool), torch.full((64, 80), 100.0, dtype=torch.float64)
+    flat = torch.where(torch.rand(64, 80, generator=g) < 0.7, 0.12 + 1e-3 * x, depths)
+    scaled = 1.5 * depths + 1e-3 * y - 0.02
+    other = several._Sampled(depths, known, rise)
+    assert several._Sampled(flat, known, rise).against(other, x, y) == several.NO_AMBIGUITY
+    found = several._Sampled(scaled, known, rise).against(other, x, y)
+    assert found.scale == pytest.approx(1.5, rel=1e-3)
+    assert found.plane == pytest.approx((0, 1e-3, -0.02), abs=1e-5)
