@@ -10,20 +10,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import partial
 
 import torch
 from torch import Tensor, nn
 
 from .configs import BandwisePATConfig, GuidedPATConfig
-from .guided import BetaEstimate, Encoded, GuidedPAT, coloured_together, output_of
-from .matching import matched
-from .pieces import Prepared, prepared
+from .guided import BetaEstimate, Encoded, GuidedPAT, output_of
+from .pieces import Prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
-from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches
-from .several import can_agree
+from .semi_global import FINE, Normalisations, SemiGlobalMatches
+from .several import matched_together
 from .spectral_mix import SpectralMix, coarse_mix, colours_of_bands
-from .warped import diffused_from, matched_colours
+from .warped import matched_colours
 
 COARSELY = 400_000
 """Pixels of alpha at most on which the bands' combination is found."""
@@ -52,10 +50,7 @@ class BandwisePAT(nn.Module):
     def prepare(self, inputs: Inputs) -> Prepared:
         """For each beta how its bands are combined and normalised, and by that its semi-global matches; the depth is
         that on which all agree."""
-        agree = can_agree(inputs)
-        match = partial(_matches, coloured=not agree)
-        found = prepared(inputs, self._combination, lambda found: (found[0].of, found[1]), match)
-        return coloured_together(inputs, found, _colours) if agree else found
+        return matched_together(inputs, self._combination, lambda found: (found[0].of, found[1]), _colours)
 
     def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
         """The combination of the one beta's bands that is most like alpha, and how that is normalised."""
@@ -105,25 +100,6 @@ class BandwisePAT(nn.Module):
             for i, regressed in enumerate((alpha + base).split(1, 1))
         ]
         return mix.reconciled(torch.cat(bands, 1), alpha)
-
-
-def _matches(
-    inputs: Inputs, common: tuple[SpectralMix, Normalisations], half: HalfSizeMatches | None, *, coloured: bool
-) -> SemiGlobalMatches:
-    """The matches of the one beta, once for all its bands; if they are not to be coloured, with colours of no bands."""
-    alpha, (beta,), (mix, normalisations) = inputs.alpha, inputs.betas, common
-    blocks = None if half else beta.field.of_blocks(FINE)
-    where = matched(alpha, _guide(beta, mix), beta.field.straight, blocks, normalisations, half)
-    found = SemiGlobalMatches(*where, alpha[:, :0], alpha[:, None, :0])
-    if not coloured:
-        return found
-    colour, weight = _colours(alpha, beta, found, common)
-    return found._replace(matched=colour, colour=diffused_from(colour, alpha, weight))
-
-
-def _guide(beta: Beta, mix: SpectralMix) -> Tensor:
-    """What of a beta is compared with alpha."""
-    return beta.image if beta.image.shape[1] == 1 else mix.of(beta.image)
 
 
 def _colours(

@@ -8,11 +8,8 @@ pixels of high confidence to the others, and adds it to alpha.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
@@ -20,25 +17,22 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, pixel_shuffle, pixel_unshuffle
 
 from arraygeom import Local, Pair, Segments, View, lazily
-from arraygeom.fields.grid import Box
 
 from ..attention import attend, attend_with_statistics
 from ..media.colour import luminance
 from .blocks import ResidualBlock, channels_last, conv, enlarge, plain, stacked
 from .configs import GuidedPATConfig
-from .matching import matched
-from .pieces import Prepared, from_pieces, prepared, whole
+from .pieces import Prepared
 from .protocol import Beta, FusionOutput, Inputs, JoinsBands
 from .semi_global import (
     FINE,
     Extent,
-    HalfSizeMatches,
     Normalisations,
     SemiGlobalMatches,
     matches,
 )
-from .several import agreed, can_agree
-from .warped import FILLS, diffused_from, likeness, matched_colours
+from .several import matched_together
+from .warped import FILLS, likeness, matched_colours
 from .windows import attend_to_windows
 
 COARSE = 4
@@ -56,9 +50,6 @@ LIKENESS = 0.06
 """Difference of brightness at which likeness falls to 1 / e."""
 LIKEST = 3.0
 """How much more a beta's colour counts, as a logit, where it is as bright as alpha than where it is unlike it."""
-PARALLAX = 2.0
-"""The power of a beta's parallax by which the odds that its colour is right fall: what it sees past depth's edges, and
-how far a wrong depth displaces it, grow with parallax."""
 NOWHERE = -10.0
 """The logit of the confidence where there is no valid segment."""
 
@@ -150,14 +141,9 @@ class GuidedPAT(nn.Module):
 
         Of several betas the depth is that on which all agree.
         """
-        agree = can_agree(inputs)
-        match = partial(_matches, coloured=not agree)
-        found = prepared(inputs, _normalisations, lambda found: (brightness, found), match)
-        if not agree:
-            return found
         parts = self._in_parts(inputs)
         full = [not parts and beta.image.shape[1] == self.config.bands for beta in inputs.betas]
-        return coloured_together(inputs, found, _colours, full)
+        return matched_together(inputs, _normalisations, lambda found: (brightness, found), _colours, full)
 
     def _in_parts(self, inputs: Inputs) -> bool:
         """Whether each beta has some of the bands, in order; else those with all of them show the same colours."""
@@ -265,53 +251,6 @@ class GuidedPAT(nn.Module):
         b, h, w, c = x.shape
         pixels = x.unflatten(-1, (2, c // 2)).movedim(3, 2)
         return pixels.reshape(b, 2 * h, 2 * w, c // 4).movedim(-1, 1)
-
-
-@torch.no_grad()
-def coloured_together(
-    inputs: Inputs,
-    found: Prepared,
-    colours: Callable[[Tensor, Beta, SemiGlobalMatches, Any], tuple[Tensor, Tensor]],
-    full: Sequence[bool] | None = None,
-) -> Prepared:
-    """The matches with the depth on which all betas agree, coloured: `colours` gives a beta's bands minus alpha at its
-    matches, and their weight.
-
-    Betas that have all bands (`full`) share the colour that is diffused; any other has its own.
-    """
-    full = full or [False] * len(found.matches)
-    matches, prior = agreed(inputs, found.matches), _priors(inputs) if any(full) else ()
-
-    def of(box: Box) -> list[Tensor]:
-        large = box != whole(inputs.hw).outer
-        ones = [inputs.of_beta(i).cut(box) if large else inputs.of_beta(i) for i in range(len(full))]
-        alpha = ones[0].alpha
-        alone = [colours(alpha, o.betas[0], m.cut(box), n) for o, m, n in zip(ones, matches, found.common)]
-        shared = []
-        if any(full):
-            counting = [(c, w * math.exp(p)) for (c, w), p, counts in zip(alone, prior, full) if counts]
-            total = torch.stack([weight for _, weight in counting]).sum(0)
-            mixed = sum(weight * colour for colour, weight in counting) / total
-            shared = [diffused_from(mixed, alpha, torch.stack([w for (_, w), c in zip(alone, full) if c]).amax(0))]
-        fills = (diffused_from(c, alpha, w) for (c, w), counts in zip(alone, full) if not counts)
-        parts = [*shared, *fills, *(colour for colour, _ in alone)]
-        return [part.half() for part in parts] if large else parts
-
-    parts = from_pieces(inputs.hw, inputs.multiple, of)
-    matched, diffused = parts[-len(full) :], iter(parts[: -len(full)])
-    shared = [next(diffused)] if any(full) else []
-    coloured = (
-        one._replace(matched=m, colour=shared[0] if counts else next(diffused))
-        for one, m, counts in zip(matches, matched, full)
-    )
-    return replace(found, prior=prior, matches=tuple(coloured))
-
-
-def _priors(inputs: Inputs) -> tuple[float, ...]:
-    """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
-    straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
-    lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
-    return tuple(PARALLAX * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
 
 
 def _joined(bands: list[Tensor]) -> Tensor:
@@ -435,20 +374,6 @@ def _in_type(segments: Segments, kind: torch.dtype) -> Segments:
 def _normalisations(inputs: Inputs) -> Normalisations:
     """How the one beta's brightness is brought to alpha's, of whole images."""
     return Normalisations.of(inputs.alpha, brightness(inputs.betas[0].image))
-
-
-def _matches(
-    inputs: Inputs, normalisations: Normalisations, half: HalfSizeMatches | None, *, coloured: bool
-) -> SemiGlobalMatches:
-    """The matches of the one beta; if they are not to be coloured, with colours of no bands."""
-    alpha, (beta,) = inputs.alpha, inputs.betas
-    blocks = None if half else beta.field.of_blocks(FINE)
-    where = matched(alpha, brightness(beta.image), beta.field.straight, blocks, normalisations, half)
-    found = SemiGlobalMatches(*where, alpha[:, :0], alpha[:, None, :0])
-    if not coloured:
-        return found
-    colour, weight = _colours(alpha, beta, found, normalisations)
-    return found._replace(matched=colour, colour=diffused_from(colour, alpha, weight))
 
 
 class Encoder(nn.Module):

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -26,9 +26,21 @@ from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
 from ..media.colour import to_bytes
-from .pieces import from_pieces
+from .matching import matched
+from .pieces import Prepared, from_pieces, prepared, whole
 from .protocol import Beta, Inputs
-from .semi_global import CONSISTENT, DISPARITY_FILL, FINE, Extent, SemiGlobalMatches, enlarged, filled
+from .semi_global import (
+    CONSISTENT,
+    DISPARITY_FILL,
+    FINE,
+    Extent,
+    HalfSizeMatches,
+    Normalisations,
+    SemiGlobalMatches,
+    enlarged,
+    filled,
+)
+from .warped import diffused_from
 
 SUPPORT = 1.5
 """A beta supports an inverse depth that is less than this many of its pixels from its own match."""
@@ -43,6 +55,9 @@ TRIALS = 400
 MORE = 0.1
 """By how much the share of pixels that agree has to rise for betas' depths to be brought together: above that of the
 depths as they are, and above that of a plane, which is what wrong matches and a flat background agree with."""
+PARALLAX = 2.0
+"""The power of a beta's parallax by which the odds that its colour is right fall: what it sees past depth's edges, and
+how far a wrong depth displaces it, grow with parallax."""
 STRIP = 1 << 16
 """Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's cache."""
 
@@ -146,6 +161,77 @@ class MatchedBeta:
         column, row = ((x + 0.5).div_(FINE).floor_().long() for x in self._seen(inverse_depth))
         inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows) & self.segments.valid
         return torch.where(inside, row * columns + column, rows * columns)
+
+
+@torch.no_grad()
+def matched_together(
+    inputs: Inputs,
+    common: Callable[[Inputs], Any],
+    comparison: Callable[[Any], tuple[Callable[[Tensor], Tensor], Normalisations]],
+    colours: Callable[[Tensor, Beta, SemiGlobalMatches, Any], tuple[Tensor, Tensor]],
+    full: Sequence[bool] = (),
+) -> Prepared:
+    """The matches of all betas, with the depth on which they agree if they can, coloured.
+
+    `common` and `comparison` are those of `pat.networks.pieces.prepared`; `colours` gives bands minus alpha at a beta's
+    matches, and their weight. Of betas that agree, those that have all bands (`full`, of each) share the colour that is
+    diffused; any other has its own.
+    """
+    agree = can_agree(inputs)
+
+    def match(piece: Inputs, known: Any, half: HalfSizeMatches | None) -> SemiGlobalMatches:
+        alpha, (beta,), (of, normalisations) = piece.alpha, piece.betas, comparison(known)
+        blocks = None if half else beta.field.of_blocks(FINE)
+        where = matched(alpha, of(beta.image), beta.field.straight, blocks, normalisations, half)
+        found = SemiGlobalMatches(*where, alpha[:, :0], alpha[:, None, :0])
+        if agree:
+            return found
+        colour, weight = colours(alpha, beta, found, known)
+        return found._replace(matched=colour, colour=diffused_from(colour, alpha, weight))
+
+    found = prepared(inputs, common, comparison, match)
+    return _coloured_together(inputs, found, colours, full or [False] * len(inputs.betas)) if agree else found
+
+
+def _coloured_together(
+    inputs: Inputs,
+    found: Prepared,
+    colours: Callable[[Tensor, Beta, SemiGlobalMatches, Any], tuple[Tensor, Tensor]],
+    full: Sequence[bool],
+) -> Prepared:
+    matches, prior = agreed(inputs, found.matches), _priors(inputs) if any(full) else ()
+
+    def of(box: Box) -> list[Tensor]:
+        """What is diffused, and each beta's colours, of a piece."""
+        large = box != whole(inputs.hw).outer
+        ones = [inputs.of_beta(i).cut(box) if large else inputs.of_beta(i) for i in range(len(full))]
+        alpha = ones[0].alpha
+        alone = [colours(alpha, o.betas[0], m.cut(box), n) for o, m, n in zip(ones, matches, found.common)]
+        shared = []
+        if any(full):
+            counting = [(c, w * math.exp(p)) for (c, w), p, counts in zip(alone, prior, full) if counts]
+            total = torch.stack([weight for _, weight in counting]).sum(0)
+            mixed = sum(weight * colour for colour, weight in counting) / total
+            shared = [diffused_from(mixed, alpha, torch.stack([w for (_, w), c in zip(alone, full) if c]).amax(0))]
+        fills = (diffused_from(c, alpha, w) for (c, w), counts in zip(alone, full) if not counts)
+        parts = [*shared, *fills, *(colour for colour, _ in alone)]
+        return [part.half() for part in parts] if large else parts
+
+    parts = from_pieces(inputs.hw, inputs.multiple, of)
+    matched_colours, diffused = parts[-len(full) :], iter(parts[: -len(full)])
+    shared = [next(diffused)] if any(full) else []
+    coloured = (
+        one._replace(matched=colour, colour=shared[0] if counts else next(diffused))
+        for one, colour, counts in zip(matches, matched_colours, full)
+    )
+    return replace(found, prior=prior, matches=tuple(coloured))
+
+
+def _priors(inputs: Inputs) -> tuple[float, ...]:
+    """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
+    straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
+    lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
+    return tuple(PARALLAX * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
 
 
 def can_agree(inputs: Inputs) -> bool:
