@@ -27,7 +27,7 @@ from torch.utils.checkpoint import checkpoint
 from arraygeom.segments import Positions, Segments
 from arraygeom.tracing import transformations
 from pat.attention import reference, torch_op
-from pat.attention.reference import Attended, SamplePositions
+from pat.attention.reference import Attended, AttentionInputs, SamplePositions
 
 Locations = Segments | Positions
 Interpolation = Literal["bilinear", "nearest"]
@@ -118,7 +118,7 @@ def _attend(
 
     def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> Attended:
         form = _form(given, q, samples)
-        return _run(q, k, v, form, _bias(part, q, form.samples), nearest, backend, measured)
+        return _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
 
     if not callable(locations):
         return run(query, key, value, locations, bias)
@@ -197,33 +197,22 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
         raise ValueError(f"bias {tuple(bias.shape)} does not broadcast to {(b, ha, wa, samples)}") from None
 
 
-def _run(
-    q: Tensor,
-    k: Tensor,
-    v: Tensor,
-    positions: SamplePositions,
-    bias: Tensor | None,
-    nearest: bool,
-    backend: Backend,
-    measured: bool,
-) -> Attended:
-    chosen = _choose(backend, q.device.type)
-    missing = "" if chosen == "reference" else _missing(q, k, v, positions.points, bias)
+def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
+    chosen = _choose(backend, inputs.query.device.type)
+    missing = "" if chosen == "reference" else _missing(inputs)
     if missing and backend != "auto":
         raise NotImplementedError(f"backend '{backend}' has no {missing}: ask for backend=\"reference\"")
-    if missing:
-        chosen = "reference"
-    if chosen == "reference":
-        return reference.attend(q, k, v, positions, bias, nearest)
-    strict = backend != "auto"
-    return torch_op.attend(q, k, v, positions, bias, nearest, measured=measured, backend=chosen, strict=strict)
+    if missing or chosen == "reference":
+        return reference.attend(inputs)
+    return torch_op.attend(inputs, measured=measured, backend=chosen, strict=backend != "auto")
 
 
-def _missing(*tensors: Tensor | None) -> str:
+def _missing(inputs: AttentionInputs) -> str:
     """What is under way that compiled backends have not; empty if nothing."""
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
+    tensors = (inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias)
     if "Jvp" in under_way or any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""

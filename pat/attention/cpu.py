@@ -19,7 +19,7 @@ from torch.nn.functional import pad
 from arraygeom.segments import sample_fractions
 from arraygeom.threads import in_parallel
 from pat.attention import kernels
-from pat.attention.reference import EDGE_SLACK, SamplePositions, accumulated, channels_last
+from pat.attention.reference import EDGE_SLACK, AttentionInputs, accumulated, channels_last
 
 PIECE_SAMPLES = 2**15
 """Samples that a thread takes at a time: a fraction of a millisecond."""
@@ -27,35 +27,23 @@ SCRATCH_TAPS = 2**20
 """Taps that backward holds at a time, 12 bytes each (16 in float64)."""
 
 
-def forward(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    positions: SamplePositions,
-    bias: Tensor | None,
-    nearest: bool,
-    measured: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Values (b, dv, ha, wa), channels last; statistics (b, ha, wa, 4), of no length if not `measured`; log of
     the sum of exponentials (b, ha, wa); nothing, where the GPU's has the samples of the largest weights."""
+    query = inputs.query
     b, _, ha, wa = query.shape
     counted = accumulated(query)
-    out = _new(b, ha, wa, value.shape[1], dtype=query.dtype)
+    out = _new(b, ha, wa, inputs.value.shape[1], dtype=query.dtype)
     statistics = _new(*((b, ha, wa, 4) if measured else (0,)), dtype=counted)
     logsum = _new(b, ha, wa, dtype=counted)
-    call = _call(query, key, value, positions, bias, nearest)
+    call = _call(inputs)
     outputs = kernels.Outputs(_flat(out), _flat(statistics), _flat(logsum), measured)
     in_parallel([partial(kernels.forward, call, share, outputs) for share in _shares(0, b * ha * wa, call)])
     return out.permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
 
 
 def backward(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    positions: SamplePositions,
-    bias: Tensor | None,
-    nearest: bool,
+    inputs: AttentionInputs,
     saved: tuple[Tensor, Tensor, Tensor, Tensor | None],
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
@@ -66,9 +54,10 @@ def backward(
     alpha at a time, in two steps: its pixels are shared among the threads for all that belongs to alpha; then
     the channels are, for the additions to beta's pixels.
     """
+    query, key, value, positions, *_ = inputs
     b, d, ha, wa = query.shape
     counted = accumulated(query)
-    call = _call(query, key, value, positions, bias, nearest)
+    call = _call(inputs)
     upstream = _flat(channels_last(cotangents[0]))
     statistics, statistics_upstream = (
         t if t.numel() else t.new_zeros(4) for t in (saved[0], cotangents[1].to(counted).contiguous())
@@ -128,12 +117,9 @@ def _new(*shape: int, dtype: torch.dtype) -> Tensor:
     return torch.from_numpy(np.empty(math.prod(shape) * dtype.itemsize, np.uint8)).view(dtype).view(shape)
 
 
-def _bias(bias: Tensor | None, counted: torch.dtype) -> Tensor:
-    return torch.empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()
-
-
-def _geometry(positions: SamplePositions, query: Tensor, key: Tensor, nearest: bool) -> kernels.Geometry:
-    h, w = key.shape[2:]
+def _geometry(inputs: AttentionInputs) -> kernels.Geometry:
+    query, positions = inputs.query, inputs.positions
+    h, w = inputs.key.shape[2:]
     number = _number(query)
     fractions = pad(sample_fractions(positions.samples, like=positions.points), (0, kernels.LANES))
     return kernels.Geometry(
@@ -142,7 +128,7 @@ def _geometry(positions: SamplePositions, query: Tensor, key: Tensor, nearest: b
         fractions=_flat(fractions),
         samples=positions.samples,
         straight=positions.straight,
-        nearest=nearest,
+        nearest=inputs.nearest,
         alpha_pixels=query.shape[2] * query.shape[3],
         shared=positions.points.shape[0] == 1,
         height=h,
@@ -157,15 +143,13 @@ def _number(like: Tensor) -> type:
     return np.float64 if accumulated(like) == torch.float64 else np.float32
 
 
-def _call(
-    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
-) -> kernels.Call:
+def _call(inputs: AttentionInputs) -> kernels.Call:
+    query, key, value, _, bias, _ = inputs
+    counted = accumulated(query)
     return kernels.Call(
-        _flat(channels_last(query)),
-        _flat(channels_last(key)),
-        _flat(channels_last(value)),
-        geometry=_geometry(positions, query, key, nearest),
-        bias=_flat(_bias(bias, accumulated(query))),
+        *(_flat(channels_last(t)) for t in (query, key, value)),
+        geometry=_geometry(inputs),
+        bias=_flat(query.new_empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()),
         biased=bias is not None,
         channels=query.shape[1],
         value_channels=value.shape[1],

@@ -22,7 +22,7 @@ import triton.language as tl
 from torch import Tensor
 
 from arraygeom.segments import sample_fractions
-from pat.attention.reference import EDGE_SLACK, LEAST_DEVIATION, SamplePositions, accumulated, channels_last
+from pat.attention.reference import EDGE_SLACK, LEAST_DEVIATION, AttentionInputs, accumulated, channels_last
 
 PIXELS = 8
 """Alpha pixels of one program."""
@@ -32,39 +32,28 @@ FIXED_BITS = 61
 """How much of an int64 a sum of fixed point numbers may take."""
 
 
-def forward(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    positions: SamplePositions,
-    bias: Tensor | None,
-    nearest: bool,
-    measured: bool,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """As `cpu.forward`, with the sample of the largest weight (b, ha, wa)."""
+    query = inputs.query
     b, _, ha, wa = query.shape
     counted = accumulated(query)
-    out = query.new_empty(b, ha, wa, value.shape[1])
+    out = query.new_empty(b, ha, wa, inputs.value.shape[1])
     statistics = query.new_empty(b, ha, wa, 4, dtype=counted)
     logsum = query.new_empty(b, ha, wa, dtype=counted)
     best = query.new_empty(b, ha, wa, dtype=torch.int32)
-    inputs, options = _call(query, key, value, positions, bias, nearest)
-    _forward[_programs(query)](*inputs, out, statistics, logsum, best, **options)
+    tensors, options = _call(inputs)
+    _forward[_programs(query)](*tensors, out, statistics, logsum, best, **options)
     return out.permute(0, 3, 1, 2), statistics if measured else statistics.new_empty(0), logsum, best
 
 
 def backward(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    positions: SamplePositions,
-    bias: Tensor | None,
-    nearest: bool,
+    inputs: AttentionInputs,
     saved: tuple[Tensor, Tensor, Tensor, Tensor],
     cotangents: tuple[Tensor, Tensor],
     wanted: Sequence[bool],
 ) -> tuple[Tensor, ...]:
     """As `cpu.backward`; `saved` are statistics, logsum, the best samples, and the values."""
+    query, key, value, positions, *_ = inputs
     b, _, ha, wa = query.shape
     counted = accumulated(query)
     upstream = channels_last(cotangents[0])
@@ -78,9 +67,9 @@ def backward(
     query_out = query.new_empty(b, ha, wa, query.shape[1])
     points_out = query.new_zeros(b, *positions.points.shape[1:], dtype=counted)
     bias_out = query.new_zeros((b, ha, wa, positions.samples) if wanted[4] else 1, dtype=counted)
-    inputs, options = _call(query, key, value, positions, bias, nearest)
+    tensors, options = _call(inputs)
     _backward[_programs(query)](
-        *inputs,
+        *tensors,
         *(statistics, saved[1], saved[2], channels_last(saved[3]), upstream, statistics_upstream, scales),
         *(query_out, *images, points_out, bias_out),
         **options,
@@ -119,11 +108,10 @@ def _programs(query: Tensor) -> tuple[int]:
     return (triton.cdiv(query.shape[0] * query.shape[2] * query.shape[3], PIXELS),)
 
 
-def _call(
-    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
-) -> tuple:
+def _call(inputs: AttentionInputs) -> tuple:
+    query, key, value, positions, bias, nearest = inputs
     counted = accumulated(query)
-    inputs = (
+    tensors = (
         *(channels_last(t) for t in (query, key, value)),
         positions.points.contiguous(),
         positions.mask.contiguous().view(torch.uint8),
@@ -146,7 +134,7 @@ def _call(
         "BIASED": bias is not None,
         "NUMBER": tl.float64 if counted == torch.float64 else tl.float32,
     }
-    return inputs, options
+    return tensors, options
 
 
 def compiled(function):

@@ -54,6 +54,18 @@ class SamplePositions(NamedTuple):
         return start[..., None, :] + u[:, None] * (end - start)[..., None, :]
 
 
+class AttentionInputs(NamedTuple):
+    """What is attended to and where: `query` (b, d, Ha, Wa), `key` (b, d, Hb, Wb) and `value` (b, dv, Hb, Wb) of one
+    dtype and device, the samples' positions, `bias` (b, Ha, Wa, l) or None, and whether look-ups are nearest."""
+
+    query: Tensor
+    key: Tensor
+    value: Tensor
+    positions: SamplePositions
+    bias: Tensor | None
+    nearest: bool
+
+
 class Attended(NamedTuple):
     """The outputs of C3 attention for each alpha pixel. Where no sample counts, everything is 0.
 
@@ -69,21 +81,21 @@ class Attended(NamedTuple):
     peak: Tensor
 
 
-def attend(
-    query: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
-) -> Attended:
-    """The formula, band by band. `bias`, if any, is (B, Ha, Wa, L)."""
+def attend(inputs: AttentionInputs) -> Attended:
+    """The formula, band by band."""
+    query, positions, bias = inputs.query, inputs.positions, inputs.bias
     counted = accumulated(query)
     with torch.autocast(query.device.type, enabled=False):
-        key, value = (channels_last(plane.to(counted)) for plane in (key, value))
+        key, value = (channels_last(plane.to(counted)) for plane in (inputs.key, inputs.value))
         bands = [
             _band(
-                query[:, :, top:bottom].to(counted).permute(0, 2, 3, 1),
-                key,
-                value,
-                positions.rows(top, bottom),
-                None if bias is None else bias[:, top:bottom].to(counted),
-                nearest,
+                inputs._replace(
+                    query=query[:, :, top:bottom].to(counted).permute(0, 2, 3, 1),
+                    key=key,
+                    value=value,
+                    positions=positions.rows(top, bottom),
+                    bias=None if bias is None else bias[:, top:bottom].to(counted),
+                )
             )
             for top, bottom in _bands(query, key, value, positions.samples)
         ]
@@ -109,9 +121,9 @@ def channels_last(image: Tensor) -> Tensor:
     return image.permute(0, 2, 3, 1).contiguous()
 
 
-def _band(
-    q: Tensor, key: Tensor, value: Tensor, positions: SamplePositions, bias: Tensor | None, nearest: bool
-) -> Attended:
+def _band(inputs: AttentionInputs) -> Attended:
+    """Images are channels last: (b, r, w, d) and (b, h, w, d)."""
+    q, key, value, positions, bias, nearest = inputs
     b, r, w, _ = q.shape
     xy = positions.positions().to(q.dtype)  # p r w l 2
     counts = positions.mask & on_image(xy, hw=key.shape[1:3])  # p r w l

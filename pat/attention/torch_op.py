@@ -15,7 +15,7 @@ from torch.nn import Parameter
 
 from arraygeom.tracing import transformations
 from pat.attention import reference
-from pat.attention.reference import Attended, SamplePositions
+from pat.attention.reference import Attended, AttentionInputs, SamplePositions
 
 INPUTS = "Tensor query, Tensor key, Tensor value, Tensor points, Tensor mask, Tensor? bias"
 SAVED = (
@@ -24,22 +24,12 @@ SAVED = (
 OPTIONS = "int samples, bool straight, bool nearest, bool measured, str backend, bool strict"
 
 
-def attend(
-    query: Tensor,
-    key: Tensor,
-    value: Tensor,
-    positions: SamplePositions,
-    bias: Tensor | None,
-    nearest: bool,
-    *,
-    measured: bool,
-    backend: str,
-    strict: bool,
-) -> Attended:
+def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: bool) -> Attended:
     """As `reference.attend`, by the `cpu` or the `triton` backend; without statistics if not `measured`.
     `strict`: no second order by the reference."""
+    query, key, value, positions, bias, nearest = inputs
     if _is_plain(query, key, value, positions.points, bias):
-        out, statistics, *_ = _kernels(backend).forward(query, key, value, positions, bias, nearest, measured)
+        out, statistics, *_ = _kernels(backend).forward(inputs, measured)
     else:
         out, statistics, *_ = _attend(
             *(query, key, value, positions.points, positions.mask, bias),
@@ -90,7 +80,7 @@ def _attend(
     strict: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     positions = SamplePositions(points, mask, samples, straight)
-    return _kernels(backend).forward(query, key, value, positions, bias, nearest, measured)
+    return _kernels(backend).forward(AttentionInputs(query, key, value, positions, bias, nearest), measured)
 
 
 @_attend.register_fake
@@ -137,8 +127,9 @@ def _attend_backward(
     wanted: list[bool],
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     positions = SamplePositions(points, mask, samples, straight)
+    inputs = AttentionInputs(query, key, value, positions, bias, nearest)
     saved, cotangents = (statistics, logsum, best, out), (value_cotangent, statistics_cotangent)
-    return _kernels(backend).backward(query, key, value, positions, bias, nearest, saved, cotangents, wanted)
+    return _kernels(backend).backward(inputs, saved, cotangents, wanted)
 
 
 @_attend_backward.register_fake
@@ -204,7 +195,7 @@ def _differentiate_again(ctx, *cotangents):
     higher = torch.is_grad_enabled()
     with torch.enable_grad():
         positions = SamplePositions(points, mask, samples, straight)
-        out = reference.attend(query, key, value, positions, bias, nearest)
+        out = reference.attend(AttentionInputs(query, key, value, positions, bias, nearest))
         outputs = [out.value, _side_by_side(out)] if measured else [out.value]
         given = upstream[: len(outputs)]
         first = torch.autograd.grad(outputs, inputs, given, create_graph=True, materialize_grads=True)
