@@ -32,7 +32,6 @@ from .semi_global import (
     HalfSizeMatches,
     Normalisation,
     Normalisations,
-    SemiGlobalMatches,
     filled,
     geometry_of,
     inner_and_outer,
@@ -40,7 +39,7 @@ from .semi_global import (
     numpy_of,
 )
 from .semi_global_kernels import census
-from .warped import at_matches, box_mean, diffused_from, matched_colours
+from .warped import at_matches, box_mean
 
 NEIGHBOURHOOD = 5
 """Side of the neighbourhood at half the size, pixels."""
@@ -63,29 +62,6 @@ BLOCK_BYTES = 120.0 * (BLOCK + 2 * MARGIN) ** 2
 
 
 @torch.no_grad()
-def semi_global_matching(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    beta: Float[Tensor, "b c hb wb"],
-    segments: Segments,
-    blocks: Segments | None,
-    normalisations: Normalisations | None = None,
-    half: HalfSizeMatches | None = None,
-) -> SemiGlobalMatches:
-    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`.
-
-    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
-    of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole images if these
-    are parts, and `half` what is known of these parts from the whole images. On the CPU, with as many threads as torch
-    may use; the same whatever their number.
-    """
-    normalisations = normalisations or Normalisations.of(alpha, guide)
-    disparity, facts = matched(alpha, guide, segments, blocks, normalisations, half)
-    colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
-    return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))
-
-
-@torch.no_grad()
 def matched(
     alpha: Float[Tensor, "b 1 h w"],
     guide: Float[Tensor, "b 1 hb wb"],
@@ -94,7 +70,14 @@ def matched(
     normalisations: Normalisations,
     half: HalfSizeMatches | None = None,
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 3 h2 w2"]]:
-    """`disparity` and `facts` alone."""
+    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`: `disparity` and `facts` of
+    `SemiGlobalMatches`.
+
+    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
+    of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole images if these
+    are parts, and `half` what is known of these parts from the whole images. On the CPU, with as many threads as torch
+    may use; the same whatever their number.
+    """
     if half is None:
         assert blocks is not None, "matching without blocks begins with matches at half the size"
         half = matched_at_half_size(alpha, guide, blocks, normalisations.half)

@@ -4,6 +4,9 @@ import cv2
 import torch
 
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
+from pat.networks.matching import matched
+from pat.networks.semi_global import Normalisations, SemiGlobalMatches
+from pat.networks.warped import diffused_from, matched_colours
 
 
 def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
@@ -30,3 +33,18 @@ def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
     """A scene with little to hold on to, 64 x 256."""
     soft = blurred(torch.rand(1, 1, 64, 256, generator=torch.Generator().manual_seed(seed)), blur)
     return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
+
+
+def semi_global_matching(
+    alpha: torch.Tensor,
+    guide: torch.Tensor,
+    beta: torch.Tensor,
+    segments: Segments,
+    blocks: Segments | None,
+    normalisations: Normalisations | None = None,
+) -> SemiGlobalMatches:
+    """Matches of one beta, whose brightness is `guide`, and its colours by them, as `prepare` of the networks has."""
+    normalisations = normalisations or Normalisations.of(alpha, guide)
+    disparity, facts = matched(alpha, guide, segments, blocks, normalisations)
+    colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
+    return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))

@@ -20,7 +20,6 @@ from arraygeom import (
     rotation_from_vector,
 )
 from pat.networks import semi_global_kernels as kernels
-from pat.networks.matching import semi_global_matching
 from pat.networks.semi_global import (
     Normalisation,
     SemiGlobalMatches,
@@ -30,7 +29,7 @@ from pat.networks.semi_global import (
     matches,
 )
 from pat.support.memory import limited
-from tests.pat.networks.matched_scenes import beside, blurred, faint
+from tests.pat.networks.matched_scenes import beside, blurred, faint, semi_global_matching
 
 HW = (64, 96)
 

@@ -7,9 +7,8 @@ import torch
 from arraygeom import Segments, pixel_grid
 from pat.media.colour import luminance
 from pat.networks import warped
-from pat.networks.matching import semi_global_matching
 from pat.networks.warped import LIKENESS, _diffused, colour_noise, explained_share, match_weight
-from tests.pat.networks.matched_scenes import beside, blurred, faint
+from tests.pat.networks.matched_scenes import beside, blurred, faint, semi_global_matching
 
 
 def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:
