@@ -114,15 +114,14 @@ def fuse(
     inputs, undo = prepared(network, views, steps)
     del views  # whose images are there again, padded
     LOG.info("planning")
-    before = 0.0 if corrections else expected_work(inputs, response, align=align)
-    estimate = announce is not None
     plan = plan_frame(
         network,
         inputs,
         limit=limit,
-        estimate=estimate,
+        estimate=announce is not None,
         stored=store is not None,
-        before=before,
+        before=0.0 if corrections else expected_work(inputs, response, align=align),
+        after=low_light.seconds_left,
         kept=low_light.kept(inputs.hw, len(betas)),
     )
     if announce:

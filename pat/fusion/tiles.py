@@ -74,12 +74,14 @@ def plan_frame(
     estimate: bool,
     stored: bool,
     before: float = 0.0,
+    after: float = 0.0,
     kept: float = 0.0,
 ) -> Plan:
     """The tiles under a limit of memory (bytes); with `estimate`, the time of a large frame by fusing a piece.
 
-    `before` is the share of the frame's work that is done beforehand, by which the time is longer. `stored` says that
-    finished tiles are stored on disk until all are there. `kept` are bytes that the caller holds beside the frame.
+    `before` is the share of the frame's work that is done beforehand, by which the time is longer, and `after` are
+    seconds that follow. `stored` says that finished tiles are stored on disk until all are there. `kept` are bytes that
+    the caller holds beside the frame.
     Raises ValueError as `tiles_within`.
     """
     pieces = matching_pieces(frame.hw, network.multiple)
@@ -90,7 +92,7 @@ def plan_frame(
     matching = 0.0 if probe and not probe.state else MATCHING_BYTES * max(area(tile.outer) for tile in pieces)
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
-    seconds = (1 + before) * probe.seconds(pieces, tiles) if probe else None
+    seconds = (1 + before) * probe.seconds(pieces, tiles) + after if probe else None
     return Plan(tiles, SLACK * (held + work), seconds, len(pieces))
 
 

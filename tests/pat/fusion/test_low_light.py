@@ -6,6 +6,8 @@ from functools import cache
 import pytest
 import torch
 
+import pat.fusion.low_light
+import pat.fusion.tiles
 from arraygeom import Pair, Rectified, Rig, View
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
@@ -21,6 +23,7 @@ from pat.networks.positions import Found, WithPositions
 from pat.networks.protocol import Beta, FusionOutput, Inputs
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
+from pat.support.steps import steps_shown
 from tests.pat.layered_array import ALPHA, BETA, load_sample
 
 
@@ -164,6 +167,20 @@ def test_what_is_held_for_low_light_is_planned_for(network):
         fuse(network, sample.rig, images, alpha=ALPHA, noise=given, announce=plans.append)
     views = sum(image.nbytes for image in images.values())
     assert plans[1].memory > plans[0].memory + 4 * views
+
+
+def test_the_time_announced_has_the_correction_in_it(network, monkeypatch):
+    sample, images, noise = in_low_light(200)
+    monkeypatch.setattr(pat.fusion.tiles, "ESTIMATED", 0)
+    monkeypatch.setattr(pat.fusion.low_light, "JOINTLY", 1e4)
+    plans, steps = [], []
+    with steps_shown(steps.append):
+        fuse(network, sample.rig, images, alpha=ALPHA, noise=noise, announce=plans.append)
+    assert plans[0].seconds > 1e3
+    assert [s.split(" (")[0] for s in steps if "denoising" in s] == [
+        *(f"denoising {n}" for n in images),
+        "denoising the fused image",
+    ]
 
 
 def test_betas_are_mixed_by_confidence():
