@@ -1,16 +1,11 @@
 """The command line: it does the main job, and what is wrong is one line and exit status 2."""
 
 import contextlib
-import dataclasses
 import functools
 import json
-import os
 import re
 import shutil
-import subprocess
-import sys
 import typing
-from pathlib import Path
 
 import pytest
 import torch
@@ -19,12 +14,10 @@ import yaml
 from arraygeom import Pose, Rig
 from pat.cli.fusing import Fuse
 from pat.cli.main import Pat, command_paths, main
-from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named, respelled
+from pat.cli.options import respelled
 from pat.data.sample_array import SAMPLE, load_sample
 from pat.evaluation.metrics import score
 from pat.media.images import read_image, write_image
-
-ROOT = Path(__file__).parents[3]
 
 
 @pytest.fixture
@@ -226,71 +219,6 @@ def test_warnings_are_one_line(small, capsys):
     assert ".py" not in told.replace(str(small), "")
 
 
-def run(*words: str, then: str = "") -> subprocess.CompletedProcess:
-    command = " ".join([sys.executable, "-m", "pat", *words, then])
-    return subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True)
-
-
-@pytest.mark.parametrize(
-    "words", [(), ("rig",), ("fuse", "--help"), ("train", "--help"), ("--tyro-print-completion", "bash")]
-)
-def test_help_and_completion_import_no_torch(words):
-    code = f"""
-import sys
-from pat.cli.main import Pat, command_paths, main
-from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
-try: main({list(words)})
-except SystemExit as stop: assert not stop.code
-assert not {{"torch", "numpy", "scipy", "numba", "arraygeom", "rich"}} & set(sys.modules), sys.modules
-"""
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert done.stderr == ""
-    assert any(word in done.stdout for word in ("fuse", "info", "rate"))
-
-
-@pytest.mark.parametrize("path", [*command_paths()], ids=" ".join)
-def test_every_command_has_help_that_reads_well(path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([*path, "--help"])
-    assert stop.value.code == 0
-    text = capsys.readouterr().out
-    first = next(line for line in text.splitlines() if line and not line.startswith(("usage", " ")))
-    assert text.count(first) == 1
-    assert "{None}" not in text
-    assert path == ("train",) or "(default: None)" not in text
-
-
-def test_names_are_those_of_the_package():
-    from arraygeom.fields.default import FIELDS
-    from pat.networks.weights import shipped
-
-    assert tuple(sorted(shipped())) == WEIGHT_NAMES
-    assert tuple(FIELDS) == FIELD_NAMES
-    assert all(dataclasses.is_dataclass(field_named(name)) for name in FIELD_NAMES)
-    assert field_named("auto") is None
-
-
-def test_help_lists_users_tools_before_authors_tools(capsys):
-    with pytest.raises(SystemExit):
-        main([])
-    text = capsys.readouterr().out
-    lines = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
-    assert lines == ["fuse", "show", "explore", "calibrate", "board", "rig", "demo", "warm-up", *Pat.authors]
-    assert all(len(line) <= 120 for line in text.splitlines())
-
-
-def test_the_version_is_printed(capsys):
-    with pytest.raises(SystemExit):
-        main(["--version"])
-    assert re.fullmatch(r"arraygeom-pat \d+\.\d+\S*\n", capsys.readouterr().out)
-
-
-def test_commands_that_do_not_exist(capsys):
-    assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
-    assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
-    assert "known here: fuse, show" in fails(["--weights"], capsys)
-
-
 @pytest.mark.parametrize(
     "command",
     [
@@ -384,22 +312,6 @@ def test_errors_are_one_line_and_a_traceback_for_debugging(error, words, monkeyp
         main(["demo", "--debug"])
 
 
-def test_a_closed_pipe_is_quiet():
-    done = run("systems", "list", then="| true; exit ${PIPESTATUS[0]}")
-    assert (done.stdout, done.stderr) == ("", "")
-    assert done.returncode in (0, 141)
-    done = run("--help", then="| (exec 0<&-; sleep 1); exit ${PIPESTATUS[0]}")
-    assert (done.stderr, done.returncode) == ("", 141)
-
-
-def test_the_module_can_be_called_as_the_function_that_it_was(capsys):
-    from pat.cli import main as called
-
-    with pytest.raises(SystemExit):
-        called(["--version"])
-    assert "arraygeom-pat" in capsys.readouterr().out
-
-
 def wrong(small) -> None:
     """The rig with the sign of its baseline changed."""
     rig = Rig.load(small / "rig.yaml")
@@ -473,22 +385,6 @@ def test_a_bad_out_is_found_before_the_fusion(small, capsys, monkeypatch):
     assert (small / "out").read_text() == "a file"
 
 
-def test_an_interruption_while_pat_is_imported_is_one_line():
-    code = """
-import builtins, runpy, sys
-ordinary = builtins.__import__
-def interrupted(name, *args, **kwargs):
-    if name == "tyro":
-        raise KeyboardInterrupt
-    return ordinary(name, *args, **kwargs)
-builtins.__import__ = interrupted
-sys.argv = ["pat", "--help"]
-runpy.run_module("pat", run_name="__main__")
-"""
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (130, "pat: interrupted\n")
-
-
 @pytest.mark.parametrize(
     ("command", "out", "text"),
     [
@@ -514,13 +410,3 @@ def test_a_bad_out_is_found_before_the_work(command, out, text, tmp_path, monkey
         main([*command, "--out", out])
     assert ended.value.code == 2
     assert text in " ".join(capsys.readouterr().err.split())
-
-
-def test_threads_that_wait_sleep():
-    """Spinning, two threads took twice the core seconds beside another process; what the user sets is kept."""
-    code = "import os\nfrom pat.__main__ import main\ntry: main()\nfinally: print(os.environ['OMP_WAIT_POLICY'])"
-    for given, wanted in (({}, "PASSIVE"), ({"OMP_WAIT_POLICY": "ACTIVE"}, "ACTIVE")):
-        others = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
-        line = [sys.executable, "-c", code, "--help"]
-        done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True, env=others | given)
-        assert done.stdout.split()[-1] == wanted

@@ -1,0 +1,267 @@
+"""Rig files that are damaged or wrong: each gives one line that names the file."""
+
+import contextlib
+import math
+import re
+import shutil
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from arraygeom.io import READERS, RigFileError, RigFileWarning, read_rig, recognise
+from tests.oracles import Oracle
+
+scipy_io = Oracle("scipy.io")
+
+FIXTURES = Path(__file__).parent / "fixtures"
+
+
+TEXTS = sorted(
+    f for f in FIXTURES.rglob("*") if f.is_file() and f.name not in ("README.md", "frames.txt", "points3D.txt")
+)
+IDS = [str(f.relative_to(FIXTURES)) for f in TEXTS]
+
+
+def copied(file: Path, folder: Path, text: str | bytes) -> Path:
+    """The file with another text, in a copy of its folder (others of its rig are there too)."""
+    home = folder / "rig"
+    shutil.rmtree(home, ignore_errors=True)
+    if file.parent == FIXTURES:
+        home.mkdir()
+        for beside in FIXTURES.glob("cam_syntim_*"):
+            shutil.copy(beside, home)
+    else:
+        shutil.copytree(file.parent, home)
+    path = home / file.name
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return path
+
+
+def refusal(path: Path, format: str | None = None) -> str:
+    """The message of the error that reading gives, one line that names the file, without its folder."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RigFileWarning)
+        with pytest.raises(RigFileError) as caught:
+            read_rig(path, format=format)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert str(path.parent) in message
+    return message.replace(str(path.parent), "")
+
+
+class NotRefused(Exception):
+    """A file was read."""
+
+
+def message_of(path: Path, format: str) -> str:
+    try:
+        read_rig(path, format=format)
+    except RigFileError as error:
+        return str(error)
+    raise NotRefused
+
+
+def formats(file: Path) -> str:
+    return recognise(file)
+
+
+@pytest.mark.parametrize("file", TEXTS, ids=IDS)
+def test_truncated_files(file, tmp_path):
+    """Cut anywhere: an error in one line, or a rig if what is left is a whole file; never another exception."""
+    text, format, messages = file.read_bytes(), formats(file), []
+    for cut in np.linspace(0, len(text) - 1, 25).astype(int):
+        path = copied(file, tmp_path, text[:cut])
+        with warnings.catch_warnings(), contextlib.suppress(NotRefused):
+            warnings.simplefilter("ignore", RigFileWarning)
+            messages.append(message_of(path, format))
+    assert len(messages) >= 10
+    assert not any("\n" in message or "cannot be read as" in message for message in messages)
+
+
+@pytest.mark.parametrize("file", TEXTS, ids=IDS)
+def test_empty_files(file, tmp_path):
+    format = formats(file)
+    assert refusal(copied(file, tmp_path, ""), format).endswith("is empty")
+    assert refusal(copied(file, tmp_path, " \n\n"), format).endswith("is empty")
+
+
+@pytest.mark.parametrize("format", [f for f in READERS if f != "colmap"])
+def test_wrong_formats(format, tmp_path):
+    """Every reader, told to read the others' files, and files that are no text or no rig at all."""
+    others = [f for f in TEXTS if formats(f) != format and f.parent == FIXTURES]
+    assert len(others) > 10
+    for file in others:
+        if {formats(file), format} in ({"kitti", "kitti-raw"}, {"aniposelib", "caliscope"}):
+            continue
+        refusal(copied(file, tmp_path, file.read_bytes()), format)
+    for content in (b"\xff\xd8\xff\xe0" + bytes(range(256)), b"hello", b"[1, 2, 3]", b"{}", b"a: 1\n"):
+        path = tmp_path / "rig.dat"
+        path.write_bytes(content)
+        refusal(path, format)
+
+
+def test_unknown_files(tmp_path):
+    path = tmp_path / "rig.dat"
+    path.write_text("hello")
+    assert "not a rig file of a known format" in refusal(path)
+    path.write_text("")
+    assert refusal(path).endswith("is empty")
+    assert "not a rig file" in refusal_of_folder(tmp_path)
+    with pytest.raises(FileNotFoundError, match=r"nowhere\.yaml: no such rig file"):
+        read_rig(tmp_path / "nowhere.yaml")
+    with pytest.raises(ValueError, match="unknown rig format 'x'"):
+        read_rig(path, format="x")
+
+
+def refusal_of_folder(folder: Path) -> str:
+    with pytest.raises(RigFileError) as caught:
+        read_rig(folder)
+    return str(caught.value)
+
+
+# In every file: camera b's focal length, its name in the messages, and its rotation's or quaternion's first number.
+FOCAL = {"cam_syntim_g": "500.000000", "kitti_calib.txt": "7.000000000000e+02", "middlebury.txt": "1000"}
+FOCAL |= {
+    "extrinsics.yml": "",
+    "images.txt": "",
+    "rigs.txt": "",
+    "left.yaml": "500.0",
+    "a.png.camera": "500",
+    "opencv_stereo": "400.",
+    "metashape.xml": "500",
+    "matlab_fisheye.json": "300.0",
+}
+WITH_FOCAL = [f for f in TEXTS if FOCAL.get(f.name, "400")]
+
+
+def focal_pattern(file: Path) -> str:
+    number = FOCAL.get(file.name, "400")
+    return rf"(?<![\d.]){re.escape(number)}(\.0*)?(?![\d.])"
+
+
+@pytest.mark.parametrize("file", WITH_FOCAL, ids=[str(f.relative_to(FIXTURES)) for f in WITH_FOCAL])
+@pytest.mark.parametrize(("value", "cause"), [("nan", "NaN"), ("0.0", "focal"), ("-400.0", "focal")])
+def test_focal_lengths(file, value, cause, tmp_path):
+    if value == "nan":
+        value = {".json": "NaN", ".yaml": ".nan", ".yml": ".Nan", ".xml": ".Nan"}.get(file.suffix, "nan")
+        value = "nan" if file.name == "metashape.xml" else value
+        if file.name == "opencv_mono.json":
+            pytest.skip("OpenCV's JSON has no NaN")
+    text, count = re.subn(focal_pattern(file), value, file.read_text(), count=1)
+    assert count == 1
+    message = refusal(copied(file, tmp_path, text), formats(file))
+    assert cause in message, message
+
+
+NOT_ROTATIONS = {
+    "opencv_stereo/extrinsics.yml": ("0.8, 0., 0.6", "0.8, 0., 0.7"),
+    "colmap/images.txt": ("0.9486832980505138", "0.8486832980505138"),
+    "colmap_rig/rigs.txt": ("0.9486832980505138", "0.8486832980505138"),
+    "kalibr.yaml": ("[0.8, 0.0, 0.6,", "[0.8, 0.0, 0.7,"),
+    "matlab_old.json": ("[[0.8, 0, -0.6]", "[[0.8, 0, -0.7]"),
+    "matlab_new.json": ("[[0.8, 0, 0.6]", "[[0.8, 0, 0.7]"),
+    "calib_cam_to_cam.txt": ("R_01: 0.8", "R_01: 0.9"),
+    "transforms.json": ("[[0.8, 0, 0.6,", "[[0.8, 0, 0.7,"),
+    "multical.json": ("[[0.8, 0.0, 0.6]", "[[0.8, 0.0, 0.7]"),
+    "caliscope.toml": ("[[0.8, 0.0, 0.6]", "[[0.8, 0.0, 0.7]"),
+    "ros/right.yaml": ("[0.8, 0.0, -0.6,", "[0.8, 0.0, -0.7,"),
+    "cam_syntim_d": ("{{0.800000,", "{{0.900000,"),
+    "boofcv.yaml": ("[0.8, 0.0, -0.6,", "[0.8, 0.0, -0.7,"),
+    "pycalib.json": ("[[0.8, 0, 0.6]", "[[0.8, 0, 0.7]"),
+    "metashape.xml": ("0.8 0 0.6 0.05", "0.8 0 0.7 0.05"),
+}
+
+
+@pytest.mark.parametrize(("name", "change"), NOT_ROTATIONS.items(), ids=list(NOT_ROTATIONS))
+def test_rotations(name, change, tmp_path):
+    file = FIXTURES / name
+    text = file.read_text()
+    assert text.count(change[0]) == 1
+    message = refusal(copied(file, tmp_path, text.replace(*change)), formats(file))
+    assert "not a rotation" in message or "quaternion of length" in message, message
+
+
+def test_reflections_and_rounded_rotations(tmp_path):
+    file = FIXTURES / "kalibr.yaml"
+    text = file.read_text()
+    mirrored = text.replace("[0.0, 1.0, 0.0, 0.02]", "[0.0, -1.0, 0.0, 0.02]")
+    assert "is a reflection" in refusal(copied(file, tmp_path, mirrored))
+    rounded = copied(file, tmp_path, text.replace("[0.8, 0.0, 0.6,", "[0.8001, 0.0, 0.6,"))
+    R = read_rig(rounded)["cam1"].R
+    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), rtol=0, atol=1e-14)
+
+
+DUPLICATES = {
+    "colmap/cameras.txt": ("\n7 OPENCV", "\n1 OPENCV"),
+    "colmap/images.txt": ("b/0001.png", "a/0001.png"),
+    "kalibr.yaml": ("cam1:", "cam0:"),
+    "transforms.json": ("b.png", "a.png"),
+    "multical.json": ('"b": {', '"a": {'),
+    "aniposelib.toml": ('"b"', '"a"'),
+    "caliscope.toml": ("[cameras.1]", "[cameras.0]"),
+    "kitti_calib.txt": ("P1:", "P0:"),
+    "calib_cam_to_cam.txt": ("K_01:", "K_00:"),
+    "middlebury.txt": ("cam1=", "cam0="),
+    "ros/right.yaml": ("camera_name: b", "camera_name: a"),
+    "metashape.xml": ("b.jpg", "a.jpg"),
+}
+
+
+@pytest.mark.parametrize(("name", "change"), DUPLICATES.items(), ids=list(DUPLICATES))
+def test_duplicate_cameras(name, change, tmp_path):
+    file = FIXTURES / name
+    path = copied(file, tmp_path, file.read_text().replace(*change))
+    if name.startswith("ros"):
+        assert "occurs twice" in refusal_of_folder(path.parent)
+    else:
+        message = refusal(path, formats(file))
+        assert "twice" in message or "overwrite" in message or "declare" in message, message
+
+
+def test_wrong_units_warn(tmp_path):
+    file = FIXTURES / "kalibr.yaml"
+    path = copied(file, tmp_path, file.read_text().replace("0.6, -0.1]", "0.6, -100.0]"))
+    with pytest.warns(RigFileWarning, match="cameras 100 m apart: is this file in millimetres.*units: millimetres"):
+        read_rig(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rig = read_rig(path, scale=1e-3)
+    assert math.isclose(float(rig["cam1"].t[0]), -0.1)
+    file = FIXTURES / "middlebury.txt"
+    path = copied(file, tmp_path, file.read_text().replace("baseline=200", "baseline=0.05"))
+    with pytest.warns(RigFileWarning, match="is this file in metres, and read as millimetres"):
+        read_rig(path)
+
+
+def test_unstated_sizes_warn():
+    with pytest.warns(RigFileWarning, match=r"states no image size: took 1201 x 341, .* say `hw"):
+        assert read_rig(FIXTURES / "kitti_calib.txt")["cam1"].hw == (341, 1201)
+
+
+def test_what_is_not_supported_says_so(tmp_path):
+    for name, old, new, words in (
+        ("kalibr.yaml", "radtan", "wide", "cam1.distortion_model: is 'wide'; supported for pinhole: radtan"),
+        ("kalibr.yaml", "camera_model: pinhole", "camera_model: tele", "camera_model: is 'tele'; supported: pinhole"),
+        ("kalibr.yaml", "cam1:", "cam2:", "the chain has a gap"),
+        ("colmap/cameras.txt", "PINHOLE", "WIDE", "line 4: has model WIDE, which is not read: calibrate with one of"),
+        ("colmap/cameras.txt", "\n7 OPENCV", "\n8 OPENCV", "camera 7: is used by an image or a rig and not defined"),
+        ("transforms.json", '"OPENCV"', '"EQUIRECTANGULAR"', "camera_model: is EQUIRECTANGULAR; supported"),
+        ("middlebury.txt", "doffs=40", "doffs=-40", "doffs: is -40, which is not the difference"),
+        ("ros/left.yaml", "plumb_bob", "omni", "distortion_model: is 'omni'; supported"),
+        ("multical.json", "b_to_a", "c_to_a", "camera_poses.c_to_a: names no camera"),
+        ("matlab_old.json", '"CameraParameters1"', '"Camera1"', "CameraParameters1: is missing"),
+    ):
+        file = FIXTURES / name
+        message = refusal(copied(file, tmp_path, file.read_text().replace(old, new)), formats(file))
+        assert words in message, message
+
+
+def test_colmap_models_that_lost_entries(tmp_path):
+    """COLMAP's comment says how many images there are: a file cut between two of them is not a whole one."""
+    file = FIXTURES / "colmap" / "images.txt"
+    lines = file.read_text().splitlines(keepends=True)
+    message = refusal(copied(file, tmp_path, "".join(lines[:6])), "colmap")
+    assert message.endswith("announces 2 images and holds 1; was it cut off?")
