@@ -23,8 +23,8 @@ from calib.images.from_images import UncalibratedRig, rig_from_images
 from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.batch import find_images
-from ..fusion.checks import equal_bands
 from ..fusion.fuse import fuse
+from ..fusion.inputs import equal_bands
 from ..fusion.results import Frame
 from ..media.exif import focal_length
 from ..media.images import read_image, write_image

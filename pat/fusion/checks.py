@@ -1,4 +1,4 @@
-"""What is refused before a fusion begins, and what is doubtful about one that is done."""
+"""What is doubtful about a fusion that is done: the confidence with which its images match."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from ..networks.bandwise import BandwisePAT
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from .inputs import FrameInputs
 from .results import Frame
-from .views import Views
 
 LOW_CONFIDENCE = 0.3
 UNFIT_CONFIDENCE = 0.21
@@ -31,41 +28,6 @@ class LowConfidenceWarning(UserWarning):
     """The images hardly match along the rig's search segments; commands end with `exit_status`."""
 
     exit_status = 3
-
-
-def check_bands(network: FusionNetwork, views: Views) -> None:
-    """Refuse betas whose bands are not those that the network makes; warn of those whose three bands are equal.
-
-    Raises ValueError that says which weights to take.
-    """
-    _refuse_bands(network, views)
-    for name in views.betas:
-        image = views.images[name]
-        if len(image) == 3 and equal_bands(image):
-            warnings.warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3)
-
-
-def _refuse_bands(network: FusionNetwork, views: Views) -> None:
-    wanted = network.config.bands if isinstance(network, GuidedPAT) else None
-    bands = {name: len(views.images[name]) for name in views.betas}
-    total = sum(bands.values())
-    if wanted is None or total == wanted or wanted in bands.values():
-        return
-    listed = ", ".join(f"'{name}' {count}" for name, count in bands.items())
-    advice = ""
-    if wanted == 3 and total == 1:
-        sensor = views.rig[next(iter(bands))].sensor
-        said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
-        advice = f"its image is grey{said}: give one in colour, or "
-    raise ValueError(
-        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights make {wanted}: "
-        f"{advice}take the weights mono-spectral, which fuse any number of bands"
-    )
-
-
-def equal_bands(image: Float[Tensor, "c h w"]) -> bool:
-    """Whether all bands are the same."""
-    return all(torch.equal(image[0], band) for band in image[1:])
 
 
 def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs) -> None:

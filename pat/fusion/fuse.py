@@ -15,10 +15,10 @@ from ..media.images import Images
 from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes
-from .checks import check_bands, warn_of_confidence
+from .checks import warn_of_confidence
 from .corrections import Corrections, expected_work, find_corrections
 from .depth import background_filled
-from .inputs import prepared
+from .inputs import check_bands, prepared
 from .low_light import Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
 from .response import Given

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import warnings
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
@@ -16,6 +18,7 @@ from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
 
+from ..networks.guided import GuidedPAT
 from ..networks.protocol import Beta, FusionNetwork, Inputs
 from .steps import FusionStep, Undo
 from .views import Views
@@ -50,6 +53,41 @@ class FrameInputs(NamedTuple):
     hw: HW
 
 
+def check_bands(network: FusionNetwork, views: Views) -> None:
+    """Refuse betas whose bands are not those that the network makes; warn of those whose three bands are equal.
+
+    Raises ValueError that says which weights to take.
+    """
+    _refuse_bands(network, views)
+    for name in views.betas:
+        image = views.images[name]
+        if len(image) == 3 and equal_bands(image):
+            warnings.warn(f"the image of '{name}' has three equal bands: it is grey, and gives no colour", stacklevel=3)
+
+
+def _refuse_bands(network: FusionNetwork, views: Views) -> None:
+    wanted = network.config.bands if isinstance(network, GuidedPAT) else None
+    bands = {name: len(views.images[name]) for name in views.betas}
+    total = sum(bands.values())
+    if wanted is None or total == wanted or wanted in bands.values():
+        return
+    listed = ", ".join(f"'{name}' {count}" for name, count in bands.items())
+    advice = ""
+    if wanted == 3 and total == 1:
+        sensor = views.rig[next(iter(bands))].sensor
+        said = ", and the rig says that it is in colour" if sensor.response == "rgb" else ""
+        advice = f"its image is grey{said}: give one in colour, or "
+    raise ValueError(
+        f"the betas have {total} band{'s' if total > 1 else ''} in all ({listed}), these weights make {wanted}: "
+        f"{advice}take the weights mono-spectral, which fuse any number of bands"
+    )
+
+
+def equal_bands(image: Float[Tensor, "c h w"]) -> bool:
+    """Whether all bands are the same."""
+    return all(torch.equal(image[0], band) for band in image[1:])
+
+
 def prepared(network: FusionNetwork, views: Views, steps: Sequence[FusionStep]) -> tuple[FrameInputs, list[Undo]]:
     """The network's inputs after these steps, and how the frame is taken back to the views, the last step first.
 
@@ -69,14 +107,14 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
     Raises ValueError if alpha's pixels have no valid search segment in a beta: views that do not overlap.
     """
     m, hw = network.multiple, views.rig[views.alpha].hw
-    alpha = padded(views.own[None], m)
+    alpha, *images = (padded(views.images[name][None], m) for name in (views.alpha, *views.betas))
     betas, placements = [], []
-    for name in views.betas:
+    for name, image in zip(views.betas, images):
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
         place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x)
-        betas.append(Beta(padded(views.images[name][None], m), on_grid, track=place.track if place.has_depth else None))
+        betas.append(Beta(image, on_grid, track=place.track if place.has_depth else None))
         if not on_grid.any_valid(pair.alpha.hw):
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
             raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")

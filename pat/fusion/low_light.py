@@ -152,7 +152,7 @@ def denoised_views(views: Views, noise: Noise | None) -> tuple[Views, LowLight]:
     if not noisy:
         without = replace(views, images={})
         return views, LowLight(without, without, {})
-    denoised = views.replace({name: view.denoised[0] for name, view in noisy.items()})
+    denoised = replace(views, images={**views.images, **{name: view.denoised[0] for name, view in noisy.items()}})
     return denoised, LowLight(views, denoised, noisy, time.perf_counter() - begin)
 
 
