@@ -8,8 +8,8 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 
 from arraygeom.camera import Camera
 from arraygeom.rig import Rig
@@ -32,7 +32,7 @@ class RenderError(RuntimeError):
         self.crashed = crashed
 
 
-class Worker:
+class Worker(AbstractContextManager["Worker"]):
     """A process that renders one scene after another (`python -m pat.synthesis.blender.worker`).
 
     It starts with the first scene and anew after a crash. Use it as a context manager, or `close` it.
@@ -42,12 +42,7 @@ class Worker:
         self._process: subprocess.Popen[str] | None = None
         self._log = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115
 
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     @property

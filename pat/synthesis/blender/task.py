@@ -60,7 +60,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
     refuse_inside(scene, rig, planned)
-    with _staged(out) as folder, _studio(scene, settings) as studio:
+    with _staged(out) as folder, _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
         first: dict[str, RenderedFrame] = {}
         for shot in planned:
@@ -189,12 +189,6 @@ def _staged(out: Path) -> Iterator[Path]:
         folder.rename(out)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _studio(scene: Scene, settings: RenderSettings) -> Iterator[Studio]:
-    with _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
-        yield studio
 
 
 @contextmanager
