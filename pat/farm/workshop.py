@@ -10,10 +10,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 from ..support.jobs import JobError
@@ -76,7 +75,7 @@ class SceneOutcome:
     reason: str = ""
 
 
-class Workshop:
+class Workshop(AbstractContextManager["Workshop"]):
     """Makes scenes one after another with a process that it starts, watches and replaces."""
 
     def __init__(self, order: Order, stopping: Callable[[], bool] = lambda: False):
@@ -86,12 +85,7 @@ class Workshop:
         self._made = self._lost_at_start = 0
         self._unread = b""
 
-    def __enter__(self) -> Workshop:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
