@@ -25,6 +25,11 @@ class RigBatch:
     far: Float[Tensor, " b"]
 
 
+def in_frame_of(alpha: Camera, camera: Camera) -> Camera:
+    """The camera with alpha's frame as the world."""
+    return camera.replace(cam_from_world=camera.cam_from_world @ alpha.cam_from_world.inverse())
+
+
 def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator) -> RigBatch:
     """`batch` rigs, alpha's images being of height and width `hw`, alpha's frame being the world."""
     near = log_uniform(rigs.near, (batch,), generator)

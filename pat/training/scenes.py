@@ -23,7 +23,7 @@ from pat.data.windows import RenderedView, pinhole_of, read_view, scene_folders,
 from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
-from pat.synthesis.rigs import scaled
+from pat.synthesis.rigs import in_frame_of, scaled
 
 T = TypeVar("T")
 ACTIVE = 8
@@ -190,14 +190,8 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
-    alpha_from_world = [one[0].camera.cam_from_world for one in drawn]
     cameras = [
-        stack(
-            [
-                v.camera.replace(cam_from_world=v.camera.cam_from_world @ a.inverse())
-                for v, a in zip(same, alpha_from_world)
-            ]
-        ).to(device, torch.float32)
+        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(device, torch.float32)
         for same in views
     ]
     return ArrayBatch(images, depth, cameras, bounds(depth[0]))
