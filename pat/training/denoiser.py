@@ -27,7 +27,8 @@ from pat.synthesis.photos import PhotoBank
 
 from .checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from .losses import image_loss
-from .noisy_scenes import NoisyScenes, noise_levels, noisy
+from .noisy_scenes import NoisyScenes, flipped, noise_levels, noisy
+from .scenes import below
 
 AVERAGE = 300
 """Time constant, in steps, of the weight average that is saved."""
@@ -128,13 +129,11 @@ def windows(bank: PhotoBank, count: int, side: int, g: Generator) -> Tensor:
     """Square parts of photographs (count, 3, side, side), some reduced, darkened, flipped and transposed."""
     found = []
     for _ in range(count):
-        texture, level = (int(torch.randint(n, (), generator=g)) for n in (len(bank), 2))
+        texture, level = (below(n, g) for n in (len(bank), 2))
         w, h = bank.wh[texture, level].tolist()
-        x, y = (int(torch.randint(max(n - side, 0) + 1, (), generator=g)) for n in (w, h))
+        x, y = (below(max(n - side, 0) + 1, g) for n in (w, h))
         flips, gain = torch.randint(2, (3,), generator=g).tolist(), float(torch.rand((), generator=g))
-        image = bank.window(texture, level, (x, y), side)
-        image = image.flip([axis for axis in (1, 2) if flips[axis - 1]])
-        image = image.mT if flips[2] else image
+        image = flipped(bank.window(texture, level, (x, y), side), flips)
         found.append(image * min(0.4 + 1.2 * gain, 1.0))
     return torch.stack(found)
 
