@@ -24,11 +24,11 @@ from pat.networks.weights import load_denoiser, load_weights, save_weights
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rigs import below
 
 from .checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from .losses import image_loss
 from .noisy_scenes import NoisyScenes, flipped, noise_levels, noisy
-from .scenes import below
 
 AVERAGE = 300
 """Time constant, in steps, of the weight average that is saved."""

@@ -31,10 +31,11 @@ from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rigs import below
 
 from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
-from .scenes import RenderedCrops, below
+from .scenes import RenderedCrops
 from .spectra import MOST, Spectra
 from .stereo import PairCrops
 

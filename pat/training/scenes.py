@@ -23,7 +23,7 @@ from pat.data.windows import RenderedView, pinhole_of, read_view, scene_folders,
 from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
-from pat.synthesis.rigs import in_frame_of, scaled
+from pat.synthesis.rigs import below, in_frame_of, one_of, scaled
 
 T = TypeVar("T")
 ACTIVE = 8
@@ -133,10 +133,11 @@ def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
 
 def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
-    cameras = {name: rig[name] for name in rig.names}
-    sizes = {name: pinhole_of(c).hw for name, c in cameras.items() if isinstance(c, Camera)}
-    if len(sizes) < max(len(cameras), 2):
-        raise ValueError(f"{folder}: has {len(sizes)} calibrated cameras of {len(cameras)}: all must be, two at least")
+    sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
+    if len(sizes) < max(len(rig.names), 2):
+        raise ValueError(
+            f"{folder}: has {len(sizes)} calibrated cameras of {len(rig.names)}: all must be, two at least"
+        )
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
@@ -195,13 +196,3 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
         for same in views
     ]
     return ArrayBatch(images, depth, cameras, bounds(depth[0]))
-
-
-def one_of(items: Sequence[T], g: Generator) -> T:
-    """One of several, all equally likely."""
-    return items[below(len(items), g)]
-
-
-def below(count: int, g: Generator) -> int:
-    """A whole number from 0 to `count` - 1."""
-    return int(torch.randint(count, (), generator=g))
