@@ -135,8 +135,7 @@ def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> RenderedFrame:
         depth=lens.depth(depth, index),
         index=lens.nearest(index[None].float())[0].int(),
     )
-    further: dict[str, Any] = _further(studio, camera, lens, shot, optics, frame, colours, exact)
-    return dataclasses.replace(frame, **further)
+    return dataclasses.replace(frame, **_further(studio, camera, lens, shot, optics, frame, colours, exact))
 
 
 def _further(
@@ -148,7 +147,7 @@ def _further(
     frame: RenderedFrame,
     colours: dict[str, Tensor],
     exact: dict[str, Tensor],
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """The passes beyond colour, depth and index."""
     wanted, found = studio.settings.passes, {}
     if "normals" in wanted:
