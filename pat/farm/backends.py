@@ -41,7 +41,6 @@ class Renderer(Protocol):
 
     def render(self, seed: int, out: Path) -> SceneCheck:
         """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises ValueError."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)

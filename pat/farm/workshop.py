@@ -71,7 +71,6 @@ class SceneOutcome:
     state: State
     refusals: int = 0
     crashes: int = 0
-    seconds: float = 0.0
     reason: str = ""
 
 
@@ -97,7 +96,7 @@ class Workshop(AbstractContextManager["Workshop"]):
     def make(self, index: int) -> SceneOutcome:
         """Make a scene unless it is there. Raises JobError for what would happen to every scene."""
         folder, limits = self.order.folder, self.order.limits
-        started, crashes, kills, refusals, reason = time.monotonic(), 0, 0, 0, ""
+        crashes, kills, refusals, reason = 0, 0, 0, ""
         state: State = "there"
         while not folder.is_done(index):
             if self.stopping():
@@ -113,10 +112,7 @@ class Workshop(AbstractContextManager["Workshop"]):
                 folder.give_up(index, reason, self._log_end(), refusals=refusals, crashes=crashes, kills=kills)
                 state = "given up"
                 break
-        seconds = time.monotonic() - started
-        return SceneOutcome(
-            index=index, state=state, refusals=refusals, crashes=crashes + kills, seconds=seconds, reason=reason
-        )
+        return SceneOutcome(index=index, state=state, refusals=refusals, crashes=crashes + kills, reason=reason)
 
     def _ask(self, index: int, attempt: int) -> dict[str, Any]:
         """One attempt. Raises JobError."""
