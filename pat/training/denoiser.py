@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -76,14 +77,14 @@ def train_denoiser(config: DenoiserTraining) -> Path:
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
         if config.steps[0]:
             single = nn.ModuleDict({"band": network.band, "colour": network.colour})
-            single.load_state_dict(
-                fit(config, "views", single, view_losses(config, bank, network), config.steps[0]).state_dict()
-            )
+            losses = partial(view_losses, config, bank, network)
+            single.load_state_dict(fit(config, "views", single, losses, config.steps[0]).state_dict())
             _save(network, config, config.out / VIEWS)
         network.eval().requires_grad_(False)
         network.fused.train().requires_grad_(True)
         scenes = NoisyScenes(bank, load_weights(config.fusion), network, config.seed)
-        fused = fit(config, "fused", network.fused, fused_losses(config, scenes, network), config.steps[1])
+        losses = partial(fused_losses, config, scenes, network)
+        fused = fit(config, "fused", network.fused, losses, config.steps[1])
         network.fused.load_state_dict(fused.state_dict())
         _save(network, config, config.out / FUSED)
     return config.out / FUSED
@@ -93,32 +94,26 @@ Losses = Callable[[int], Iterator[Tensor]]
 """The loss of each step from a given one on, computed when it is asked for."""
 
 
-def view_losses(config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork) -> Losses:
+def view_losses(config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int) -> Iterator[Tensor]:
     """Of the denoisers of single views, on photographs."""
-
-    def losses(start: int) -> Iterator[Tensor]:
-        for step in range(start, 2**62):
-            g = generator_for(config.seed, "views", step)
-            halves = windows(bank, config.batch, config.side, g).split(-(-config.batch // 2))
-            parts = [(d, x) for c in halves for d, x in ((network.band, luminance(c)), (network.colour, c))]
-            given = [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
-            with _autocast(config):
-                found = [image_loss(d(recorded, deviation), x) for d, x, recorded, deviation in given]
-            yield torch.stack(found).mean()
-
-    return losses
+    for step in range(start, 2**62):
+        g = generator_for(config.seed, "views", step)
+        halves = windows(bank, config.batch, config.side, g).split(-(-config.batch // 2))
+        parts = [(d, x) for c in halves for d, x in ((network.band, luminance(c)), (network.colour, c))]
+        given = [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
+        with _autocast(config):
+            found = [image_loss(d(recorded, deviation), x) for d, x, recorded, deviation in given]
+        yield torch.stack(found).mean()
 
 
-def fused_losses(config: DenoiserTraining, scenes: NoisyScenes, network: LowLightNetwork) -> Losses:
+def fused_losses(
+    config: DenoiserTraining, scenes: NoisyScenes, network: LowLightNetwork, start: int
+) -> Iterator[Tensor]:
     """Of the denoiser of the fused image, on layered scenes."""
-
-    def losses(start: int) -> Iterator[Tensor]:
-        for scene in scenes.steps(config.batch, config.side, start=start):
-            with _autocast(config):
-                image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
-            yield image_loss(image, scene.ground_truth)
-
-    return losses
+    for scene in scenes.steps(config.batch, config.side, start=start):
+        with _autocast(config):
+            image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
+        yield image_loss(image, scene.ground_truth)
 
 
 def _autocast(config: DenoiserTraining) -> torch.autocast:
