@@ -11,7 +11,6 @@ import tempfile
 from contextlib import AbstractContextManager
 from pathlib import Path
 
-from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from ...support.schema import to_document
@@ -66,7 +65,7 @@ class Worker(AbstractContextManager["Worker"]):
         with tempfile.TemporaryDirectory(prefix="pat-request-") as folder:
             request = Path(folder)
             scene.save(request / "scene.yaml")
-            _detached(rig).save(request / "rig.yaml")
+            rig.to("cpu").save(request / "rig.yaml")
             order = {"out": str(Path(out).absolute()), "settings": to_document(settings)}
             (request / "request.json").write_text(json.dumps(order), encoding="utf-8")
             answer = json.loads(self._ask(str(request), timeout))
@@ -118,10 +117,3 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings, timeo
     """
     with Worker() as worker:
         return worker.render(scene, rig, out, settings=settings, timeout=timeout)
-
-
-def _detached(rig: Rig) -> Rig:
-    """The rig without gradients, in float64 on the CPU."""
-    cameras = {name: camera.to("cpu") for name, camera in rig.cameras.items()}
-    assert all(isinstance(camera, Camera) for camera in cameras.values())
-    return rig.replace(cameras=cameras)

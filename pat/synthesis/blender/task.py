@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.camera import Camera, View
+from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from ...support.schema import to_document
@@ -108,9 +108,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
     """Raises ValueError if a camera is inside an object when it takes a frame."""
     for shot in planned:
-        camera = rig[shot.camera]
-        assert isinstance(camera, Camera)
-        centre = camera.centre.detach().cpu().double().numpy()
+        centre = rig[shot.camera].centre.detach().cpu().double().numpy()
         for item in scene.objects:
             if inside(item, centre, shot.time):
                 raise ValueError(
@@ -118,9 +116,8 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
                 )
 
 
-def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> RenderedFrame:
+def take(studio: Studio, camera: Camera, lens: Lens, shot: Shot) -> RenderedFrame:
     """One frame with the passes that the settings ask for. Raises ValueError if the camera sees nothing."""
-    assert isinstance(camera, Camera)
     settings = studio.settings
     optics = settings.optics.get(shot.camera, Optics())
     colours = studio.colours(lens.pinhole, shot.time, optics, "rgb")
