@@ -134,10 +134,9 @@ def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
 def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
     sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
-    if len(sizes) < max(len(rig.names), 2):
-        raise ValueError(
-            f"{folder}: has {len(sizes)} calibrated cameras of {len(rig.names)}: all must be, two at least"
-        )
+    count = len(rig.names)
+    if len(sizes) < max(count, 2):
+        raise ValueError(f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least")
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
