@@ -42,15 +42,22 @@ SLACK = 1e-3
 
 
 def sample(
-    image: Float[Tensor, "b c h w"], x: Real[Tensor, "k *n 2"], *, interpolation: Interpolation = "bilinear"
+    image: Float[Tensor, "b c h w"],
+    x: Real[Tensor, "k *n 2"],
+    *,
+    interpolation: Interpolation = "bilinear",
+    extended: bool = False,
 ) -> Sampled:
     """Images (B, C, H, W) at positions x (B, *n, 2), or (1, *n, 2) for the same positions in each, in pixels.
 
-    On the outer half pixel of the area the nearest pixels count. Outside it values are 0 and valid is False.
+    On the outer half pixel of the area the nearest pixels count. Outside it values are 0 and valid is False; or, if
+    `extended`, they are those of the nearest pixel, which are valid.
     """
     batch, hw = len(image), (image.shape[-2], image.shape[-1])
     dtype = torch.promote_types(image.dtype, floating(x).dtype)
     x = floating(x).expand(batch, *x.shape[1:])
+    if extended:
+        x = torch.minimum(x.clamp(min=0), x.new_tensor([hw[1] - 1, hw[0] - 1]))
     valid = on_image(x, hw)
     grid = to_grid(torch.where(valid[..., None], x, 0.0), hw).reshape(batch, 1, -1, 2)
     try:

@@ -226,9 +226,8 @@ class SystemsRun:
 
         out = writable(self.out or Path("out/systems") / self.name, folder=True)
         if self.recording is None:
-            further: dict[str, Any] = {"full": self.full, "photos": self.photos, "max_memory": self.max_memory}
-            further["scene"] = self.scene
-            result = run_system(self.name, out, weights=self.weights, say=say, **further)
+            same = ("full", "scene", "photos", "weights", "max_memory")
+            result = run_system(self.name, out, say=say, **{name: getattr(self, name) for name in same})
         elif self.name == "fast-slow":
             result = run_recorded(self.recording, out, weights=self.weights, say=say)
         else:
@@ -325,7 +324,6 @@ class Render:
         from ..farm.folders import Shard
         from ..farm.job import RenderConfig
         from ..farm.run import render
-        from .options import console
 
         summary = render(
             RenderConfig.load(self.config),
@@ -334,7 +332,7 @@ class Render:
             workers=self.workers,
             shard=Shard.parse(self.shard),
             scheduler=self.scheduler,
-            console=console(),
+            console=options.console(),
         )
         say(f"{self.out}: {summary}")
         if not summary.complete:

@@ -407,7 +407,6 @@ class Demo:
     weights: Weights = "mono-colour"
 
     def run(self) -> None:
-        """Write the images, and print the scores of alpha alone, the baseline and the fusion."""
         options.compile_at_once()
         from arraygeom.atomic import write_text
         from arraygeom.compiled import numba_loaded

@@ -134,7 +134,6 @@ class Info:
     """Print JSON instead of tables."""
 
     def run(self) -> None:
-        """Print the tables, or JSON."""
         from rich.console import Console
         from rich.table import Table
 
@@ -212,7 +211,6 @@ class Doctor:
     """Print JSON instead of text."""
 
     def run(self) -> None:
-        """Print the diagnosis, and write the repaired rig if a mistake is found."""
         from arraygeom.atomic import write_text
         from calib.images.doctor import diagnose
 
@@ -263,7 +261,6 @@ class Refine:
     """Write the refined rig in spite of objections."""
 
     def run(self) -> None:
-        """Print what was found, and write the refined rig if it is accepted."""
         from arraygeom.atomic import write_text
         from arraygeom.io.native import write
         from calib.images.refinement import refine

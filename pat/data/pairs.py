@@ -11,12 +11,14 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pat.media.images import read_image
+
+T = TypeVar("T")
 
 
 class Disparity(NamedTuple):
@@ -91,18 +93,14 @@ def middlebury_pairs(root: str | Path) -> Iterator[StereoPair]:
     and 4.
     """
     root = _folder(root)
-    scenes = _middlebury_scenes(root)
-    if not scenes:
-        raise _no_pair(root)
+    scenes = _some(_middlebury_scenes(root), root)
     return (_middlebury_pair(root, left, layout) for left, layout in scenes)
 
 
 def folder_pairs(root: str | Path, *, max_disparity: float = PAPER_DISPARITY) -> Iterator[StereoPair]:
     """Every (near-)rectified pair under `root` whose names follow one of `LEFT_AND_RIGHT`, such as KITTI's."""
     root = _folder(root)
-    files = _named(root)
-    if not files:
-        raise _no_pair(root)
+    files = _some(_named(root), root)
     return (
         StereoPair(_pair_name(root, left), read_image(left), read_image(right), max_disparity) for left, right in files
     )
@@ -117,9 +115,7 @@ def pair_files(root: str | Path) -> list[PairFiles]:
     found = {left: PairFiles(left, right, PAPER_DISPARITY) for left, right in _named(root)}
     for left, layout in _middlebury_scenes(root):
         found[left] = PairFiles(left, left.with_name(layout.right), 255 / layout.scale)
-    if not found:
-        raise _no_pair(root)
-    return [found[left] for left in sorted(found)]
+    return [found[left] for left in _some(sorted(found), root)]
 
 
 def _folder(root: str | Path) -> Path:
@@ -129,8 +125,10 @@ def _folder(root: str | Path) -> Path:
     return root
 
 
-def _no_pair(root: Path) -> ValueError:
-    return ValueError(f"{root}: holds no stereo pair: check the folder and how its images are named")
+def _some(found: list[T], root: Path) -> list[T]:
+    if not found:
+        raise ValueError(f"{root}: holds no stereo pair: check the folder and how its images are named")
+    return found
 
 
 def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:

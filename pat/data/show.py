@@ -26,21 +26,16 @@ def draw_patches(patches: Sequence[Patch], *, field: ReceptiveField | None = Non
     figure = Figure(figsize=(3.2 * columns, (3.2 * h / w + 0.35) * len(patches)), layout="constrained")
     for row, patch in enumerate(patches):
         x = _pixels(patch.rig[patch.alpha].hw)
-        for column, (name, image) in enumerate(patch.images.items()):
+        further = ("ground truth", patch.ground_truth), ("depth", colour_depth(patch.depth))
+        for column, (name, image) in enumerate([*patch.images.items(), *further]):
             axes = figure.add_subplot(len(patches), columns, row * columns + column + 1)
-            show_image(axes, patch.rig[name].hw, image.expand(3, -1, -1).clamp(0, 1))
+            show_image(axes, (image.shape[-2], image.shape[-1]), image.expand(3, -1, -1).clamp(0, 1))
             axes.set_title(f"{name} (alpha)" if column == 0 else name, fontsize=8)
             if column == 0:
                 axes.scatter(*numpy(x).T, c=COLOURS[: len(x)], s=18, edgecolors="white", linewidths=0.6)
-            else:
+            elif column < len(patch.images):
                 pair = patch.rig.pair(patch.alpha, name)
                 draw_sampling_locations(axes, field or recorded_field(pair), pair, x)
-        for column, (title, image) in enumerate(
-            {"ground truth": patch.ground_truth, "depth": colour_depth(patch.depth)}.items()
-        ):
-            axes = figure.add_subplot(len(patches), columns, row * columns + columns - 1 + column)
-            show_image(axes, (image.shape[-2], image.shape[-1]), image)
-            axes.set_title(title, fontsize=8)
     return figure
 
 

@@ -17,6 +17,7 @@ from torch.nn.functional import interpolate
 from arraygeom import Camera, Rig
 from arraygeom.viz import COLOURS, calibrated, frustum, frustum_size, interactive_rig
 
+from ..media.colour import to_bytes
 from .pixel import BetaReport, ExplorerState
 from .theme import NEUTRAL
 
@@ -124,10 +125,10 @@ def bare_figure(**options: Any) -> Any:
     return drawn
 
 
-def draw_cross(drawn: Any, source: ColumnDataSource, *, colour: str = "yellow", size: int = 16) -> None:
+def draw_cross(drawn: Any, source: ColumnDataSource, *, size: int = 16) -> None:
     """A cross with a dark rim."""
     drawn.scatter("x", "y", source=source, marker="cross", size=size + 2, color="black", line_width=4)
-    drawn.scatter("x", "y", source=source, marker="cross", size=size, color=colour, line_width=2)
+    drawn.scatter("x", "y", source=source, marker="cross", size=size, color="yellow", line_width=2)
 
 
 def draw_segment(drawn: Any, source: ColumnDataSource, colour: str) -> None:
@@ -171,9 +172,8 @@ def rgba(image: Float[Tensor, "c h w"]) -> np.ndarray:
     if shrink < 1:
         image = interpolate(image[None], scale_factor=shrink, mode="bilinear", antialias=True)[0]
     colours = image if image.shape[0] == 3 else image.mean(0, keepdim=True).expand(3, -1, -1)
-    opaque = torch.cat([colours.clamp(0, 1), torch.ones_like(colours[:1])])
-    bytes_ = (255 * opaque).round().to(torch.uint8).permute(1, 2, 0).contiguous().numpy()
-    return bytes_.view(np.uint32)[..., 0]
+    opaque = torch.cat([colours, torch.ones_like(colours[:1])])
+    return np.ascontiguousarray(to_bytes(opaque).transpose(1, 2, 0)).view(np.uint32)[..., 0]
 
 
 def space(rig: Rig, alpha: str) -> dict[str, Any]:

@@ -304,9 +304,7 @@ def window_features(
     guide: Float[Tensor, "1 1 h w"], x: Float[Tensor, "l 2"], steps: Float[Tensor, "k 2"]
 ) -> Float[Tensor, "l k"]:
     """The window's values around each point, mean 0 and length 1; 0 where it is flat."""
-    h, w = guide.shape[-2:]
-    points = (x[:, None] + steps).clamp(min=0).minimum(x.new_tensor([w - 1, h - 1]))
-    values = sampled(guide, points)[0]
+    values = sampled(guide, x[:, None] + steps, extended=True)[0]
     values = values - values.mean(-1, keepdim=True)
     length = values.norm(dim=-1, keepdim=True)
     return torch.where(length > FLAT, values / torch.where(length > FLAT, length, 1.0), 0.0)
@@ -343,9 +341,9 @@ def joint_depth(betas: Mapping[str, BetaReport]) -> float:
     return total / inverse if inverse > 0 else math.nan
 
 
-def sampled(image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"]) -> Float[Tensor, "c *l"]:
+def sampled(image: Float[Tensor, "1 c h w"], x: Float[Tensor, "*l 2"], extended: bool = False) -> Float[Tensor, "c *l"]:
     """The image's values at positions, in their precision; the image is not copied."""
-    return sample(image, x[None].to(image)).values[0].to(x)
+    return sample(image, x[None].to(image), extended=extended).values[0].to(x)
 
 
 def fused_colour(scene: ExplorerScene, betas: Mapping[str, BetaReport], state: ExplorerState) -> Float[Tensor, "c"]:

@@ -29,7 +29,7 @@ from pat.synthesis.patterns import patterns
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rendered import RENDER_FILE, RenderedFrame, frame_file, save_frame
 from pat.synthesis.rig_distribution import RigDistribution
-from pat.synthesis.rigs import RigBatch
+from pat.synthesis.rigs import RigBatch, in_frame_of
 
 FARTHEST = 50.0
 """Layered scenes of rigs that see to infinity end at this many times the near bound."""
@@ -41,7 +41,6 @@ class Renderer(Protocol):
 
     def render(self, seed: int, out: Path) -> SceneCheck:
         """Render the scene of a seed into the folder `out`, which it makes, and check it. Raises ValueError."""
-        ...
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,8 +156,7 @@ def rig_from_alpha(rig: Rig) -> RigBatch:
     near, far = (float(d) for d in rig.depth)
     far = min(far, FARTHEST * near)
     cameras = [c.to(torch.float64) for c in rig.cameras.values() if isinstance(c, Camera)]
-    world_from_alpha = cameras[0].cam_from_world.inverse()
-    seen = [stack([c.replace(cam_from_world=c.cam_from_world @ world_from_alpha)]) for c in cameras]
+    seen = [stack([in_frame_of(cameras[0], c)]) for c in cameras]
     return RigBatch(seen, torch.tensor([near], dtype=torch.float64), torch.tensor([far], dtype=torch.float64))
 
 

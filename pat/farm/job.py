@@ -54,8 +54,6 @@ class RenderConfig:
         path = Path(path)
         try:
             return from_document(cls, read_yaml(path)).beside(path.absolute().parent)
-        except FileNotFoundError:
-            raise
         except ValueError as error:
             prefix = "" if str(error).startswith(str(path)) else f"{path}: "
             raise ValueError(f"{prefix}{error}") from None
@@ -96,11 +94,10 @@ class RenderConfig:
     def identity(self) -> dict[str, Any]:
         """All that the scenes depend on."""
         rig = load_yaml(self.rig.read_text(encoding="utf-8")) if self.rig.is_file() else str(self.rig)
-        settings = to_document(self.settings)
         return {
             "backend": self.backend,
             "seed": self.seed,
-            "settings": settings,
+            "settings": to_document(self.settings),
             "check": to_document(self.check),
             "rig": rig,
         }

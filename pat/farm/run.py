@@ -6,7 +6,6 @@ import time
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from rich.console import Console
 
@@ -92,13 +91,11 @@ def render(
             outcomes = local_pool(order, missing, workers)
         else:
             outcomes = dask_pool(order, missing, Workers(workers, scheduler))
-        shown: dict[str, Any] = {
-            "title": "scenes",
-            "done": len(wanted) - len(missing),
-            "console": console or Console(stderr=True),
-        }
+        console, done = console or Console(stderr=True), len(wanted) - len(missing)
         try:
-            for _ in followed(outcomes, total=len(wanted), status=summary.add, **shown):
+            for _ in followed(
+                outcomes, title="scenes", total=len(wanted), done=done, console=console, status=summary.add
+            ):
                 pass
         finally:
             with suppress(OSError):

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import errno
 import json
+import math
 import os
 import shutil
 import signal
@@ -20,6 +21,7 @@ import traceback
 from pathlib import Path
 from typing import Any
 
+from ..support.memory import resident
 from .folders import publish
 
 FACTS = "farm.json"
@@ -86,7 +88,7 @@ class _Server:
             "check": report.to_document(),
             "seconds": round(time.monotonic() - started[0], 3),
             "cpu_seconds": round(time.process_time() - started[1], 3),
-            "memory_mb": _resident_mb(),
+            "memory_mb": round((resident() or math.nan) / 1e6, 1),
             "process": os.getpid(),
         }
         (partial / FACTS).write_text(json.dumps(facts, indent=1), encoding="utf-8")
@@ -101,15 +103,6 @@ def _die_with_parent() -> None:
         ctypes.CDLL(None).prctl(pr_set_pdeathsig, signal.SIGKILL)
     if os.getppid() != int(os.environ.get("PAT_FARM_PARENT", os.getppid())):
         sys.exit(1)
-
-
-def _resident_mb() -> float:
-    """Memory that this process has now."""
-    try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return float("nan")
-    return round(pages * os.sysconf("SC_PAGE_SIZE") / 1e6, 1)
 
 
 def _line(error: BaseException) -> str:

@@ -10,10 +10,9 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 from ..support.jobs import JobError
@@ -72,11 +71,10 @@ class SceneOutcome:
     state: State
     refusals: int = 0
     crashes: int = 0
-    seconds: float = 0.0
     reason: str = ""
 
 
-class Workshop:
+class Workshop(AbstractContextManager["Workshop"]):
     """Makes scenes one after another with a process that it starts, watches and replaces."""
 
     def __init__(self, order: Order, stopping: Callable[[], bool] = lambda: False):
@@ -86,12 +84,7 @@ class Workshop:
         self._made = self._lost_at_start = 0
         self._unread = b""
 
-    def __enter__(self) -> Workshop:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -103,7 +96,7 @@ class Workshop:
     def make(self, index: int) -> SceneOutcome:
         """Make a scene unless it is there. Raises JobError for what would happen to every scene."""
         folder, limits = self.order.folder, self.order.limits
-        started, crashes, kills, refusals, reason = time.monotonic(), 0, 0, 0, ""
+        crashes, kills, refusals, reason = 0, 0, 0, ""
         state: State = "there"
         while not folder.is_done(index):
             if self.stopping():
@@ -119,10 +112,7 @@ class Workshop:
                 folder.give_up(index, reason, self._log_end(), refusals=refusals, crashes=crashes, kills=kills)
                 state = "given up"
                 break
-        seconds = time.monotonic() - started
-        return SceneOutcome(
-            index=index, state=state, refusals=refusals, crashes=crashes + kills, seconds=seconds, reason=reason
-        )
+        return SceneOutcome(index=index, state=state, refusals=refusals, crashes=crashes + kills, reason=reason)
 
     def _ask(self, index: int, attempt: int) -> dict[str, Any]:
         """One attempt. Raises JobError."""

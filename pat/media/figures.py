@@ -34,8 +34,7 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     for rows, found, seen in zip(colours.split(256, 1), inverse.split(256), known.split(256)):
         scaled = (256 / max(high - low, 1e-12) * (found - low)).int().clamp_(0, 255)
         which = torch.where(seen, scaled, 256).flatten()
-        for row, values in zip(rows, turbo):
-            row.copy_(values.index_select(0, which).view(row.shape))
+        rows.copy_(turbo.index_select(1, which).view(rows.shape))
     return colours
 
 

@@ -75,10 +75,7 @@ def read_image(
     label = f"{name}: {path}" if name else f"{path}"
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
-    if path.suffix.lower() in RAW_SUFFIXES:
-        content = _png_of_raw(path, label)
-    else:
-        content = path.read_bytes()
+    content = _png_of_raw(path, label) if path.suffix.lower() in RAW_SUFFIXES else path.read_bytes()
     if content[4:12] in _HEIF:
         content = _png_of_heif(path, label, hw)
     header = image_header(content)

@@ -106,8 +106,7 @@ def light_of(sensor: Sensor, like: Sensor) -> float:
 
 def _light(sensor: Sensor, like: Sensor) -> tuple[float, float, float]:
     """Factors of linear red, green and blue; a grey image takes the middle one."""
-    both = sensor.exposure is not None and like.exposure is not None
-    exposure = like.exposure / sensor.exposure if both and like.exposure and sensor.exposure else 1.0
+    exposure = like.exposure / sensor.exposure if like.exposure and sensor.exposure else 1.0
     wanted = _gains(like)[1]
     r, g, b = (exposure * wanted / gain for gain in _gains(sensor))
     return r, g, b

@@ -50,8 +50,7 @@ class OpticalImage:
 
 def _nearest_values(values: Tensor, A: Tensor, hw: HW) -> Tensor:
     old = map_homogeneous(torch.linalg.inv(A)[:2], pixel_grid(hw, dtype=values.dtype, device=values.device))
-    limits = old.new_tensor([values.shape[-1] - 1, values.shape[-2] - 1])
-    return sample(values, torch.minimum(old.clamp(min=0), limits)[None], interpolation="nearest").values
+    return sample(values, old[None], interpolation="nearest", extended=True).values
 
 
 def _rotated(motion: Tensor, A: Tensor) -> Tensor:

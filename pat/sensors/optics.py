@@ -152,11 +152,8 @@ class MotionBlur(LitStep):
         steps = max(math.ceil(2 * float(path.detach().norm(dim=-1).max())), 1)
         times = (torch.arange(steps, dtype=path.dtype) + 0.5) / steps - 0.5
         grid = pixel_grid(light.hw, dtype=path.dtype, device=path.device)
-        limits = grid.new_tensor([light.hw[1] - 1, light.hw[0] - 1])
-        frames = (
-            sample(light.image, torch.minimum((grid - t * path).clamp(min=0), limits)).values for t in times.tolist()
-        )
-        return replace(light, image=torch.stack(list(frames)).mean(0))
+        frames = [sample(light.image, grid - t * path, extended=True).values for t in times.tolist()]
+        return replace(light, image=torch.stack(frames).mean(0))
 
     def _motion(self, light: OpticalImage) -> Tensor:
         if self.velocity is not None:

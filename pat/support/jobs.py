@@ -65,13 +65,9 @@ class JobReport:
                 files.append(outcome.makes)
 
     def __str__(self) -> str:
-        parts = [f"{len(self.made)} made"]
-        parts += [f"{len(self.kept)} there already"] if self.kept else []
-        parts += [f"{len(self.failed)} failed"] if self.failed else []
-        parts += [f"{len({file for files in self.warned.values() for file in files})} with warnings"] * bool(
-            self.warned
-        )
-        return ", ".join(parts)
+        warned = {file for files in self.warned.values() for file in files}
+        further = {"there already": self.kept, "failed": self.failed, "with warnings": warned}
+        return ", ".join([f"{len(self.made)} made", *(f"{len(n)} {what}" for what, n in further.items() if n)])
 
 
 class JobError(ValueError):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any
@@ -168,26 +168,22 @@ def _camera(rig: Rig, name: str) -> Camera:
     return camera
 
 
-def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> list[str]:
-    found = []
+def _view_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:
     if figures["dark"] > limits.dark:
-        found.append(f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})")
+        yield f"{name}: {figures['dark']:.0%} of the image is black (at most {limits.dark:.0%})"
     if figures["bright"] > limits.bright:
-        found.append(f"{name}: {figures['bright']:.0%} of the image is saturated (at most {limits.bright:.0%})")
+        yield f"{name}: {figures['bright']:.0%} of the image is saturated (at most {limits.bright:.0%})"
     if figures["texture"] < limits.texture:
-        found.append(f"{name}: {figures['texture']:.0%} of the image has texture (at least {limits.texture:.0%})")
-    return found
+        yield f"{name}: {figures['texture']:.0%} of the image has texture (at least {limits.texture:.0%})"
 
 
-def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> list[str]:
-    found = []
+def _pair_reasons(name: str, figures: Mapping[str, float], limits: CheckLimits) -> Iterator[str]:
     if figures.get("p95", 0.0) > limits.error:
-        found.append(f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})")
+        yield f"{name}: depth misses pixels by {figures['p95']:.3f} (at most {limits.error:g})"
     if figures.get("shift", 0.0) > limits.shift:
-        found.append(f"{name}: colours are displaced by {figures['shift']:.2f} pixels (at most {limits.shift:g})")
+        yield f"{name}: colours are displaced by {figures['shift']:.2f} pixels (at most {limits.shift:g})"
     if figures["contradicted"] > limits.contradicted:
-        found.append(f"{name}: {figures['contradicted']:.1%} of the points are seen through")
-    return found
+        yield f"{name}: {figures['contradicted']:.1%} of the points are seen through"
 
 
 def _overlap_reasons(pairs: Mapping[str, Mapping[str, float]], names: set[str], limits: CheckLimits) -> list[str]:

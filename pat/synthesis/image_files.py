@@ -63,9 +63,8 @@ def write_light(path: Path, image: Float[Tensor, "c h w"], *, bits: int = 8) -> 
     .exr stays linear and multiplied by coverage; .png and .jpg are sRGB-encoded, and .png holds colours that are not
     multiplied by coverage.
     """
-    linear = path.suffix == ".exr"
     coverage = image[3:] if len(image) == 4 else None
-    if linear:
+    if path.suffix == ".exr":
         return write_image(path, image[:3], bits=32, coverage=coverage)
     colours = image if coverage is None else image[:3] / coverage.clamp(min=1e-6)
     write_image(path, srgb_image(colours), bits=bits, coverage=coverage)

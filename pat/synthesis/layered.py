@@ -17,7 +17,7 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom.camera import Camera
 from arraygeom.homography import plane_homography
-from arraygeom.pixels import HW
+from arraygeom.pixels import HW, pixel_grid, to_homogeneous
 from arraygeom.pose import Pose
 from arraygeom.sampling import sample
 
@@ -114,7 +114,8 @@ class LayeredScenes:
         """Inverse depth and opacity (B, L, N) of every layer at every pixel."""
         B, L = layers.present.shape
         H = layers.outline_from_plane @ plane_from_camera(layers, camera)
-        homogeneous = self._pixels(camera.hw) @ H.float().to(self.device).mT
+        pixels = to_homogeneous(pixel_grid(camera.hw, device=self.device)).flatten(0, 1)
+        homogeneous = pixels @ H.float().to(self.device).mT
         q = homogeneous[..., 2].contiguous()
         in_front = (q > 1e-6) & layers.present.to(self.device)[..., None]
         q.masked_fill_(~in_front, 1.0)
@@ -158,10 +159,6 @@ class LayeredScenes:
         r, g, b = self.photos.lookup(texture, torch.stack([u, v], -1), level)
         p = paint.unbind(2)
         return (p[0] * r[:, None] + p[1] * g[:, None] + p[2] * b[:, None] + p[3]).mT.clamp(0, 1)
-
-    def _pixels(self, hw: HW) -> Tensor:
-        y, x = torch.meshgrid(*(torch.arange(n, device=self.device).float() for n in hw), indexing="ij")
-        return torch.stack([x, y, torch.ones_like(x)], -1).flatten(0, 1)
 
 
 _CHUNK = 1 << 16

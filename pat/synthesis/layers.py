@@ -9,8 +9,10 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Generator, Tensor
+from torch.nn.functional import normalize
 
 from arraygeom.camera import Camera
+from arraygeom.pixels import to_homogeneous
 from arraygeom.pose import Pose, matvec
 
 from ..media.colour import REC601
@@ -97,17 +99,12 @@ def _randn(shape: tuple[int, ...], g: Generator) -> Tensor:
 
 
 def _tilted(normal: tuple[float, float, float], by: float, count: int, g: Generator) -> Tensor:
-    return _unit(torch.tensor(normal, dtype=torch.float64) + by * _randn((count, 3), g))
-
-
-def _unit(v: Tensor) -> Tensor:
-    return v / v.norm(dim=-1, keepdim=True)
+    return normalize(torch.tensor(normal, dtype=torch.float64) + by * _randn((count, 3), g), dim=-1)
 
 
 def _rays(camera: Camera, pixel: Tensor) -> Tensor:
     """(x, y, 1) in the camera's frame of pixels (B, L, 2)."""
-    homogeneous = torch.cat([pixel, torch.ones_like(pixel[..., :1])], -1)
-    return homogeneous @ torch.linalg.inv(camera.K).mT
+    return to_homogeneous(pixel) @ torch.linalg.inv(camera.K).mT
 
 
 def _anchors(alpha: Camera, shape: tuple[int, int], g: Generator) -> Tensor:
@@ -171,7 +168,7 @@ def _roles(shape: tuple[int, int], g: Generator) -> tuple[Tensor, Tensor]:
 def _painters(normal: Tensor) -> Tensor:
     """Rotations `plane_from_world` with rows e1, e2, normal; e2 points where the plane recedes fastest."""
     forward = torch.tensor([0.0, 0, 1], dtype=torch.float64)
-    e2 = _unit(forward - normal[..., 2:] * normal)
+    e2 = normalize(forward - normal[..., 2:] * normal, dim=-1)
     return torch.stack([torch.linalg.cross(e2, normal), e2, normal], -2)
 
 

@@ -99,8 +99,7 @@ def _fence(rng: np.random.Generator) -> np.ndarray:
 
 def _branches(rng: np.random.Generator) -> np.ndarray:
     mask = np.zeros((_FINE, _FINE), np.uint8)
-    start = np.array([0.0, 0.95])
-    _grow(mask, rng, start, -np.pi / 2 + rng.normal(0, 0.2), 0.6, 20)
+    _grow(mask, rng, np.array([0.0, 0.95]), -np.pi / 2 + rng.normal(0, 0.2), 0.6, 20)
     return mask
 
 

@@ -57,9 +57,13 @@ class PhotoBank:
         on later ones; it is not checked against the folders. `choose` selects images by number, to hold
         some out. Raises ValueError where no image is found.
         """
-        images = _cached(cache) if cache and Path(cache).exists() else read_photographs(folders, max_edge)
-        if cache and not Path(cache).exists():
-            np.savez(cache, *images)
+        if cache and Path(cache).exists():
+            with np.load(cache) as archive:
+                images = list(archive.values())
+        else:
+            images = read_photographs(folders, max_edge)
+            if cache:
+                np.savez(cache, *images)
         images = [p for i, p in enumerate(images) if choose(i)]
         rng = np.random.default_rng(seed)
         extra = patterns(rng, 48) + recoloured(images, rng, 48)
@@ -132,11 +136,6 @@ def read_photographs(folders: tuple[str | Path, ...], max_edge: int) -> list[np.
     if not images:
         raise ValueError(f"no image found under {', '.join(map(str, folders)) or 'no folder'}")
     return images
-
-
-def _cached(path: str | Path) -> list[np.ndarray]:
-    with np.load(path) as archive:
-        return list(archive.values())
 
 
 def _decoded(path: Path) -> np.ndarray | None:

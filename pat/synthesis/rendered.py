@@ -6,7 +6,6 @@ one `<camera>-<frame>.npz` for every frame of every camera, with the arrays of `
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import re
@@ -95,12 +94,11 @@ _MOST = 6e4
 def save_frame(path: Path, frame: RenderedFrame) -> None:
     """Write the arrays of a frame, synced to disk."""
     arrays: dict[str, NDArray] = {}
-    for field in dataclasses.fields(frame):
-        value = getattr(frame, field.name)
+    for name, value in vars(frame).items():
         if isinstance(value, Tensor):
-            kind = _STORED.get(field.name, np.float32)
+            kind = _STORED.get(name, np.float32)
             array = value.numpy()
-            arrays[field.name] = (np.minimum(array, _MOST) if kind == np.float16 else array).astype(kind)
+            arrays[name] = (np.minimum(array, _MOST) if kind == np.float16 else array).astype(kind)
     with path.open("wb") as file:
         np.savez_compressed(file, **arrays)  # type: ignore[arg-type]
         file.flush()

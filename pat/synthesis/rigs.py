@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float
@@ -15,6 +17,8 @@ from arraygeom.pose import Pose, rotation_from_vector
 
 from .rig_distribution import Range, RigDistribution
 
+T = TypeVar("T")
+
 
 @dataclass(frozen=True)
 class RigBatch:
@@ -23,6 +27,11 @@ class RigBatch:
     cameras: list[Camera]
     near: Float[Tensor, " b"]
     far: Float[Tensor, " b"]
+
+
+def in_frame_of(alpha: Camera, camera: Camera) -> Camera:
+    """The camera with alpha's frame as the world."""
+    return camera.replace(cam_from_world=camera.cam_from_world @ alpha.cam_from_world.inverse())
 
 
 def random_rigs(rigs: RigDistribution, batch: int, hw: HW, generator: Generator) -> RigBatch:
@@ -50,21 +59,17 @@ def _baseline(rigs: RigDistribution, alpha: Camera, near: Tensor, g: Generator) 
     return log_uniform(rigs.parallax, near.shape, g) * near / alpha.K[:, 0, 0]
 
 
-def _resolution(rigs: RigDistribution, g: Generator) -> float:
-    return rigs.resolutions[int(torch.randint(len(rigs.resolutions), (), generator=g))]
-
-
 def _rectified_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
     drawn = torch.randint(2, near.shape, generator=g) * 2 - 1
     side = {"left": torch.ones_like(drawn), "right": -torch.ones_like(drawn), "either": drawn}[rigs.alpha]
     t = torch.zeros_like(alpha.t)
     t[:, 0] = -side * _baseline(rigs, alpha, near, g)
-    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, _resolution(rigs, g)))
+    return alpha.replace(cam_from_world=Pose(alpha.R, t)).resize(scaled(alpha.hw, one_of(rigs.resolutions, g)))
 
 
 def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tensor, g: Generator) -> Camera:
     """Placed anywhere around alpha; the principal point puts what alpha sees in the middle of the image."""
-    batch, resolution = len(near), _resolution(rigs, g)
+    batch, resolution = len(near), one_of(rigs.resolutions, g)
     hw = scaled(alpha.hw, resolution)
     centre = _baseline(rigs, alpha, near, g)[:, None] * _direction(batch, g)
     depth = 1 / torch.lerp(1 / far, 1 / near, uniform((0, 1), (batch,), g))
@@ -86,6 +91,16 @@ def _general_beta(rigs: RigDistribution, alpha: Camera, near: Tensor, far: Tenso
 def scaled(hw: HW, s: float) -> HW:
     """The size s times as large, rounded."""
     return round(hw[0] * s), round(hw[1] * s)
+
+
+def one_of(items: Sequence[T], generator: Generator) -> T:
+    """One of several, all equally likely."""
+    return items[below(len(items), generator)]
+
+
+def below(count: int, generator: Generator) -> int:
+    """A whole number from 0 to `count` - 1."""
+    return int(torch.randint(count, (), generator=generator))
 
 
 def uniform(bounds: Range, shape: tuple[int, ...], generator: Generator) -> Tensor:

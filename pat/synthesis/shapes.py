@@ -57,7 +57,9 @@ def mesh(item: Object) -> Mesh:
     parts = [_part(s, extent, item.relief) for s in surfaces]
     if item.relief is None:
         return _joined([_welded(p, extent) if s.weld else p for p, s in zip(parts, surfaces)])
-    return _with_relief(_welded(_joined(parts), extent), item.relief)
+    flat = _welded(_joined(parts), extent)
+    bumps = item.relief.height * _noise(flat.vertices / item.relief.size, item.relief.seed)
+    return flat._replace(vertices=flat.vertices + bumps[:, None] * _normals(flat))
 
 
 def inside(item: Object, point: Float[NDArray, "3"], time: float) -> bool:
@@ -105,8 +107,7 @@ def _lengths(points: NDArray) -> tuple[float, float]:
 def _welded(loose: Mesh, extent: NDArray) -> Mesh:
     """Corners that coincide made one, and faces without area gone."""
     _, first, new = np.unique(np.round(loose.vertices / extent, 6), axis=0, return_index=True, return_inverse=True)
-    faces, uv = new.reshape(-1)[loose.faces], loose.uv
-    faces, uv = _triangles_last(faces, uv)
+    faces, uv = _triangles_last(new.reshape(-1)[loose.faces], loose.uv)
     keep = np.array([len(set(f)) >= 3 for f in faces.tolist()])
     return Mesh(loose.vertices[first], faces[keep], uv[keep])
 
@@ -118,11 +119,6 @@ def _triangles_last(faces: NDArray, uv: NDArray) -> tuple[NDArray, NDArray]:
         rows = np.flatnonzero(faces[:, i] == faces[:, i + 1])
         faces[rows], uv[rows] = np.roll(faces[rows], 2 - i, axis=1), np.roll(uv[rows], 2 - i, axis=1)
     return faces, uv
-
-
-def _with_relief(flat: Mesh, relief: Relief) -> Mesh:
-    bumps = relief.height * _noise(flat.vertices / relief.size, relief.seed)
-    return flat._replace(vertices=flat.vertices + bumps[:, None] * _normals(flat))
 
 
 def _normals(surface: Mesh) -> NDArray:

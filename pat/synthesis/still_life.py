@@ -18,8 +18,8 @@ from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from .furnish import seeded, vec
-from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain, wood
-from .room import FLOOR, furniture
+from .props import arranged, ball, box, first_camera, lathed, moved, on_path, paint, plain
+from .room import BRASS, FLOOR, OAK, SHELF, WALNUT, furniture
 from .scene import Key, Light, Material, Motion, Object, Paint, Scene, Texture, Vec3, World
 
 VIEW = 1.4
@@ -59,8 +59,6 @@ _LIGHTS = (
 # Surfaces -------------------------------------------------------------------------------------------------------
 
 
-_OAK = wood((0.21, 0.10, 0.042), (0.36, 0.19, 0.085), 14.0)
-_WALNUT = wood((0.07, 0.035, 0.018), (0.13, 0.066, 0.034), 18.0)
 _PLASTER = Material(
     texture=Texture(kind="noise", paints=(paint(0.40, 0.43, 0.36), paint(0.47, 0.50, 0.42)), scale=7.0, grain=0.05),
     roughness=0.95,
@@ -74,19 +72,16 @@ _CLOTH = Material(
 
 # What is in the room --------------------------------------------------------------------------------------------
 
-SHELF = 1.15
-"""Depth of the bookshelf's front."""
-
 
 def _furniture() -> Iterator[Object]:
-    yield box("table", (0, 0.02, 0.28), (2.3, 0.04, 1.0), _OAK)
+    yield box("table", (0, 0.02, 0.28), (2.3, 0.04, 1.0), OAK)
     yield box("runner", (0.05, -0.002, 0.26), (0.62, 0.004, 0.62), _CLOTH, yaw=12)
     yield box("wall", (0, -0.9, SHELF + 0.34), (8, 4.5, 0.04), _PLASTER)
-    yield box("floor", (0, 0.78, 0.0), (8, 0.04, 4), _WALNUT)
+    yield box("floor", (0, 0.78, 0.0), (8, 0.04, 4), WALNUT)
     for i, y in enumerate((-1.12, -0.70, -0.28, 0.14)):
-        yield box(f"board{i}", (-0.02, y, SHELF + 0.15), (2.4, 0.025, 0.3), _WALNUT)
+        yield box(f"board{i}", (-0.02, y, SHELF + 0.15), (2.4, 0.025, 0.3), WALNUT)
     for i, x in enumerate((-1.22, 0.35, 1.18)):
-        yield box(f"side{i}", (x, -0.5, SHELF + 0.15), (0.025, 1.5, 0.3), _WALNUT)
+        yield box(f"side{i}", (x, -0.5, SHELF + 0.15), (0.025, 1.5, 0.3), WALNUT)
     yield box("back", (-0.02, -0.5, SHELF + 0.31), (2.4, 1.5, 0.01), plain(0.11, 0.075, 0.05, roughness=0.8))
 
 
@@ -213,12 +208,11 @@ def _throw(duration: float) -> list[tuple[float, Vec3]]:
 
 
 def _lamp() -> Iterator[Object]:
-    brass = plain(0.55, 0.36, 0.12, roughness=0.25, metallic=1.0)
     shade = Material(texture=Texture(paints=(paint(0.85, 0.62, 0.36),)), roughness=0.9, specular=0.1, emission=0.62)
     bulb = Material(texture=Texture(paints=(Paint(LAMPLIGHT, 1.0),)), emission=BULB)
     x, z = 0.62, 0.42
     yield lathed(
-        "lamp", (x, 0, z), [(0, 0.3), (0.008, 0.3), (0.008, 0.03), (0.03, 0.02), (0.08, 0.012), (0.08, 0)], brass
+        "lamp", (x, 0, z), [(0, 0.3), (0.008, 0.3), (0.008, 0.03), (0.03, 0.02), (0.08, 0.012), (0.08, 0)], BRASS
     )
     rim = [(0.072, 0.2), (0.074, 0.2), (0.14, 0.002), (0.142, 0.0), (0.138, 0.002)]
     yield lathed("shade", (x, -0.33, z), rim, shade)

@@ -17,7 +17,7 @@ from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.layers import Layers, draw_layers
 from pat.synthesis.photos import PhotoBank
 from pat.synthesis.rig_distribution import RigDistribution
-from pat.synthesis.rigs import RigBatch
+from pat.synthesis.rigs import RigBatch, in_frame_of
 
 RenderedView = tuple[Float[Tensor, "1 3 h w"], Float[Tensor, "h w"]]
 
@@ -56,8 +56,7 @@ class SystemScene(LayeredScenes):
         camera, alpha = self.rig[name], self.rig[self.alpha]
         if not (isinstance(camera, Camera) and isinstance(alpha, Camera)):
             raise ValueError(f"'{name}' is not calibrated: a scene is rendered for calibrated cameras")
-        pose = camera.cam_from_world @ alpha.cam_from_world.inverse()
-        return stack([camera.replace(cam_from_world=pose, distortion=None)])
+        return stack([in_frame_of(alpha, camera).replace(distortion=None)])
 
     @torch.no_grad()
     def seen(self, name: str, layers: Layers | None = None) -> RenderedView:

@@ -244,7 +244,7 @@ def _still(job: SystemRun) -> tuple[list[str], Panels]:
         merged_frame = merged(frame, rig, images, alpha)
         rows["fusion, exposures merged"] = merged_frame.image
         extra = [
-            *_ranges(rig, recording, images, frame, merged_frame, alpha),
+            *_ranges(rig, recording, images, frame, merged_frame),
             *_permuted(load_weights(job.weights), read, images, alpha, frame),
         ]
         write_image(out / "merged.tif", linear_from_srgb(merged_frame.image.clamp(min=0)), bits=32)
@@ -352,7 +352,7 @@ def _confidence_line(frame: Frame, ground_truth: Tensor) -> list[str]:
 
 
 def _ranges(
-    rig: Rig, recording: SystemRecording, images: Mapping[str, Tensor], frame: Frame, joint: Frame, alpha: str
+    rig: Rig, recording: SystemRecording, images: Mapping[str, Tensor], frame: Frame, joint: Frame
 ) -> list[str]:
     """A table of the range of light that each image measures with an error of at most a quarter."""
     measured = {name: (linear_from_srgb(images[name])[0], recording.light[name][0]) for name in rig.names}

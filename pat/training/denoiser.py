@@ -10,6 +10,7 @@ import json
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -24,10 +25,11 @@ from pat.networks.weights import load_denoiser, load_weights, save_weights
 from pat.sensors import generator_for
 from pat.support.locks import folder_lock
 from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rigs import below
 
 from .checkpoints import collect, newest_checkpoint, restore, write_checkpoint
 from .losses import image_loss
-from .noisy_scenes import NoisyScenes, noise_levels, noisy
+from .noisy_scenes import NoisyScenes, flipped, noise_levels, noisy
 
 AVERAGE = 300
 """Time constant, in steps, of the weight average that is saved."""
@@ -75,14 +77,14 @@ def train_denoiser(config: DenoiserTraining) -> Path:
         bank = PhotoBank.load(*config.photos, cache=config.cache, seed=config.seed)
         if config.steps[0]:
             single = nn.ModuleDict({"band": network.band, "colour": network.colour})
-            single.load_state_dict(
-                fit(config, "views", single, view_losses(config, bank, network), config.steps[0]).state_dict()
-            )
+            losses = partial(view_losses, config, bank, network)
+            single.load_state_dict(fit(config, "views", single, losses, config.steps[0]).state_dict())
             _save(network, config, config.out / VIEWS)
         network.eval().requires_grad_(False)
         network.fused.train().requires_grad_(True)
         scenes = NoisyScenes(bank, load_weights(config.fusion), network, config.seed)
-        fused = fit(config, "fused", network.fused, fused_losses(config, scenes, network), config.steps[1])
+        losses = partial(fused_losses, config, scenes, network)
+        fused = fit(config, "fused", network.fused, losses, config.steps[1])
         network.fused.load_state_dict(fused.state_dict())
         _save(network, config, config.out / FUSED)
     return config.out / FUSED
@@ -92,32 +94,26 @@ Losses = Callable[[int], Iterator[Tensor]]
 """The loss of each step from a given one on, computed when it is asked for."""
 
 
-def view_losses(config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork) -> Losses:
+def view_losses(config: DenoiserTraining, bank: PhotoBank, network: LowLightNetwork, start: int) -> Iterator[Tensor]:
     """Of the denoisers of single views, on photographs."""
-
-    def losses(start: int) -> Iterator[Tensor]:
-        for step in range(start, 2**62):
-            g = generator_for(config.seed, "views", step)
-            halves = windows(bank, config.batch, config.side, g).split(-(-config.batch // 2))
-            parts = [(d, x) for c in halves for d, x in ((network.band, luminance(c)), (network.colour, c))]
-            given = [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
-            with _autocast(config):
-                found = [image_loss(d(recorded, deviation), x) for d, x, recorded, deviation in given]
-            yield torch.stack(found).mean()
-
-    return losses
+    for step in range(start, 2**62):
+        g = generator_for(config.seed, "views", step)
+        halves = windows(bank, config.batch, config.side, g).split(-(-config.batch // 2))
+        parts = [(d, x) for c in halves for d, x in ((network.band, luminance(c)), (network.colour, c))]
+        given = [(d, x, *noisy(x, noise_levels(len(x), g), g)) for d, x in parts]
+        with _autocast(config):
+            found = [image_loss(d(recorded, deviation), x) for d, x, recorded, deviation in given]
+        yield torch.stack(found).mean()
 
 
-def fused_losses(config: DenoiserTraining, scenes: NoisyScenes, network: LowLightNetwork) -> Losses:
+def fused_losses(
+    config: DenoiserTraining, scenes: NoisyScenes, network: LowLightNetwork, start: int
+) -> Iterator[Tensor]:
     """Of the denoiser of the fused image, on layered scenes."""
-
-    def losses(start: int) -> Iterator[Tensor]:
-        for scene in scenes.steps(config.batch, config.side, start=start):
-            with _autocast(config):
-                image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
-            yield image_loss(image, scene.ground_truth)
-
-    return losses
+    for scene in scenes.steps(config.batch, config.side, start=start):
+        with _autocast(config):
+            image = network(scene.image, scene.alpha, scene.beta, scene.confidence)
+        yield image_loss(image, scene.ground_truth)
 
 
 def _autocast(config: DenoiserTraining) -> torch.autocast:
@@ -128,13 +124,11 @@ def windows(bank: PhotoBank, count: int, side: int, g: Generator) -> Tensor:
     """Square parts of photographs (count, 3, side, side), some reduced, darkened, flipped and transposed."""
     found = []
     for _ in range(count):
-        texture, level = (int(torch.randint(n, (), generator=g)) for n in (len(bank), 2))
+        texture, level = (below(n, g) for n in (len(bank), 2))
         w, h = bank.wh[texture, level].tolist()
-        x, y = (int(torch.randint(max(n - side, 0) + 1, (), generator=g)) for n in (w, h))
+        x, y = (below(max(n - side, 0) + 1, g) for n in (w, h))
         flips, gain = torch.randint(2, (3,), generator=g).tolist(), float(torch.rand((), generator=g))
-        image = bank.window(texture, level, (x, y), side)
-        image = image.flip([axis for axis in (1, 2) if flips[axis - 1]])
-        image = image.mT if flips[2] else image
+        image = flipped(bank.window(texture, level, (x, y), side), flips)
         found.append(image * min(0.4 + 1.2 * gain, 1.0))
     return torch.stack(found)
 

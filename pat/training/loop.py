@@ -56,7 +56,8 @@ def train(config: TrainConfig, *, field: ReceptiveField | None = None) -> Path:
         try:
             run.work()
         finally:
-            run.watch.close()
+            if run.watch:
+                run.watch.close()
         here.wait()
     return config.out / BEST
 
@@ -82,7 +83,7 @@ class Run:
         self.began = time.monotonic() - 60 * minutes
         if here.first:
             save_config(config, config.out / "config.yaml")
-        self.watch = Watch(config if here.first else None, step=self.step)
+        self.watch = Watch(config, step=self.step) if here.first else None
         for part in convolutions(self.network):
             if config.precision == "bfloat16":
                 in_bfloat16(part)
@@ -109,7 +110,7 @@ class Run:
             self._advance(given, done)
             if self.step % self.config.validate == 0 or done >= 1:
                 self._validate()
-            elif self.step < self.config.validate and self.step >= EARLY and self.step & (self.step - 1) == 0:
+            elif self.watch and EARLY <= self.step < self.config.validate and self.step & (self.step - 1) == 0:
                 self.watch.show(self.averaged, self.validation, self.step)
             if self.step % self.config.save == 0 or done >= 1:
                 self._save(done=done >= 1)
@@ -133,7 +134,8 @@ class Run:
         self.loss = float(loss)
         now = time.monotonic()
         speed, self.ticked = config.batch * config.groups / (now - self.ticked), now
-        self.watch.step(self.step, self.loss, float(norm), rate, done=done, speed=speed)
+        if self.watch:
+            self.watch.step(self.step, self.loss, float(norm), rate, done=done, speed=speed)
 
     def _backward(self, given: Sample, *, last: bool) -> Tensor:
         """Add the gradients of one group to the others'; processes exchange them with the last."""
@@ -145,7 +147,7 @@ class Run:
 
     def _validate(self) -> None:
         """Measure, show, and keep the weights if they are the best so far."""
-        if not self.here.first:
+        if self.watch is None:
             return
         facts = validation(self.averaged, self.validation)
         facts |= {"step": self.step, "loss": self.loss, "minutes": self._minutes()}
@@ -157,7 +159,7 @@ class Run:
             save_weights(self.averaged, self.config.out / BEST, facts=recipe)
 
     def _save(self, *, done: bool) -> None:
-        if self.here.first:
+        if self.watch:
             self.watch.flush()
             facts = {"step": self.step, "best": self.best, "minutes": self._minutes(), "done": done}
             state = collect(self.network, self.adam, self.average, facts | {"recipe": config_text(self.config)})

@@ -9,6 +9,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Generator, Tensor, nn
 
 from arraygeom import Epipolar, sample
@@ -20,6 +21,7 @@ from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import NoiseLevel, generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rigs import below, one_of
 
 from .config import GENERAL, RECTIFIED
 from .samples import enlarged, pair_of
@@ -59,7 +61,7 @@ class NoisyScene(NamedTuple):
 
 def noise_levels(count: int, g: Generator) -> NoiseLevel:
     """Random levels: 15 to 3,000 electrons at white and up to 5 of read noise, or 1 to 60 of 255 at any value."""
-    draw, light = torch.rand(4, count, 1, 1, 1, generator=g), bool(torch.randint(2, (), generator=g))
+    draw, light = torch.rand(4, count, 1, 1, 1, generator=g), bool(below(2, g))
     electrons, constant = 15 * 200 ** draw[0], (draw[2] < 0.3) & (not light)
     shot = torch.where(constant, 0.0, 1 / electrons)
     read = torch.where(constant, 60 ** draw[3] / 255, 5 * draw[1].square() / electrons)
@@ -94,11 +96,11 @@ class NoisyScenes:
     def group(self, number: int) -> Tensor:
         """One group of scenes, stacked, in half precision."""
         g = generator_for(self.seed, "scenes", number)
-        scene = self.makers[int(torch.randint(2, (), generator=g))].sample(TOGETHER, g)
+        scene = one_of(self.makers, g).sample(TOGETHER, g)
         dark = (0.4 + 1.2 * torch.rand(TOGETHER, 1, 1, 1, generator=g)).clamp(max=1.0)
         ideal, other = (dark * image for image in scene.images)
         level = noise_levels(TOGETHER, g)
-        second = level if int(torch.randint(2, (), generator=g)) else noise_levels(TOGETHER, g)
+        second = level if below(2, g) else noise_levels(TOGETHER, g)
         alpha = _view(self.denoiser.band, luminance(ideal), level, g)
         beta = NoisyView(*(enlarged(part, HW) for part in _view(self.denoiser.colour, other, second, g)))
         field = FieldOnGrid.of(Epipolar(), pair_of(scene, 1, g))
@@ -114,13 +116,17 @@ def windows_of(groups: Sequence[Tensor], batch: int, side: int, g: Generator) ->
     """Random square parts of scenes, flipped and transposed."""
     found = []
     for _ in range(batch):
-        scenes = groups[int(torch.randint(len(groups), (), generator=g))]
-        i, y, x = (int(torch.randint(n, (), generator=g)) for n in (len(scenes), HW[0] - side + 1, HW[1] - side + 1))
+        scenes = one_of(groups, g)
+        i, y, x = (below(n, g) for n in (len(scenes), HW[0] - side + 1, HW[1] - side + 1))
         flips = torch.randint(2, (3,), generator=g).tolist()
-        part = scenes[i, :, y : y + side, x : x + side].float()
-        part = part.flip([axis for axis in (1, 2) if flips[axis - 1]])
-        found.append(part.mT if flips[2] else part)
+        found.append(flipped(scenes[i, :, y : y + side, x : x + side].float(), flips))
     return NoisyScene.of_stacked(torch.stack(found))
+
+
+def flipped(image: Float[Tensor, "c n n"], flips: Sequence[int]) -> Float[Tensor, "c n n"]:
+    """A square image upside down, left to right and transposed, each where its number is not 0."""
+    image = image.flip([axis for axis in (1, 2) if flips[axis - 1]])
+    return image.mT if flips[2] else image
 
 
 def _view(denoiser: nn.Module, ideal: Tensor, level: NoiseLevel, g: Generator) -> NoisyView:

@@ -31,6 +31,7 @@ from pat.networks.protocol import FusionNetwork, Inputs
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
+from pat.synthesis.rigs import below
 
 from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
@@ -249,7 +250,7 @@ def _banded(scene: ArrayBatch, g: Generator, spectral: float) -> list[Tensor]:
     """The scene's images, with this probability in other bands than red, green and blue."""
     if spectral == 0 or not _chance(spectral, g):
         return scene.images
-    count = 1 + int(torch.randint(MOST, (), generator=g)) if len(scene.images) == 2 else len(scene.images) - 1
+    count = 1 + below(MOST, g) if len(scene.images) == 2 else len(scene.images) - 1
     spectra = Spectra.drawn(len(scene.images[0]), count, g)
     return [spectra.of(image) for image in scene.images]
 

@@ -23,7 +23,7 @@ from pat.data.windows import RenderedView, pinhole_of, read_view, scene_folders,
 from pat.media.colour import srgb_image
 from pat.sensors import generator_for
 from pat.synthesis.layered import ArrayBatch
-from pat.synthesis.rigs import scaled
+from pat.synthesis.rigs import below, in_frame_of, one_of, scaled
 
 T = TypeVar("T")
 ACTIVE = 8
@@ -133,10 +133,10 @@ def chosen(found: list[T], choose: Callable[[int], bool], what: str) -> list[T]:
 
 def large_enough(folder: Path, rig: Rig, hw: HW) -> list[str]:
     """The cameras of a scene that can be alpha. Raises ValueError if none can, or there is no other."""
-    cameras = {name: rig[name] for name in rig.names}
-    sizes = {name: pinhole_of(c).hw for name, c in cameras.items() if isinstance(c, Camera)}
-    if len(sizes) < max(len(cameras), 2):
-        raise ValueError(f"{folder}: has {len(sizes)} calibrated cameras of {len(cameras)}: all must be, two at least")
+    sizes = {name: pinhole_of(c).hw for name, c in rig.cameras.items() if isinstance(c, Camera)}
+    count = len(rig.names)
+    if len(sizes) < max(count, 2):
+        raise ValueError(f"{folder}: has {len(sizes)} calibrated cameras of {count}: all must be, two at least")
     names = [name for name, size in sizes.items() if size[0] >= hw[0] and size[1] >= hw[1]]
     if not names:
         listed = ", ".join(f"{name} {w}x{h}" for name, (h, w) in sizes.items())
@@ -190,24 +190,8 @@ def batched(drawn: Sequence[Sequence[RenderedView]], device: str) -> ArrayBatch:
     views = list(zip(*drawn))
     images = [srgb_image(torch.stack([v.rgb for v in same])).to(device) for same in views]
     depth = [torch.stack([v.depth for v in same]).to(device) for same in views]
-    alpha_from_world = [one[0].camera.cam_from_world for one in drawn]
     cameras = [
-        stack(
-            [
-                v.camera.replace(cam_from_world=v.camera.cam_from_world @ a.inverse())
-                for v, a in zip(same, alpha_from_world)
-            ]
-        ).to(device, torch.float32)
+        stack([in_frame_of(alpha.camera, v.camera) for alpha, v in zip(views[0], same)]).to(device, torch.float32)
         for same in views
     ]
     return ArrayBatch(images, depth, cameras, bounds(depth[0]))
-
-
-def one_of(items: Sequence[T], g: Generator) -> T:
-    """One of several, all equally likely."""
-    return items[below(len(items), g)]
-
-
-def below(count: int, g: Generator) -> int:
-    """A whole number from 0 to `count` - 1."""
-    return int(torch.randint(count, (), generator=g))

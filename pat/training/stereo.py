@@ -22,8 +22,9 @@ from pat.data.pairs import PairFiles, pair_files
 from pat.data.windows import reduced
 from pat.media.images import read_image
 from pat.synthesis.layered import ArrayBatch
+from pat.synthesis.rigs import below, one_of
 
-from .scenes import ACTIVE, Crops, active_items, below, chosen, one_of
+from .scenes import ACTIVE, Crops, active_items, chosen
 
 REDUCED = 2
 """The largest reduction of a window: images found online are often less sharp than their pixels."""

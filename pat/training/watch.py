@@ -27,16 +27,13 @@ HEADER = "step,loss,gradient,rate\n"
 
 
 class Watch:
-    """Progress reports of the first process; in others `Watch(None, ...)` does nothing.
+    """Progress reports, of the first process alone.
 
     `steps.csv` has a line for each step and `log.jsonl` one for each validation. Lines of steps after
     `step`, where the run continues, are removed.
     """
 
-    def __init__(self, config: TrainConfig | None, *, step: int = 0) -> None:
-        self.config = config
-        if config is None:
-            return
+    def __init__(self, config: TrainConfig, *, step: int = 0) -> None:
         self.out = config.out
         self.board = _board(config.out / "tensorboard") if config.tensorboard else None
         _keep_lines(self.out / "steps.csv", step, lambda line: int(line.partition(",")[0]), header=HEADER)
@@ -57,8 +54,6 @@ class Watch:
 
     def step(self, step: int, loss: float, norm: float, rate: float, *, done: float, speed: float) -> None:
         """Report one step; `done` is the completed fraction of the run, `speed` in scenes a second."""
-        if self.config is None:
-            return
         self.steps.write(f"{step},{loss!r},{norm!r},{rate!r}\n")
         self.bar.update(self.task, completed=min(done, 1.0), step=step, loss=loss, speed=speed)
         if self.board and step % 10 == 0:
@@ -67,8 +62,6 @@ class Watch:
 
     def validated(self, facts: Mapping[str, float]) -> None:
         """Report a validation."""
-        if self.config is None:
-            return
         line = json.dumps({k: round(v, 4) for k, v in facts.items()})
         self.bar.console.print(line, highlight=False) if not self.bar.disable else print(line, flush=True)
         self.flush()
@@ -80,8 +73,6 @@ class Watch:
 
     def show(self, network: nn.Module, samples: list[Sample], step: int) -> None:
         """Images of the validation: beta, alpha, fused, ground truth, confidence, side by side."""
-        if self.config is None:
-            return
         sheet = contact_sheet(network, samples[:SHOWN])
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
         if self.board:
@@ -89,13 +80,10 @@ class Watch:
 
     def flush(self) -> None:
         """Flush the files."""
-        if self.config is not None:
-            self.steps.flush()
+        self.steps.flush()
 
     def close(self) -> None:
         """Close bar and files."""
-        if self.config is None:
-            return
         self.bar.stop()
         self.steps.close()
         if self.board:

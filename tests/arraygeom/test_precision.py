@@ -216,6 +216,13 @@ def test_samples_outside_an_image_are_zero_whatever_its_first_pixel():
     assert found.values.tolist() == [[[0.0, 1.0], [0.0, 1.0]]]
 
 
+def test_extended_samples_are_those_of_the_nearest_pixel():
+    image = torch.arange(20.0).reshape(1, 1, 4, 5)
+    found = sample(image, torch.tensor([[[-9.0, -3.0], [1.5, 70.0], [99.0, 2.0], [2.0, 1.0]]]), extended=True)
+    assert found.values.flatten().tolist() == [0.0, 16.5, 14.0, 7.0]
+    assert found.valid.all()
+
+
 def test_intrinsics_keep_the_gradient():
     focal, centre = torch.nn.Parameter(torch.tensor(500.0)), torch.tensor([3.0, 4.0], requires_grad=True)
     K = intrinsics(focal, (480, 640), centre)

@@ -18,7 +18,6 @@ from . import compat
 Spectrum = Literal["rgb", "nir"]
 
 _STEPS = {"voronoi", "brick", "checker"}
-_MIRRORED = "MIRROR"
 
 
 @dataclass(frozen=True)
@@ -132,16 +131,24 @@ class _Nodes:
             socket.default_value = value
 
     def vector(self, operation: str, *values: Any) -> Any:
-        node = self.new("VectorMath", operation=operation)
+        return self._computed("VectorMath", operation, values)
+
+    def number(self, operation: str, *values: Any) -> Any:
+        return self._computed("Math", operation, values)
+
+    def _computed(self, kind: str, operation: str, values: tuple[Any, ...]) -> Any:
+        node = self.new(kind, operation=operation)
         for socket, value in zip(node.inputs, values):
             self.give(socket, value)
         return node.outputs[0]
 
-    def number(self, operation: str, *values: Any) -> Any:
-        node = self.new("Math", operation=operation)
-        for socket, value in zip(node.inputs, values):
-            self.give(socket, value)
-        return node.outputs[0]
+    def texture(self, kind: str, coordinates: Any, **inputs: Any) -> Any:
+        """A texture at these coordinates, with values of further inputs."""
+        node = self.new(f"Tex{kind}")
+        self.give(node.inputs["Vector"], coordinates)
+        for name, value in inputs.items():
+            node.inputs[name].default_value = value
+        return node
 
 
 def _material(bpy: Any, thing: Object, stage: BuiltScene, scratch: Path) -> Any:
@@ -213,10 +220,7 @@ def _coordinates(nodes: _Nodes, texture: Texture, source: str = "Object", scale:
 def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
     if not texture.grain:
         return paint
-    noise = nodes.new("TexNoise")
-    nodes.give(noise.inputs["Vector"], _coordinates(nodes, texture, scale=4.0))
-    noise.inputs["Scale"].default_value = 1.0
-    noise.inputs["Detail"].default_value = 3.0
+    noise = nodes.texture("Noise", _coordinates(nodes, texture, scale=4.0), Scale=1.0, Detail=3.0)
     grain = nodes.number("MULTIPLY_ADD", compat.factor(noise), 3 * texture.grain, 1 - 1.5 * texture.grain)
     node = nodes.new("VectorMath", operation="SCALE")
     nodes.give(node.inputs[0], paint)
@@ -226,10 +230,7 @@ def _grained(nodes: _Nodes, texture: Texture, paint: Any) -> Any:
 
 def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Texture], Any]:
     def make(nodes: _Nodes, texture: Texture) -> Any:
-        node = nodes.new(f"Tex{kind}")
-        nodes.give(node.inputs["Vector"], _coordinates(nodes, texture))
-        for name, value in inputs.items():
-            node.inputs[name].default_value = value
+        node = nodes.texture(kind, _coordinates(nodes, texture), **inputs)
         if "Distortion" in node.inputs and texture.distortion:
             node.inputs["Distortion"].default_value = texture.distortion
         return compat.factor(node)
@@ -238,21 +239,15 @@ def _pattern(kind: str, **inputs: float) -> Callable[[_Nodes, Texture], Any]:
 
 
 def _voronoi(nodes: _Nodes, texture: Texture) -> Any:
-    node = nodes.new("TexVoronoi")
-    nodes.give(node.inputs["Vector"], _coordinates(nodes, texture))
-    node.inputs["Scale"].default_value = 1.0
+    node = nodes.texture("Voronoi", _coordinates(nodes, texture), Scale=1.0)
     split = nodes.new("SeparateXYZ")
     nodes.give(split.inputs[0], node.outputs["Color"])
     return split.outputs[0]
 
 
 def _brick(nodes: _Nodes, texture: Texture) -> Any:
-    node = nodes.new("TexBrick")
-    nodes.give(node.inputs["Vector"], _coordinates(nodes, texture, "UV"))
-    greys = {"Color1": 0.0, "Color2": 0.7, "Mortar": 1.0}
-    for name, grey in greys.items():
-        node.inputs[name].default_value = (grey, grey, grey, 1.0)
-    node.inputs["Scale"].default_value = 0.5
+    greys = {"Color1": (0.0, 0.0, 0.0, 1.0), "Color2": (0.7, 0.7, 0.7, 1.0), "Mortar": (1.0, 1.0, 1.0, 1.0)}
+    node = nodes.texture("Brick", _coordinates(nodes, texture, "UV"), **greys, Scale=0.5)
     return node.outputs["Color"]
 
 
@@ -275,7 +270,7 @@ _PATTERNS: dict[TextureKind, Callable[[_Nodes, Texture], Any]] = {
 
 def _image(bpy: Any, nodes: _Nodes, texture: Texture, stage: BuiltScene, scratch: Path) -> Any:
     image = _loaded(bpy, texture, scratch)
-    node = nodes.new("TexImage", image=image, extension=_MIRRORED)
+    node = nodes.new("TexImage", image=image, extension="MIRROR")
     (w, h), (left, top) = _laid(image.size, texture)
     onto = (1 / w, -1 / h, 0), (left / w + texture.offset[0], 1 - top / h + texture.offset[1], 0)
     nodes.give(node.inputs["Vector"], nodes.vector("MULTIPLY_ADD", nodes.new("TexCoord").outputs["UV"], *onto))

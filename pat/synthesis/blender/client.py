@@ -8,10 +8,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+from contextlib import AbstractContextManager
 from pathlib import Path
-from types import TracebackType
 
-from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from ...support.schema import to_document
@@ -32,7 +31,7 @@ class RenderError(RuntimeError):
         self.crashed = crashed
 
 
-class Worker:
+class Worker(AbstractContextManager["Worker"]):
     """A process that renders one scene after another (`python -m pat.synthesis.blender.worker`).
 
     It starts with the first scene and anew after a crash. Use it as a context manager, or `close` it.
@@ -42,12 +41,7 @@ class Worker:
         self._process: subprocess.Popen[str] | None = None
         self._log = tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace")  # noqa: SIM115
 
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     @property
@@ -71,7 +65,7 @@ class Worker:
         with tempfile.TemporaryDirectory(prefix="pat-request-") as folder:
             request = Path(folder)
             scene.save(request / "scene.yaml")
-            _detached(rig).save(request / "rig.yaml")
+            rig.to("cpu").save(request / "rig.yaml")
             order = {"out": str(Path(out).absolute()), "settings": to_document(settings)}
             (request / "request.json").write_text(json.dumps(order), encoding="utf-8")
             answer = json.loads(self._ask(str(request), timeout))
@@ -123,10 +117,3 @@ def render(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings, timeo
     """
     with Worker() as worker:
         return worker.render(scene, rig, out, settings=settings, timeout=timeout)
-
-
-def _detached(rig: Rig) -> Rig:
-    """The rig without gradients, in float64 on the CPU."""
-    cameras = {name: camera.to("cpu") for name, camera in rig.cameras.items()}
-    assert all(isinstance(camera, Camera) for camera in cameras.values())
-    return rig.replace(cameras=cameras)

@@ -13,7 +13,7 @@ LIBRARIES = "libx11-6 libxrender1 libxfixes3 libxi6 libxkbcommon0 libsm6 libgl1"
 PYTHONS = "Python 3.11 (bpy 4.5 and 5.0) or 3.13 (5.1 and newer)"
 INSTALL = "pip install 'arraygeom-pat[synthesis]'"
 
-_PASSES = {"index": ("Object Index.X", "IndexOB.X")}
+_INDEX = "Object Index.X", "IndexOB.X"
 
 
 def load() -> Any:
@@ -83,7 +83,7 @@ def factor(node: Any) -> Any:
 
 def index_name(channels: Mapping[str, Any]) -> str:
     """The channel of the object index among those of a file."""
-    return next(name for name in _PASSES["index"] if name in channels)
+    return next(name for name in _INDEX if name in channels)
 
 
 def make_linear(item: Any) -> None:

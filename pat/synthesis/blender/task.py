@@ -20,7 +20,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom.camera import Camera, View
+from arraygeom.camera import Camera
 from arraygeom.rig import Rig
 
 from ...support.schema import to_document
@@ -60,7 +60,7 @@ def render_here(scene: Scene, rig: Rig, out: Path, *, settings: RenderSettings) 
     lenses = {name: lens_for(camera, name) for name, camera in rig.cameras.items()}
     planned = shots(rig, settings)
     refuse_inside(scene, rig, planned)
-    with _staged(out) as folder, _studio(scene, settings) as studio:
+    with _staged(out) as folder, _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
         files: dict[str, list[dict[str, Any]]] = {name: [] for name in rig.names}
         first: dict[str, RenderedFrame] = {}
         for shot in planned:
@@ -108,9 +108,7 @@ def shots(rig: Rig, settings: RenderSettings) -> list[Shot]:
 def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
     """Raises ValueError if a camera is inside an object when it takes a frame."""
     for shot in planned:
-        camera = rig[shot.camera]
-        assert isinstance(camera, Camera)
-        centre = camera.centre.detach().cpu().double().numpy()
+        centre = rig[shot.camera].centre.detach().cpu().double().numpy()
         for item in scene.objects:
             if inside(item, centre, shot.time):
                 raise ValueError(
@@ -118,9 +116,8 @@ def refuse_inside(scene: Scene, rig: Rig, planned: list[Shot]) -> None:
                 )
 
 
-def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> RenderedFrame:
+def take(studio: Studio, camera: Camera, lens: Lens, shot: Shot) -> RenderedFrame:
     """One frame with the passes that the settings ask for. Raises ValueError if the camera sees nothing."""
-    assert isinstance(camera, Camera)
     settings = studio.settings
     optics = settings.optics.get(shot.camera, Optics())
     colours = studio.colours(lens.pinhole, shot.time, optics, "rgb")
@@ -135,8 +132,7 @@ def take(studio: Studio, camera: View, lens: Lens, shot: Shot) -> RenderedFrame:
         depth=lens.depth(depth, index),
         index=lens.nearest(index[None].float())[0].int(),
     )
-    further: dict[str, Any] = _further(studio, camera, lens, shot, optics, frame, colours, exact)
-    return dataclasses.replace(frame, **further)
+    return dataclasses.replace(frame, **_further(studio, camera, lens, shot, optics, frame, colours, exact))
 
 
 def _further(
@@ -148,7 +144,7 @@ def _further(
     frame: RenderedFrame,
     colours: dict[str, Tensor],
     exact: dict[str, Tensor],
-) -> dict[str, Tensor]:
+) -> dict[str, Any]:
     """The passes beyond colour, depth and index."""
     wanted, found = studio.settings.passes, {}
     if "normals" in wanted:
@@ -189,12 +185,6 @@ def _staged(out: Path) -> Iterator[Path]:
         folder.rename(out)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-@contextmanager
-def _studio(scene: Scene, settings: RenderSettings) -> Iterator[Studio]:
-    with _scratch() as scratch, closing(Studio(scene, settings, scratch)) as studio:
-        yield studio
 
 
 @contextmanager
