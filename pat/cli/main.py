@@ -74,6 +74,8 @@ def _run(arguments: list[str], *, debug: bool) -> None:
         raise
     except (ValueError, OSError, FloatingPointError) as error:
         _fail(error, f"{error}", debug)
+    except ImportError as error:
+        _fail(error, f"{error}" if "pip install" in f"{error}" else f"{error}: pip install 'arraygeom-pat[all]'", debug)
     except MemoryError as error:
         _fail(error, "out of memory: give smaller images, or --max-memory where there is one", debug)
     except (RuntimeError, LookupError, ArithmeticError) as error:

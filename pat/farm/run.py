@@ -26,7 +26,8 @@ class RenderSummary:
     made: int = 0
     there: int = 0
     given_up: list[int] = field(default_factory=list)
-    stopped: int = 0
+    stopped: list[str] = field(default_factory=list)
+    """Why, for each scene that could not be tried to the end."""
     refusals: int = 0
     crashes: int = 0
     started: float = field(default_factory=time.monotonic)
@@ -37,11 +38,12 @@ class RenderSummary:
         self.seconds = time.monotonic() - self.started
         self.made += outcome.state == "done"
         self.there += outcome.state == "there"
-        self.stopped += outcome.state == "stopped"
         self.refusals += outcome.refusals
         self.crashes += outcome.crashes
         if outcome.state == "given up":
             self.given_up.append(outcome.index)
+        if outcome.state == "stopped":
+            self.stopped.append(outcome.reason)
         return f"{self.rate:.0f} an hour, {self.refusals} refused, {self.crashes} crashed"
 
     @property
@@ -60,6 +62,9 @@ class RenderSummary:
             extra.append(
                 f"given up: {', '.join(map(str, self.given_up[:10]))}{' ...' if len(self.given_up) > 10 else ''}"
             )
+        if self.stopped:
+            reason = next(filter(None, self.stopped), "")
+            extra.append(f"{len(self.stopped)} not made{f' ({reason})' * bool(reason)}: run the command again")
         return ", ".join([f"{self.made} scenes made, {self.there} were there", f"{self.rate:.0f} an hour", *extra])
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from pat.cli.fusing import Demo
 from pat.cli.main import Pat, command_paths, main
 from pat.cli.options import FIELD_NAMES, WEIGHT_NAMES, field_named
 from tests.pat.cli.test_cli import fails
@@ -79,6 +80,21 @@ def test_commands_that_do_not_exist(capsys):
     assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
     assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
     assert "known here: fuse, show" in fails(["--weights"], capsys)
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (ImportError("drawing needs matplotlib: pip install 'arraygeom-pat[plots]'"), "matplotlib: pip install"),
+        (ModuleNotFoundError("No module named 'dask'"), "No module named 'dask': pip install 'arraygeom-pat[all]'"),
+    ],
+)
+def test_a_package_that_is_not_installed_is_one_line(error, said, monkeypatch, capsys):
+    def fail(self):
+        raise error
+
+    monkeypatch.setattr(Demo, "run", fail)
+    assert said in fails(["demo"], capsys)
 
 
 def test_a_closed_pipe_is_quiet():

@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -232,8 +233,10 @@ def test_rigs_that_layers_cannot_show_are_refused():
 def test_the_summary_counts():
     summary = RenderSummary(there=3)
     for state, refusals in (("done", 2), ("done", 0), ("given up", 20), ("stopped", 0)):
-        summary.add(SceneOutcome(index=5, state=state, refusals=refusals, crashes=1))
+        outcome = SceneOutcome(index=5, state=state, refusals=refusals, crashes=1)
+        summary.add(replace(outcome, reason="its workers died: X") if state == "stopped" else outcome)
     assert not summary.complete
+    assert str(summary).endswith("given up: 5, 1 not made (its workers died: X): run the command again")
     assert str(summary).startswith("2 scenes made, 3 were there")
     assert "22 refused by the check, 4 crashed, given up: 5" in str(summary)
     assert Shard.parse("1/1") == Shard()
