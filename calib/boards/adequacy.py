@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Pose, rotation_from_vector
 
+from .board import Board
 from .bundle import BundleResult, readjusted
 from .camera_parameters import camera_jacobian, parameter_names
-from .target import Board
 from .validation import without_blocks
 
 GRID = 15, 20

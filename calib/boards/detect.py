@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from .board import Board, MarkedBoard, marker_dictionary
 from .corners import monomials, refine_corners
 from .known_points import KnownPoints
-from .target import AprilGrid, Board, Charuco, Chessboard, Circles, MarkedBoard, marker_dictionary
+from .target import AprilGrid, Charuco, Chessboard, Circles
 
 Grey = UInt8[np.ndarray, "h w"]
 

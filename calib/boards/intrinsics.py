@@ -14,9 +14,9 @@ from jaxtyping import Float
 from arraygeom import Camera, Distortion, Pose, intrinsics
 from arraygeom.pixels import HW
 
+from .board import Board
 from .detect import Detection
 from .photos import FrameKey
-from .target import Board
 
 Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"]
 COEFFICIENTS: dict[Lens, int] = {"brown-conrady": 5, "rational": 8, "thin-prism": 12, "tilted": 14}

@@ -10,12 +10,12 @@ from jaxtyping import Float
 
 from arraygeom import Pose
 
+from .board import Board
 from .bundle import BoardPoses, BundleProblem, Observations, readjusted
 from .camera_parameters import parameter_names
 from .intrinsics import BoardViews, Lens, board_pose
 from .photos import FrameKey
 from .rig import SingleCalibration, calibrate_single
-from .target import Board
 
 MODELS: tuple[Lens, ...] = ("none", "kannala-brandt", "brown-conrady", "rational", "thin-prism", "tilted")
 """By number of coefficients."""

@@ -12,10 +12,10 @@ import torch
 
 from arraygeom import Camera, Pose
 
+from .board import Board
 from .detect import Detection
 from .intrinsics import BoardViews, board_pose
 from .photos import FrameKey
-from .target import Board
 
 TOLERANCE = 0.03
 """A frame agrees with a pose if it predicts the board to this share of the image width: one view of a small board

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Pose, Rig
 
+from .board import Board
 from .bundle import BoardPoses, BundleProblem, BundleResult, Free, Observations, adjust, loss, noise
 from .camera_parameters import CameraPrior, intrinsic_values, parameter_names
 from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts, without_outliers
@@ -23,7 +24,6 @@ from .photos import FrameKey
 from .poses import CalibratedViews, InitialRig, initial_rig
 from .shape import LEAST_GAIN, BoardShape, described, fewest_frames, is_significant
 from .start import StartDeviations, rig_near_start, start_cameras, start_notes, start_prior
-from .target import Board
 from .validation import epipolar_errors, held_out_errors, misfit_notes, misfits
 
 SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"

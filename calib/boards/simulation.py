@@ -21,9 +21,9 @@ from arraygeom import Camera, Pose, Rig, pixel_grid, rotation_from_vector, stack
 from arraygeom.atomic import write_atomically
 from arraygeom.viz import calibrated
 
+from .board import Board
 from .printing import draw_board
 from .shape import BoardShape
-from .target import Board
 
 FILLS = (0.35, 0.9)
 """Least and largest width of the board, as a share of the narrowest view."""

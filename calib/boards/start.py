@@ -10,12 +10,12 @@ import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig
 
+from .board import Board
 from .bundle import BundleResult
 from .camera_parameters import CameraPrior, centre_derivatives, intrinsic_values
 from .intrinsics import COEFFICIENTS, BoardViews, Lens, board_pose
 from .observability import typical_prior
 from .poses import CalibratedViews, InitialRig, average_pose, consistent_boards, nearest_pose, symmetry_poses
-from .target import Board
 
 FAR_FROM_START = 4.0
 """Standard deviations from the start beyond which a camera is named."""
