@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from arraygeom import Pose
+from arraygeom import stack
 
 from .board import Board
 from .bundle import BoardPoses, BundleProblem, Observations, readjusted
@@ -90,7 +90,7 @@ def _frame_error(fit: SingleCalibration, key: FrameKey, views: BoardViews, board
     part = board.part[found.ids[:1]]
     problem = BundleProblem(
         {"": camera},
-        BoardPoses(Pose(pose.R[None], pose.t[None])),
+        BoardPoses(stack([pose])),
         {"": Observations(np.zeros(len(found.ids), dtype=int), board.points[found.ids], found.x)},
         shape=None if solved.shape is None else solved.shape.of_blocks(part),
     )

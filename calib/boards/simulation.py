@@ -50,7 +50,7 @@ def simulate_photos(
         (folder / name).mkdir(parents=True, exist_ok=True)
         rays = fine_rays(camera)
         for i in range(count):
-            pose = camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
+            pose = camera.cam_from_world @ boards[i]
             image = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
             png = cv2.imencode(".png", np.clip(image.round(), 0, 255).astype(np.uint8))[1]
             with write_atomically(folder / name / f"{i:03d}.png") as temporary:

@@ -73,10 +73,9 @@ def start_cameras(start: Rig, views: Mapping[str, BoardViews], lens: Mapping[str
             (h, w), (rows, columns) = camera.hw, v.hw
             raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
         if camera.distortion is None and lens[name] != "none":
-            model, count = (
-                ("brown-conrady", COEFFICIENTS[lens[name]]) if lens[name] in COEFFICIENTS else ("kannala-brandt", 4)
-            )
-            camera = camera.replace(distortion=Distortion(model, torch.zeros(count, dtype=torch.float64)))
+            model = "brown-conrady" if lens[name] in COEFFICIENTS else "kannala-brandt"
+            coefficients = torch.zeros(COEFFICIENTS.get(lens[name], 4), dtype=torch.float64)
+            camera = camera.replace(distortion=Distortion(model, coefficients))
         found[name] = camera.to(torch.float64)
     return found
 
