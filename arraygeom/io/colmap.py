@@ -261,7 +261,7 @@ def _rigs_binary(source: RigSource) -> list[Sensors]:
     return rigs
 
 
-PARTS: dict[str, tuple[Any, Any, Any]] = {
+PARTS = {
     ".txt": (_cameras_text, _images_text, _rigs_text),
     ".bin": (_cameras_binary, _images_binary, _rigs_binary),
 }
