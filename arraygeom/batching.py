@@ -137,10 +137,8 @@ def _stacked(values: list[Any], where: str) -> Any:
         return torch.stack(values)
     if isinstance(first, Batched):
         held = {f.name: [getattr(v, f.name) for v in values] for f in _fields(first)}
-        return dataclasses.replace(
-            first,
-            **{n: same[0] if n in LABELS else _stacked(same, f"{where}.{n}") for n, same in held.items()},  # type: ignore[type-var]
-        )
+        made = {n: same[0] if n in LABELS else _stacked(same, f"{where}.{n}") for n, same in held.items()}
+        return dataclasses.replace(first, **made)  # type: ignore[type-var]
     if isinstance(first, Mapping) and all(v.keys() == first.keys() for v in values):
         return {key: _stacked([v[key] for v in values], f"{where}[{key!r}]") for key in first}
     if isinstance(first, tuple) and any(isinstance(v, Tensor) for v in first):
@@ -152,7 +150,7 @@ def _stacked(values: list[Any], where: str) -> Any:
 
 
 def _named(value: Any) -> str:
-    return f"{', '.join(map(str, value))}" if isinstance(value, Mapping) else str(value)
+    return ", ".join(map(str, value)) if isinstance(value, Mapping) else str(value)
 
 
 def _equal(a: Any, b: Any) -> bool:

@@ -8,7 +8,7 @@ plotly.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import cycle, pairwise
 from statistics import fmean
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -50,7 +50,7 @@ def draw_rig(rig: Rig, *, alpha: str | None = None, size: float | None = None, t
     axes: Any = figure.add_subplot(projection="3d", proj_type="ortho")
     size = size or frustum_size(cameras)
     middle = fmean(float(camera.centre[0]) for camera in cameras.values())
-    for colour, (name, camera) in zip(_colours(), cameras.items()):
+    for colour, (name, camera) in zip(cycle(COLOURS), cameras.items()):
         for line in frustum(camera, size):
             axes.plot(*_upright(line), color=colour, lw=1.1)
         side = "right" if float(camera.centre[0]) <= middle else "left"
@@ -73,7 +73,7 @@ def interactive_rig(rig: Rig, *, alpha: str | None = None, size: float | None = 
     cameras = calibrated(rig)
     figure = go.Figure()
     size = size or frustum_size(cameras)
-    for colour, (name, camera) in zip(_colours(), cameras.items()):
+    for colour, (name, camera) in zip(cycle(COLOURS), cameras.items()):
         x, y, z = _upright(_joined(frustum(camera, size)))
         figure.add_scatter3d(x=x, y=y, z=z, mode="lines", line={"color": colour, "width": 4}, name=name)
         where = [[v] for v in _upright(numpy(camera.centre))]
@@ -356,9 +356,9 @@ def _sheet(sizes: list[HW], height: float = 2.6) -> tuple[float, float]:
     return width * shrink, height * shrink + 0.3
 
 
-def _colours(n: int | None = None) -> list[Any]:
-    if n is None or n <= len(COLOURS):
-        return [*COLOURS * 32][:n] if n is not None else [*COLOURS * 32]
+def _colours(n: int) -> list[Any]:
+    if n <= len(COLOURS):
+        return list(COLOURS[:n])
     from matplotlib import colormaps
 
     return list(colormaps["turbo"](np.linspace(0.05, 0.95, n)))

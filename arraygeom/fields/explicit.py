@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Real
+from jaxtyping import Real
 from torch import Tensor
 
 from ..epipolar import epipolar_lines
@@ -129,7 +129,8 @@ class Local:
         centre, placed = apply_homography(pair.homography, x)
         offsets = pixel_grid((self.size, self.size), dtype=x.dtype, device=x.device) - (self.size - 1) / 2
         xy = centre[..., None, :] + self.spacing * offsets.reshape(-1, 2)
-        return _masked(xy, pair.beta.contains(xy) & placed[..., None])
+        mask = pair.beta.contains(xy) & placed[..., None]
+        return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
 
 @dataclass(frozen=True)
@@ -144,8 +145,3 @@ class Dense:
         grid = pixel_grid(pair.beta.hw, dtype=x.dtype, device=x.device)[:: self.stride, :: self.stride]
         xy = grid.reshape(-1, 2).expand(*x.shape[:-1], -1, 2)
         return Positions(xy, torch.ones_like(xy[..., 0], dtype=torch.bool))
-
-
-def _masked(xy: Float[Tensor, "*n l 2"], mask: Bool[Tensor, "*n l"]) -> Positions:
-    """Positions that are zero where they do not count."""
-    return Positions(torch.where(mask[..., None], xy, 0.0), mask)

@@ -11,8 +11,10 @@ from torch import Tensor
 from ..pixels import HW, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
-from .protocol import ReceptiveField, lazily
+from .protocol import ReceptiveField, SamplingLocations, lazily
 
+At = Callable[[Tensor], SamplingLocations]
+"""A field as a function of alpha's pixels (n, 2)."""
 Box = tuple[int, int, int, int]
 """(top, bottom, left, right) in pixels: rows top to bottom - 1, columns left to right - 1."""
 
@@ -39,7 +41,7 @@ class FieldOnGrid:
     samples: how many positions of a segment are to be sampled, or how many positions there are.
     """
 
-    at: Callable[[Tensor], Segments | Positions]
+    at: At
     samples: int
     pixels: Segments | None
     blocks: Segments | None = None
@@ -76,15 +78,13 @@ class FieldOnGrid:
         """
         if self.blocks is not None and side == BLOCK:
             return self.blocks
-        if self.pixels is None:
-            raise ValueError("this network samples straight segments: choose a straight field, or undistort the images")
-        h, w = self.pixels.valid.shape[-2:]
-        return _on_grid(self.at, (h // side, w // side), side, self.pixels.start.device)
+        h, w = self.straight.valid.shape[-2:]
+        return _on_grid(self.at, (h // side, w // side), side, self.straight.start.device)
 
     def displaced(self, step: Callable[[Segments, Tensor], Tensor]) -> FieldOnGrid:
         """A straight field with its segments moved by a step that depends on them and on alpha's pixels (*n, 2)."""
 
-        def moved(found: Segments | Positions, x: Tensor) -> Segments:
+        def moved(found: SamplingLocations, x: Tensor) -> Segments:
             assert isinstance(found, Segments)
             return _shifted(found, -step(found, x))
 
@@ -131,7 +131,7 @@ class FieldOnGrid:
         """The field of alpha's pixels in a box (of even sides), for a beta whose first pixel was at `shift` (x, y)."""
         top, _, left, _ = box
 
-        def at(x: Tensor) -> Segments | Positions:
+        def at(x: Tensor) -> SamplingLocations:
             found = self.at(x + x.new_tensor([left, top]))
             if isinstance(found, Positions):
                 return Positions(found.xy - found.xy.new_tensor(shift), found.mask)
@@ -145,7 +145,7 @@ class FieldOnGrid:
     def of_one(self, i: int) -> FieldOnGrid:
         """The field of the i-th rig of a batch, still with a batch axis, of length 1."""
 
-        def one(found: Segments | Positions) -> Segments | Positions:
+        def one(found: SamplingLocations) -> SamplingLocations:
             parts = [t if len(t) == 1 else t[i : i + 1] for t in vars(found).values()]
             return type(found)(*parts)
 
@@ -153,12 +153,13 @@ class FieldOnGrid:
         return FieldOnGrid(lambda x: one(self.at(x)), self.samples, pixels, blocks)  # type: ignore[arg-type]
 
 
-def _on_grid(
-    at: Callable[[Tensor], Segments | Positions], hw: HW, side: int = 1, device: torch.device | None = None
-) -> Segments:
-    """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w)."""
+def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None, *, at_once: bool = False) -> Segments:
+    """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w).
+
+    Some rows at a time; all `at_once` where a gradient is to be kept.
+    """
     h, w = hw
-    rows = max(_CHUNK // max(w, 1), 1)
+    rows = h if at_once else max(_CHUNK // max(w, 1), 1)
     columns = torch.arange(w, dtype=torch.float64, device=device)
     whole: list[Tensor] = []
     for top in range(0, h, rows):
@@ -169,23 +170,13 @@ def _on_grid(
         if rows >= h:
             return Segments(*part)
         if any(t.requires_grad for t in part):
-            return _on_grid_whole(at, hw, side, device)
+            return _on_grid(at, hw, side, device, at_once=True)
         if h * w >= LARGE:
             part = [*(t.float() for t in part[:2]), part[2]]
         whole = whole or [t.new_empty(t.shape[0], h, w, *t.shape[3:]) for t in part]
         for target, t in zip(whole, part):
             target[:, top : top + rows] = t
     return Segments(*whole)
-
-
-def _on_grid_whole(
-    at: Callable[[Tensor], Segments | Positions], hw: HW, side: int, device: torch.device | None
-) -> Segments:
-    """The same at once, which keeps the gradient."""
-    grid = (pixel_grid(hw, dtype=torch.float64, device=device) + 0.5) * side - 0.5
-    found = at(grid.reshape(-1, 2))
-    assert isinstance(found, Segments)
-    return Segments(*(t.reshape(-1, *hw, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))))
 
 
 def _exact(found: Segments) -> Segments:

@@ -130,9 +130,8 @@ def _widest(pair: Pair) -> Tensor:
     if "widest" not in pair.memo:
         grid = all_pixels(pair)
         with torch.no_grad():
-            disparity = torch.cat(
-                [_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)], -2
-            )
+            parts = [_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)]
+        disparity = torch.cat(parts, -2)
         index = disparity.flatten(-2).argmax(-1)
         chosen = grid.reshape(-1, 2).index_select(0, index.reshape(-1)).reshape(*index.shape, 1, 2)
         pair.memo["widest"] = chosen.to(pair.cameras[0].K)

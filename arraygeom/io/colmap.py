@@ -17,14 +17,13 @@ from typing import Any, NamedTuple
 
 from torch import Tensor
 
-from ..camera import Camera
-from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
+from ..camera import Camera, LensView
+from ..distortion import BROWN_CONRADY, KANNALA_BRANDT
 from ..lenses.central import FOV, THIN_PRISM_FISHEYE
-from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
 from .export import brown_conrady, calibrated, focal_and_centre
-from .source import RigSource
+from .source import RigFileError, RigSource
 
 CONVENTION = "first pixel's centre at 0.5 (shift -0.5); world->camera, quaternions w x y z; scale as in the model"
 
@@ -57,21 +56,14 @@ AT_ORIGIN = [1.0] + 6 * [0.0]
 """QW QX QY QZ TX TY TZ."""
 
 
-class _Intrinsics(NamedTuple):
-    K: Tensor
-    hw: HW
-    lens: Distortion | None
-
-
 class _Image(NamedTuple):
     name: str
     camera: int
     pose: Pose
 
 
-class _Sensor(NamedTuple):
-    camera: int
-    pose: Pose
+Sensors = list[tuple[int, Pose]]
+"""The cameras of a rig, by id, and their poses in it."""
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -83,15 +75,16 @@ def read(source: RigSource) -> Rig:
     folder = _folder(source.path)
     if folder is None:
         raise source.fail(None, "is no COLMAP model: wanted a folder with cameras.txt and images.txt, or .bin")
-    reader = _Binary if (folder / "cameras.bin").exists() else _Text
-    cameras = reader.cameras(_file(folder, "cameras", reader.suffix))
-    images = reader.images(_file(folder, "images", reader.suffix))
-    rigs = folder / f"rigs{reader.suffix}"
-    sensors = [s for s in (reader.rigs(RigSource(rigs)) if rigs.exists() else []) if len(s) > 1]
+    suffix = ".bin" if (folder / "cameras.bin").exists() else ".txt"
+    read_cameras, read_images, read_rigs = PARTS[suffix]
+    cameras = read_cameras(_file(folder, "cameras", suffix))
+    images = read_images(_file(folder, "images", suffix))
+    rigs = folder / f"rigs{suffix}"
+    sensors = [s for s in (read_rigs(RigSource(rigs)) if rigs.exists() else []) if len(s) > 1]
     if len(sensors) > 1:
         raise RigSource(rigs).fail(None, f"has {len(sensors)} rigs of several cameras; keep one")
     if sensors:
-        named = ((_sensor_name(s.camera, images), s.camera, s.pose) for s in sensors[0])
+        named = ((_sensor_name(i, images), i, pose) for i, pose in sensors[0])
     else:
         named = ((image.name, image.camera, image.pose) for image in images)
     return source.rig((name, _camera(source, cameras, i, pose)) for name, i, pose in named)
@@ -131,11 +124,11 @@ def _file(folder: Path, stem: str, suffix: str) -> RigSource:
     return source
 
 
-def _camera(source: RigSource, cameras: dict[int, _Intrinsics], i: int, pose: Pose) -> Camera:
+def _camera(source: RigSource, cameras: dict[int, LensView], i: int, pose: Pose) -> Camera:
     if i not in cameras:
         raise source.fail(f"camera {i}", "is used by an image or a rig and not defined; do the files belong together?")
-    K, hw, lens = cameras[i]
-    return Camera(K=K, cam_from_world=pose, hw=hw, distortion=lens)
+    view = cameras[i]
+    return Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)
 
 
 def _sensor_name(camera: int, images: list[_Image]) -> str:
@@ -144,139 +137,135 @@ def _sensor_name(camera: int, images: list[_Image]) -> str:
     return folders.pop() if len(folders) == 1 and "." not in folders else f"camera{camera}"
 
 
-def _intrinsics(source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> _Intrinsics:
+def _intrinsics(source: RigSource, entry: str, model: str, wh: tuple[Any, Any], parameters: list[Any]) -> LensView:
     if model not in MODELS:
         raise source.fail(entry, f"has model {model}, which is not read: calibrate with one of {', '.join(MODELS)}")
     kind = MODELS[model]
     p = source.numbers(parameters, (kind.focals + 2 + kind.coefficients,), f"{entry} ({model})").tolist()
     K = source.focal_and_centre([p[0], p[kind.focals - 1], *p[kind.focals : kind.focals + 2]], entry, first_pixel=0.5)
     hw, c = source.size(*wh, entry), p[kind.focals + 2 :]
-    if kind.lens is None or (not any(c) and kind.lens in (BROWN_CONRADY, FOV)):
-        return _Intrinsics(K, hw, None)
-    if kind.lens == BROWN_CONRADY:
-        return _Intrinsics(K, hw, source.brown_conrady(c, entry))
-    if kind.lens == KANNALA_BRANDT:
-        return _Intrinsics(K, hw, source.kannala_brandt(c, entry))
-    return _Intrinsics(K, hw, source.lens(kind.lens, c, entry))
+    lens = None if kind.lens is None or (kind.lens == FOV and not any(c)) else source.lens(kind.lens, c, entry)
+    return LensView(hw=hw, K=K, distortion=lens)
 
 
 def _pose(source: RigSource, entry: str, numbers: list[Any]) -> Pose:
     return source.pose(source.quaternion(numbers[:4], f"{entry} QW QX QY QZ"), numbers[4:7], entry)
 
 
-class _Text:
-    """The text files."""
-
-    suffix = ".txt"
-
-    @staticmethod
-    def cameras(source: RigSource) -> dict[int, _Intrinsics]:
-        """The intrinsics of every line, CAMERA_ID MODEL WIDTH HEIGHT PARAMS, by id."""
-        found: dict[int, _Intrinsics] = {}
-        for number, line in _lines(source):
-            fields, entry = line.split(), f"line {number}"
-            if len(fields) < 5:
-                raise source.fail(entry, "wanted CAMERA_ID MODEL WIDTH HEIGHT PARAMS; is the file whole?")
-            i = _id(source, fields[0], entry)
-            if i in found:
-                raise source.fail(entry, f"camera {i} occurs twice; keep one")
-            width, height, *parameters = source.numbers_in(" ".join(fields[2:]), None, entry).tolist()
-            found[i] = _intrinsics(source, entry, fields[1], (width, height), parameters)
-        _check_count(source, "cameras", len(found))
-        return found
-
-    @staticmethod
-    def images(source: RigSource) -> list[_Image]:
-        """Every other line; those between hold the points, and may be blank."""
-        lines = [(n, line) for n, line in enumerate(source.text().split("\n"), 1) if not line.startswith("#")]
-        while lines and not lines[0][1].strip():
-            lines.pop(0)
-        found = [_Text._image(source, n, line) for n, line in lines[::2] if line.strip()]
-        _check_count(source, "images", len(found))
-        return found
-
-    @staticmethod
-    def _image(source: RigSource, number: int, line: str) -> _Image:
-        fields, entry = line.split(maxsplit=9), f"line {number}"
-        if len(fields) != 10:
-            raise source.fail(entry, "wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
-        pose = _pose(source, entry, source.numbers_in(" ".join(fields[1:8]), (7,), entry).tolist())
-        return _Image(fields[9].strip(), _id(source, fields[8], entry), pose)
-
-    @staticmethod
-    def rigs(source: RigSource) -> list[list[_Sensor]]:
-        found = [list(_Text._sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
-        if not found:
-            raise source.fail(None, "holds no rig; was it cut off?")
-        _check_count(source, "rigs", len(found))
-        return found
-
-    @staticmethod
-    def _sensors(source: RigSource, entry: str, fields: list[str]) -> Iterator[_Sensor]:
-        """RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for the others."""
-        tokens = iter(fields[1:])
-        try:
-            count = int(next(tokens))
-            for k in range(count):
-                kind, i = next(tokens), _id(source, next(tokens), entry)
-                posed = k == 0 or next(tokens) == "1"
-                words = " ".join(next(tokens) for _ in range(7)) if k and posed else ""
-                numbers = source.numbers_in(words, (7,), entry).tolist() if words else AT_ORIGIN
-                if kind == "CAMERA":
-                    yield _sensor(source, entry, i, numbers if posed else None)
-        except (StopIteration, ValueError, RuntimeError) as error:
-            if isinstance(error, RuntimeError | StopIteration) or not hasattr(error, "entry"):
-                raise source.fail(entry, "is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
-            raise
+# The text files -------------------------------------------------------------------------------------------------
 
 
-class _Binary:
-    """The binary files, little-endian."""
+def _cameras_text(source: RigSource) -> dict[int, LensView]:
+    """The intrinsics of every line, CAMERA_ID MODEL WIDTH HEIGHT PARAMS, by id."""
+    found: dict[int, LensView] = {}
+    for number, line in _lines(source):
+        fields, entry = line.split(), f"line {number}"
+        if len(fields) < 5:
+            raise source.fail(entry, "wanted CAMERA_ID MODEL WIDTH HEIGHT PARAMS; is the file whole?")
+        i = _id(source, fields[0], entry)
+        if i in found:
+            raise source.fail(entry, f"camera {i} occurs twice; keep one")
+        width, height, *parameters = source.numbers_in(" ".join(fields[2:]), None, entry).tolist()
+        found[i] = _intrinsics(source, entry, fields[1], (width, height), parameters)
+    _check_count(source, "cameras", len(found))
+    return found
 
-    suffix = ".bin"
 
-    @staticmethod
-    def cameras(source: RigSource) -> dict[int, _Intrinsics]:
-        """The intrinsics of every camera by id."""
-        names = {model.id: name for name, model in MODELS.items()}
-        data, found = _Bytes(source), dict[int, _Intrinsics]()
-        for _ in range(data.count()):
-            i, model, w, h = data.take("<IiQQ")
-            entry = f"camera {i}"
-            if i in found:
-                raise source.fail(entry, "occurs twice; keep one")
-            if model not in names:
-                raise source.fail(entry, f"has model number {model}, which is not supported")
-            kind = MODELS[names[model]]
-            parameters = list(data.take(f"<{kind.focals + 2 + kind.coefficients}d"))
-            found[i] = _intrinsics(source, entry, names[model], (w, h), parameters)
-        return found
+def _images_text(source: RigSource) -> list[_Image]:
+    """Every other line; those between hold the points, and may be blank."""
+    lines = [(n, line) for n, line in enumerate(source.text().split("\n"), 1) if not line.startswith("#")]
+    while lines and not lines[0][1].strip():
+        lines.pop(0)
+    found = [_image(source, n, line) for n, line in lines[::2] if line.strip()]
+    _check_count(source, "images", len(found))
+    return found
 
-    @staticmethod
-    def images(source: RigSource) -> list[_Image]:
-        data, found = _Bytes(source), []
-        for _ in range(data.count()):
-            i, *numbers, camera = data.take("<I7dI")
-            name = data.string()
-            data.skip(24 * data.count())
-            found.append(_Image(name, camera, _pose(source, f"image {i}", numbers)))
-        return found
 
-    @staticmethod
-    def rigs(source: RigSource) -> list[list[_Sensor]]:
-        """The cameras of each rig; other sensors are passed over."""
-        data, rigs = _Bytes(source), []
-        for _ in range(data.count()):
-            rig, count = data.take("<II")
-            sensors = []
-            for k in range(count):
-                kind, i = data.take("<iI")
-                posed = k == 0 or bool(data.take("<B")[0])
-                numbers = list(data.take("<7d")) if k and posed else AT_ORIGIN
-                if kind == 0:
-                    sensors.append(_sensor(source, f"rig {rig}", i, numbers if posed else None))
-            rigs.append(sensors)
-        return rigs
+def _image(source: RigSource, number: int, line: str) -> _Image:
+    fields, entry = line.split(maxsplit=9), f"line {number}"
+    if len(fields) != 10:
+        raise source.fail(entry, "wanted IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME; is the file whole?")
+    pose = _pose(source, entry, source.numbers_in(" ".join(fields[1:8]), (7,), entry).tolist())
+    return _Image(fields[9].strip(), _id(source, fields[8], entry), pose)
+
+
+def _rigs_text(source: RigSource) -> list[Sensors]:
+    found = [list(_sensors(source, f"line {n}", line.split())) for n, line in _lines(source)]
+    if not found:
+        raise source.fail(None, "holds no rig; was it cut off?")
+    _check_count(source, "rigs", len(found))
+    return found
+
+
+def _sensors(source: RigSource, entry: str, fields: list[str]) -> Iterator[tuple[int, Pose]]:
+    """RIG_ID NUM_SENSORS REF_TYPE REF_ID, then TYPE ID HAS_POSE [QW QX QY QZ TX TY TZ] for the others."""
+    tokens = iter(fields[1:])
+    try:
+        count = int(next(tokens))
+        for k in range(count):
+            kind, i = next(tokens), _id(source, next(tokens), entry)
+            posed = k == 0 or next(tokens) == "1"
+            words = " ".join(next(tokens) for _ in range(7)) if k and posed else ""
+            numbers = source.numbers_in(words, (7,), entry).tolist() if words else AT_ORIGIN
+            if kind == "CAMERA":
+                yield _sensor(source, entry, i, numbers if posed else None)
+    except RigFileError:
+        raise
+    except (StopIteration, ValueError, RuntimeError):
+        raise source.fail(entry, "is not a rig (RIG_ID NUM_SENSORS ...); is the file whole?") from None
+
+
+# The binary files, little-endian ---------------------------------------------------------------------------------
+
+
+def _cameras_binary(source: RigSource) -> dict[int, LensView]:
+    """The intrinsics of every camera by id."""
+    names = {model.id: name for name, model in MODELS.items()}
+    data, found = _Bytes(source), dict[int, LensView]()
+    for _ in range(data.count()):
+        i, model, w, h = data.take("<IiQQ")
+        entry = f"camera {i}"
+        if i in found:
+            raise source.fail(entry, "occurs twice; keep one")
+        if model not in names:
+            raise source.fail(entry, f"has model number {model}, which is not supported")
+        kind = MODELS[names[model]]
+        parameters = list(data.take(f"<{kind.focals + 2 + kind.coefficients}d"))
+        found[i] = _intrinsics(source, entry, names[model], (w, h), parameters)
+    return found
+
+
+def _images_binary(source: RigSource) -> list[_Image]:
+    data, found = _Bytes(source), []
+    for _ in range(data.count()):
+        i, *numbers, camera = data.take("<I7dI")
+        name = data.string()
+        data.take(f"{24 * data.count()}x")  # the points
+        found.append(_Image(name, camera, _pose(source, f"image {i}", numbers)))
+    return found
+
+
+def _rigs_binary(source: RigSource) -> list[Sensors]:
+    """The cameras of each rig; other sensors are passed over."""
+    data, rigs = _Bytes(source), []
+    for _ in range(data.count()):
+        rig, count = data.take("<II")
+        sensors = []
+        for k in range(count):
+            kind, i = data.take("<iI")
+            posed = k == 0 or bool(data.take("<B")[0])
+            numbers = list(data.take("<7d")) if k and posed else AT_ORIGIN
+            if kind == 0:
+                sensors.append(_sensor(source, f"rig {rig}", i, numbers if posed else None))
+        rigs.append(sensors)
+    return rigs
+
+
+PARTS = {
+    ".txt": (_cameras_text, _images_text, _rigs_text),
+    ".bin": (_cameras_binary, _images_binary, _rigs_binary),
+}
+"""How cameras, images and rigs are read, by the ending of their files."""
 
 
 class _Bytes:
@@ -309,17 +298,11 @@ class _Bytes:
         text, self.at = self.data[self.at : end].decode("utf-8", errors="replace"), end + 1
         return text
 
-    def skip(self, n: int) -> None:
-        """Pass over bytes."""
-        if self.at + n > len(self.data):
-            raise self.source.fail(f"byte {self.at}", "the file ends too early; was it cut off?")
-        self.at += n
 
-
-def _sensor(source: RigSource, entry: str, camera: int, numbers: list[Any] | None) -> _Sensor:
+def _sensor(source: RigSource, entry: str, camera: int, numbers: list[Any] | None) -> tuple[int, Pose]:
     if numbers is None:
         raise source.fail(entry, f"camera {camera} has no pose in its rig; calibrate the rig first")
-    return _Sensor(camera, _pose(source, entry, numbers))
+    return camera, _pose(source, entry, numbers)
 
 
 def _lines(source: RigSource) -> Iterator[tuple[int, str]]:

@@ -16,7 +16,7 @@ import torch
 import yaml
 
 from ..camera import Camera
-from ..distortion import KANNALA_BRANDT, Distortion
+from ..distortion import BROWN_CONRADY, KANNALA_BRANDT, Distortion
 from ..lenses.central import DOUBLE_SPHERE, EXTENDED_UNIFIED, FOV, UNIFIED
 from ..pose import Pose
 from ..rig import Rig
@@ -117,11 +117,8 @@ def _lens(source: RigSource, name: str, camera: str, before: list[float], fields
         return source.lens(UNIFIED, [*before, *(c or [0.0] * 4)], f"{name}.intrinsics")
     if camera != "pinhole":
         return source.lens(DOUBLE_SPHERE if camera == "ds" else EXTENDED_UNIFIED, before, f"{name}.intrinsics")
-    if model == "none":
-        return None
-    if model == "fov":
-        return source.lens(FOV, c, entry)
-    return source.brown_conrady(c, entry) if model == "radtan" else source.kannala_brandt(c, entry)
+    lens = {"radtan": BROWN_CONRADY, "equidistant": KANNALA_BRANDT, "fov": FOV, "none": None}[model]
+    return None if lens is None else source.lens(lens, c, entry)
 
 
 def _entry(name: str, camera: Camera) -> dict[str, Any]:

@@ -11,14 +11,10 @@ from __future__ import annotations
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
-from torch import Tensor
-
-from ..camera import Camera
+from ..camera import Camera, LensView
 from ..distortion import Distortion
 from ..lenses.central import THIN_PRISM_FISHEYE
-from ..pixels import HW
 from ..pose import Pose
 from ..rig import Rig
 from ..safe_yaml import DEEPEST, LARGEST_TEXT
@@ -26,12 +22,6 @@ from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0.5 (shift -0.5); camera->chunk, inverted; the chunk's scale, else as in the file"
 LENS_NUMBERS = ("k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
-
-
-class _Sensor(NamedTuple):
-    K: Tensor
-    hw: HW
-    lens: Distortion | None
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -46,7 +36,7 @@ def read(source: RigSource) -> Rig:
     sensors = {sensor.get("id"): sensor for sensor in chunks[0].iter("sensor")}
     scales = {part.get("id"): _scale(source, part) for part in chunks[0].iter("component")}
     scale = _scale(source, chunks[0])
-    made: dict[str, _Sensor] = {}
+    views: dict[str, LensView] = {}
     cameras, left_out = [], []
     for camera in chunks[0].iter("camera"):
         name, sensor = camera.get("label") or f"camera{camera.get('id')}", camera.get("sensor_id") or ""
@@ -56,14 +46,14 @@ def read(source: RigSource) -> Rig:
             continue
         if sensor not in sensors:
             raise source.fail(name, f"is of sensor '{sensor}', which is not defined")
-        if sensor not in made:
-            made[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
-        K, hw, lens = made[sensor]
-        entry = f"{name}.transform"
+        if sensor not in views:
+            views[sensor] = _sensor(source, sensors[sensor], f"sensor {sensor}")
+        view, entry = views[sensor], f"{name}.transform"
         pose = source.pose_matrix(source.numbers_in(transform, (16,), entry), entry).inverse()
         own = scales.get(camera.get("component_id"))
         metres = own if own is not None else scale if scale is not None else 1.0
-        cameras.append((name, Camera(K=K, cam_from_world=Pose(pose.R, pose.t * metres), hw=hw, distortion=lens)))
+        pose = Pose(pose.R, pose.t * metres)
+        cameras.append((name, Camera(K=view.K, cam_from_world=pose, hw=view.hw, distortion=view.distortion)))
     if left_out:
         source.warn(f"holds {len(left_out)} cameras that are not aligned (such as {left_out[0]}); they are left out")
     return source.rig(cameras)
@@ -95,7 +85,7 @@ def _events(parser: ET.XMLPullParser, text: str) -> Iterator[tuple[str, ET.Eleme
         yield from parser.read_events()  # type: ignore[misc]
 
 
-def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> _Sensor:
+def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> LensView:
     """A sensor's last calibration (the adjusted one, where there are two)."""
     found = sensor.findall("calibration")
     if not found:
@@ -109,7 +99,7 @@ def _sensor(source: RigSource, sensor: ET.Element, entry: str) -> _Sensor:
     h, w = source.size(width, height, f"{entry} resolution")
     f, cx, cy, b1, b2 = (_number(source, calibration, name, entry) for name in ("f", "cx", "cy", "b1", "b2"))
     K = source.intrinsics([[f + b1, b2, w / 2 + cx], [0, f, h / 2 + cy], [0, 0, 1]], f"{entry} f", first_pixel=0.5)
-    return _Sensor(K, (h, w), _lens(source, calibration, entry))
+    return LensView(hw=(h, w), K=K, distortion=_lens(source, calibration, entry))
 
 
 def _lens(source: RigSource, calibration: ET.Element, entry: str) -> Distortion | None:

@@ -64,7 +64,7 @@ CAMERA = (
     *("response", "frame_rate", "time_offset", "coding", "bayer", "bits", "black_level", "exposure", "gain"),
 )
 NAMED = {"focal": "focal length", "scale": "scale"}
-CALIBRATION = ("focal", "centre", "K", "rotation", "translation", "position", "distortion")
+CALIBRATION = {"focal", "centre", "K", "rotation", "translation", "position", "distortion"}
 
 
 def recognises(path: Path, head: str) -> bool:
@@ -140,19 +140,19 @@ class _Document(RigSource):
         """A calibrated camera, a view with a lens alone, or one of which only the size is known."""
         self.keys(fields, CAMERA, entry)
         width, height = (self.whole(n, f"{entry}.size") for n in self.pair(fields.get("size"), f"{entry}.size"))
-        height, width = self.bounded((height, width), f"{entry}.size")
-        sensor = self.sensor(entry, fields)
-        if not any(key in fields for key in CALIBRATION):
-            return View(hw=(height, width), sensor=sensor)
-        if not any(key in fields for key in CALIBRATION if key != "distortion"):
-            return self.lens_view(f"{entry}.distortion", fields["distortion"], View(hw=(height, width), sensor=sensor))
+        view = View(hw=self.bounded((height, width), f"{entry}.size"), sensor=self.sensor(entry, fields))
+        stated = fields.keys() & CALIBRATION
+        if not stated:
+            return view
+        if stated == {"distortion"}:
+            return self.lens_view(f"{entry}.distortion", fields["distortion"], view)
         lens = self.distortion(f"{entry}.distortion", fields.get("distortion"))
         return Camera(
-            K=self.K(entry, fields, (height, width)),
+            K=self.K(entry, fields, view.hw),
             cam_from_world=self.stated_pose(entry, fields),
-            hw=(height, width),
+            hw=view.hw,
             distortion=None if lens is not None and lens.is_identity else lens,
-            sensor=sensor,
+            sensor=view.sensor,
         )
 
     def lens_view(self, entry: str, fields: Any, view: View) -> View:

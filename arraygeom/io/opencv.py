@@ -70,10 +70,9 @@ def write(rig: Rig) -> str | dict[str, str]:
     (_, one), (_, two) = cameras
     relative = two.cam_from_world @ one.cam_from_world.inverse()
     names = "".join(f'name{i}: "{name}"\n' for i, (name, _) in enumerate(cameras, 1))
+    intrinsics = "".join(_camera_text(name, camera, str(i)) for i, (name, camera) in enumerate(cameras, 1))
     return {
-        "intrinsics.yml": _HEADER
-        + names
-        + "".join(_camera_text(name, camera, str(i)) for i, (name, camera) in enumerate(cameras, 1)),
+        "intrinsics.yml": _HEADER + names + intrinsics,
         "extrinsics.yml": _HEADER + _matrix_text("R", relative.R) + _matrix_text("T", relative.t[:, None]),
     }
 

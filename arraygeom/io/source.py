@@ -14,7 +14,7 @@ import yaml
 from torch import Tensor
 
 from ..camera import Camera
-from ..distortion import COEFFICIENT_COUNTS, Distortion
+from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Distortion
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
@@ -231,17 +231,19 @@ class RigSource:
         if c.numel() > 14:
             raise self.fail(entry, f"has {c.numel()} coefficients; OpenCV's model has at most 14")
         count = next(n for n in (4, 5, 8, 12, 14) if n >= c.numel())
-        return Distortion("brown-conrady", torch.nn.functional.pad(c, (0, count - c.numel())))
+        return Distortion(BROWN_CONRADY, torch.nn.functional.pad(c, (0, count - c.numel())))
 
     def kannala_brandt(self, value: Any, entry: str) -> Distortion:
         """A fisheye lens from one to four coefficients."""
         c = self.numbers(value, None, entry)
         if not 1 <= c.numel() <= 4:
             raise self.fail(entry, f"has {c.numel()} coefficients; the fisheye model has 4 (k1 k2 k3 k4)")
-        return Distortion("kannala-brandt", torch.nn.functional.pad(c, (0, 4 - c.numel())))
+        return Distortion(KANNALA_BRANDT, torch.nn.functional.pad(c, (0, 4 - c.numel())))
 
-    def lens(self, model: str, coefficients: Any, entry: str) -> Distortion:
-        """A lens of any model from all its coefficients, once they are within the model's bounds."""
+    def lens(self, model: str, coefficients: Any, entry: str) -> Distortion | None:
+        """A lens of any model; of other models than the two above from all coefficients, within the model's bounds."""
+        if model in (BROWN_CONRADY, KANNALA_BRANDT):
+            return (self.brown_conrady if model == BROWN_CONRADY else self.kannala_brandt)(coefficients, entry)
         c = self.numbers(coefficients, (COEFFICIENT_COUNTS[model][0],), entry)
         lens = Distortion(model, c)
         if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:

@@ -41,7 +41,7 @@ def brown_distort(c: Tensor, xy: Tensor) -> tuple[Tensor, Tensor]:
     inside = squared < limit
     pull = torch.where(inside, 1.0, (limit / torch.where(inside, 1.0, squared.clamp(min=TINY))).sqrt())
     planar, jacobian = _brown_planar(lens, xy * pull[..., None])
-    tilted, ahead = _tilt(lens, planar)
+    tilted, ahead = _apply(_tilt_matrix(lens), planar)
     return tilted, inside & _orients(jacobian) & ahead
 
 
@@ -52,9 +52,10 @@ def brown_undistort(c: Tensor, xy_d: Tensor) -> tuple[Tensor, Tensor]:
     first derivatives and the next one the second (the error of a Newton step is the square of the one before).
     """
     lens = Brown.named(c)
-    target, ahead = _untilt(lens, xy_d)
+    H = _tilt_matrix(lens)
+    target, ahead = _apply(H if H is None else torch.linalg.inv(H), xy_d)
     with torch.no_grad():
-        inverse = _traced_brown_inverse if torch.compiler.is_compiling() else _brown_inverse_of
+        inverse = _traced_brown_inverse if torch.compiler.is_compiling() else _brown_inverse
         solved, valid = inverse(c.detach(), target.detach())
     safe_target = torch.where(valid[..., None], target, 0.0)
     xy = torch.where(valid[..., None], solved, 0.0)
@@ -116,17 +117,12 @@ def _brown_start(lens: Brown, target: Tensor, limit: Tensor) -> Tensor:
     return target * (r / torch.where(wanted > 0, wanted, 1.0))[..., None]
 
 
-def _brown_inverse_of(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
-    lens = Brown.named(c)
-    return _brown_inverse(lens, target, brown_limit(lens).to(target))
-
-
 @torch.library.custom_op(
     "arraygeom::brown_inverse", mutates_args=(), schema="(Tensor c, Tensor target) -> (Tensor, Tensor)"
 )
 def _traced_brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The same for torch.compile, which cannot follow iterations that numbers end."""
-    solved, valid = _brown_inverse_of(c, target)
+    solved, valid = _brown_inverse(c, target)
     return solved.contiguous(), valid.contiguous()
 
 
@@ -136,11 +132,13 @@ def _(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     return target.new_empty((*shape, 2)), target.new_empty(shape, dtype=torch.bool)
 
 
-def _brown_inverse(lens: Brown, target: Tensor, limit: Tensor) -> tuple[Tensor, Tensor]:
+def _brown_inverse(c: Tensor, target: Tensor) -> tuple[Tensor, Tensor]:
     """The solution and whether there is one; where not, the solution of the radial terms alone.
 
     Close to the turn the slope is nearly 0 and leads nowhere, hence two more attempts from further in.
     """
+    lens = Brown.named(c)
+    limit = brown_limit(lens).to(target)
     start = solved = _brown_start(lens, target, limit)
     valid = torch.zeros_like(target[..., 0], dtype=torch.bool)
     for begin in (start, _pulled_in(start, 0.9 * limit), _pulled_in(target, 0.5 * limit)):
@@ -199,16 +197,6 @@ def _tilt_matrix(lens: Brown) -> Tensor | None:
 
     tx, ty = (angle.double()[..., None] for angle in lens.tilt)  # in float64, which autocast leaves alone
     return tilt_projection(tx, ty)
-
-
-def _tilt(lens: Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
-    H = _tilt_matrix(lens)
-    return _apply(H, xy)
-
-
-def _untilt(lens: Brown, xy: Tensor) -> tuple[Tensor, Tensor]:
-    H = _tilt_matrix(lens)
-    return _apply(H if H is None else torch.linalg.inv(H), xy)
 
 
 def _apply(H: Tensor | None, xy: Tensor) -> tuple[Tensor, Tensor]:

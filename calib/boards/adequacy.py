@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Pose, rotation_from_vector
 
+from .board import Board
 from .bundle import BundleResult, readjusted
 from .camera_parameters import camera_jacobian, parameter_names
-from .target import Board
 from .validation import without_blocks
 
 GRID = 15, 20
@@ -112,7 +112,8 @@ class NextView(NamedTuple):
 def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2) -> list[NextView]:
     """The views that lower a camera's uncertainty of projection most, one after the other."""
     _, change = _changes(known, depth)
-    candidates = _candidates(known, board.members[0])
+    gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board.members[0]).items()}
+    candidates = {text: gain for text, gain in gains.items() if gain is not None}
     information, found = np.linalg.inv(known.covariance), []
     before = _median(change, known.covariance)
     for _ in range(count):
@@ -125,12 +126,6 @@ def next_views(known: Intrinsics, board: Board, depth: float, *, count: int = 2)
 
 def _median(change: np.ndarray, covariance: np.ndarray) -> float:
     return float(np.median(np.sqrt(np.einsum("nif,fg,nig->n", change, covariance, change))))
-
-
-def _candidates(known: Intrinsics, board: Board) -> Mapping[str, np.ndarray]:
-    """Views in words, and the information that each adds on the free intrinsics."""
-    gains = {text: _gain(known, X) for text, X in proposed_views(known.camera, board).items()}
-    return {text: gain for text, gain in gains.items() if gain is not None}
 
 
 def proposed_views(camera: Camera, board: Board) -> Mapping[str, Float[np.ndarray, "n 3"]]:

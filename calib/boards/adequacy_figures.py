@@ -36,10 +36,9 @@ def draw_adequacy(calibration: Calibration, depths: tuple[float, float]) -> Figu
             _map(axes, figure, known.camera.hw, x, deviation, f"{name}: uncertainty at {depth:.2g} m")
         if name in halves:
             x, off = halves[name]
-            _map(
-                axes := row[2], figure, known.camera.hw, x, np.linalg.norm(off, axis=1), f"{name}: halves of the frames"
-            )
-            axes.quiver(*x[::3].T, *off[::3].T, angles="xy", color="white", width=0.003)
+            length = np.linalg.norm(off, axis=1)
+            _map(row[2], figure, known.camera.hw, x, length, f"{name}: halves of the frames")
+            row[2].quiver(*x[::3].T, *off[::3].T, angles="xy", color="white", width=0.003)
         else:
             row[2].set_axis_off()
             row[2].set_title("too few frames to compare halves", fontsize=9)

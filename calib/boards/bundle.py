@@ -129,7 +129,7 @@ class BundleProblem:
         if not isinstance(self.structure, BoardPoses):
             raise TypeError(f"the structure is {type(self.structure).__name__}; wanted BoardPoses")
         boards = self.structure.world_from_board
-        return {key: Pose(boards.R[i], boards.t[i]) for i, key in enumerate(keys)}
+        return {key: boards[i] for i, key in enumerate(keys)}
 
     def rms(self) -> float:
         """Root mean square length of all residuals, pixels: OpenCV's reprojection error."""
@@ -148,7 +148,6 @@ class BundleResult(NamedTuple):
     sigma: dict[str, float]
     names: tuple[str, ...]
     covariance: Float[np.ndarray, "c c"] | None
-    iterations: int
     converged: bool
 
     def free(self) -> dict[str, Bool[np.ndarray, "_"]]:
@@ -160,9 +159,7 @@ class BundleResult(NamedTuple):
         }
 
 
-def adjust(
-    problem: BundleProblem, free: Free, *, rounds: int = 4, iterations: int = 50, equal_noise: bool = False
-) -> BundleResult:
+def adjust(problem: BundleProblem, free: Free, *, rounds: int = 4, equal_noise: bool = False) -> BundleResult:
     """Minimise the reprojection error over the free camera parameters and all blocks.
 
     First by least squares of equal noise, as the initial values may be poor; then `rounds` times with the noise of each
@@ -171,13 +168,10 @@ def adjust(
     noise of its own would attract every board pose.
     """
     parameters = _count(free) + len(problem.structure) * problem.structure.width
-    problem, done, converged = _minimise(
-        problem, free, dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE)), iterations
-    )
+    problem, converged = _minimise(problem, free, dict.fromkeys(problem.cameras, max(problem.rms(), LEAST_NOISE)))
     sigma = _pooled(noise(problem, parameters))
     for _ in range(rounds):
-        problem, used, converged = _minimise(problem, free, sigma, iterations)
-        done += used
+        problem, converged = _minimise(problem, free, sigma)
         before, sigma = sigma, noise(problem, parameters)
         sigma = _pooled(sigma) if equal_noise else sigma
         if all(abs(np.log(sigma[name] / before[name])) < 1e-2 for name in sigma):
@@ -188,12 +182,12 @@ def adjust(
         for entry, is_free in zip(parameter_names(camera), free[name])
         if is_free
     )
-    return BundleResult(problem, sigma, names, _covariance(problem, free, sigma), done, converged)
+    return BundleResult(problem, sigma, names, _covariance(problem, free, sigma), converged)
 
 
 def readjusted(problem: BundleProblem, free: Free, sigma: Mapping[str, float]) -> BundleProblem:
     """The problem adjusted once more, from a solution of nearly the same problem and with its noise."""
-    return _minimise(problem, free, sigma, 10)[0]
+    return _minimise(problem, free, sigma, iterations=10)[0]
 
 
 def _pooled(sigma: Mapping[str, float]) -> dict[str, float]:
@@ -237,11 +231,11 @@ def loss(problem: BundleProblem, sigma: Mapping[str, float]) -> float:
 
 
 def _minimise(
-    problem: BundleProblem, free: Free, sigma: Mapping[str, float], iterations: int
-) -> tuple[BundleProblem, int, bool]:
-    """Levenberg's loop: (problem, iterations, converged)."""
+    problem: BundleProblem, free: Free, sigma: Mapping[str, float], *, iterations: int = 50
+) -> tuple[BundleProblem, bool]:
+    """Levenberg's loop: (problem, converged)."""
     least, damping = loss(problem, sigma), 1e-4
-    for iteration in range(1, iterations + 1):
+    for _ in range(iterations):
         equations = normal_equations(problem, free, sigma)
         while True:
             trial = _stepped(problem, free, *equations.solve(damping))
@@ -250,13 +244,13 @@ def _minimise(
                 break
             damping *= 10
             if damping > 1e6:
-                return problem, iteration, True
+                return problem, True
         gained = least - trial_loss
         problem, least = trial, trial_loss
         damping = max(damping / 10, 1e-12)
         if gained < CONVERGED:
-            return problem, iteration, True
-    return problem, iterations, False
+            return problem, True
+    return problem, False
 
 
 def _stepped(problem: BundleProblem, free: Free, change: Array, blocks: Array) -> BundleProblem:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from arraygeom import Camera, Pose, Rig
-from arraygeom.pose import rotation_vector
+from arraygeom.pose import cross_matrix, rotation_vector
 
 
 def parameter_names(camera: Camera) -> list[str]:
@@ -68,7 +68,9 @@ class CameraPrior(NamedTuple):
 
     def equations(self, camera: Camera) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
         """The prior's part of the normal equations: inverse covariance and negative gradient by each parameter."""
-        derivatives = self._derivatives(camera)
+        derivatives = np.eye(len(self.mean))
+        if self.pose is not None:
+            derivatives[3:6, :6] = centre_derivatives(camera)
         return derivatives.T @ self.information @ derivatives, derivatives.T @ self.information @ self.offset(camera)
 
     def loss(self, camera: Camera) -> float:
@@ -84,16 +86,7 @@ class CameraPrior(NamedTuple):
             offset[3:6] = (self.pose.inverse().t - camera.centre).numpy()
         return offset
 
-    def _derivatives(self, camera: Camera) -> np.ndarray:
-        """Of the values that the prior is of by the parameters."""
-        found = np.eye(len(self.mean))
-        if self.pose is not None:
-            found[3:6, :6] = centre_derivatives(camera)
-        return found
-
 
 def centre_derivatives(camera: Camera) -> Float[np.ndarray, "3 6"]:
     """Derivatives of the optical centre in the world by the camera's rotation vector and translation."""
-    x, y, z = camera.t.tolist()
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(-camera.R.numpy().T @ np.concatenate([cross, np.eye(3)], 1))
+    return np.asarray(-camera.R.numpy().T @ np.concatenate([cross_matrix(camera.t).numpy(), np.eye(3)], 1))

@@ -11,10 +11,10 @@ from typing import Any
 
 from arraygeom.pixels import HW
 
+from .board import Board
 from .detect import Detection, Grey, detect, explain, other_size
 from .intrinsics import BoardViews
 from .photos import FrameKey, Photo, Photos, find_photos
-from .target import Board
 
 EXPLAINED_IMAGES = 4
 """Images without a board that are analysed for the reason."""

@@ -153,9 +153,10 @@ def _least_squares(grey: Array, start: Array, shape: EdgeGeometry, extent: Array
     """Gauss-Newton on all corners at once: positions, and residuals (root mean square) in contrasts."""
     pixels = _around(start, extent)
     values = grey[pixels[..., 1].clip(0, grey.shape[0] - 1), pixels[..., 0].clip(0, grey.shape[1] - 1)]
-    model = _initial_model(values, pixels, CornerModel(start, *np.ones((3, len(start), 1))), shape, extent, width)
+    model = _initial_model(values, start, *_distances(pixels - start[:, None], shape, extent, width))
     for _ in range(STEPS):
-        root, left, J = _linearised(values, pixels, model, shape, extent, width)
+        root, d, e = _distances(pixels - model.x[:, None], shape, extent, width)
+        left, J = _linearised(values, model, shape.normal, d, e)
         J *= root[..., None]
         A = J.swapaxes(1, 2) @ J
         A += 1e-6 * np.eye(5) * (np.trace(A, axis1=1, axis2=2)[:, None, None] / 5 + 1e-9)
@@ -174,29 +175,23 @@ def _around(x: Array, extent: Array) -> Array:
     return np.rint(x).astype(int)[:, None] + np.stack(np.meshgrid(row, row), -1).reshape(-1, 2)
 
 
-def _initial_model(
-    values: Array, pixels: Array, model: CornerModel, shape: EdgeGeometry, extent: Array, width: Array
-) -> CornerModel:
-    """The model with the level and the contrast that fit at the given positions."""
-    root, d, e = _distances(pixels - model.x[:, None], shape, extent, width)
+def _initial_model(values: Array, x: Array, root: Array, d: Array, e: Array) -> CornerModel:
+    """The model with the level and the contrast that fit at the given positions; its blur is 1."""
     pattern, weight = erf(d) * erf(e), root**2
     level = np.average(values, weights=weight + 1e-9, axis=1)[:, None]
     contrast = (weight * pattern * (values - level)).sum(1) / (weight * pattern**2).sum(1).clip(1e-9)
-    return model._replace(level=level, contrast=contrast[:, None])
+    return CornerModel(x, level, contrast[:, None], np.ones((len(x), 1)))
 
 
-def _linearised(
-    values: Array, pixels: Array, model: CornerModel, shape: EdgeGeometry, extent: Array, width: Array
-) -> tuple[Array, Array, Array]:
-    """Square roots of the weights (n, m), residuals (n, m), derivatives of the model by a step (n, m, 5)."""
-    root, d, e = _distances(pixels - model.x[:, None], shape, extent, width)
+def _linearised(values: Array, model: CornerModel, normal: Array, d: Array, e: Array) -> tuple[Array, Array]:
+    """Residuals (n, m) and derivatives of the model by a step (n, m, 5), at distances d and e from the edges."""
     _, _, b, blur = model
     S, T = (erf(v / (2**0.5 * blur)) for v in (d, e))
     by_d, by_e = (b * (2 / np.pi) ** 0.5 / blur * np.exp(-((v / blur) ** 2) / 2) for v in (d, e))
     by_d, by_e = by_d * T, by_e * S
-    by_x = [-(by_d * shape.normal[:, :1, k] + by_e * shape.normal[:, 1:, k]) for k in (0, 1)]
+    by_x = [-(by_d * normal[:, :1, k] + by_e * normal[:, 1:, k]) for k in (0, 1)]
     J = np.stack([*by_x, np.ones_like(d), S * T, -(by_d * d + by_e * e)], -1)
-    return root, values - model.level - b * S * T, J
+    return values - model.level - b * S * T, J
 
 
 def _distances(offset: Array, shape: EdgeGeometry, extent: Array, width: Array) -> tuple[Array, Array, Array]:

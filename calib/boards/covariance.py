@@ -39,12 +39,8 @@ class RigCovariance:
 
     def of(self, name: str, camera: Camera) -> Float[np.ndarray, "p c"]:
         """The selection matrix of a camera's parameters, in the order of `parameter_names`, among these."""
-        selection = np.zeros((len(parameter_names(camera)), len(self.names)))
-        index = {free: i for i, free in enumerate(self.names)}
-        for row, entry in enumerate(parameter_names(camera)):
-            if (column := index.get(f"{name}.{entry}")) is not None:
-                selection[row, column] = 1.0
-        return selection
+        entries = np.array([f"{name}.{entry}" for entry in parameter_names(camera)])
+        return (entries[:, None] == np.array(self.names, dtype=str)).astype(np.float64)
 
     def save(self, path: str | Path) -> None:
         """Write it as JSON, atomically."""

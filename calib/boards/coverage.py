@@ -10,9 +10,9 @@ from jaxtyping import Int
 
 from arraygeom import Pose
 
+from .board import Board
 from .intrinsics import BoardViews
 from .photos import FrameKey
-from .target import Board
 
 CELLS = 6, 8
 """Rows and columns of the coverage grid."""

@@ -14,9 +14,10 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 
+from .board import Board, MarkedBoard, marker_dictionary
 from .corners import monomials, refine_corners
 from .known_points import KnownPoints
-from .target import AprilGrid, Board, Charuco, Chessboard, Circles, MarkedBoard, marker_dictionary
+from .target import AprilGrid, Charuco, Chessboard, Circles
 
 Grey = UInt8[np.ndarray, "h w"]
 
@@ -226,18 +227,15 @@ def _by_gradients(grey: Grey, x: np.ndarray, share: float) -> np.ndarray:
 
 
 def _plausible(found: Detection, board: Board) -> bool:
-    """Whether there are enough points, not collinear, and on a smoothly distorted grid."""
+    """Whether there are enough points, not collinear, and on a smoothly distorted grid.
+
+    A homography plus a polynomial of degree 3 has to map the points on the board to the pixels.
+    """
     if isinstance(board, KnownPoints):
         return True
     p = board.points[found.ids, :2]
     if len(p) < FEWEST or np.linalg.svd(p - p.mean(0), compute_uv=False)[1] <= 0.5 * board.spacing:
         return False
-    return _smooth(found, board)
-
-
-def _smooth(found: Detection, board: Board) -> bool:
-    """Whether a homography plus a polynomial of degree 3 maps the points on the board to the pixels."""
-    p = board.points[found.ids, :2]
     H, _ = cv2.findHomography(p, found.x)
     if H is None:
         return False
@@ -267,8 +265,8 @@ def _reason(grey: Grey, board: Board) -> str:
 
 def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
     border = board.border if isinstance(board, AprilGrid) else 1
-    ids, last = _markers(grey, board.dictionary, border), board.markers[-1]
-    if isinstance(board, AprilGrid) and len(_markers(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
+    ids, last = _tags(grey, board.dictionary, border), board.markers[-1]
+    if isinstance(board, AprilGrid) and len(_tags(grey, board.dictionary, 3 - border)) >= max(4, len(ids)):
         other = f"border{3 - border}"
         return f"its tags have {3 - border} black bits around their codes: add ':{other}' to the board's name"
     if isinstance(board, KnownPoints):
@@ -286,24 +284,17 @@ def _marker_reason(grey: Grey, board: MarkedBoard) -> str | None:
             f"{legacy}"
         )
     for name in OTHER_DICTIONARIES:
-        if len(seen := _markers(grey, name)) >= 6:
+        if len(seen := _tags(grey, name, 1)) >= 6:
             return f"{len(seen)} markers of the dictionary {name} are visible, not of {board.dictionary}: name that one"
-    if len(_markers(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
+    if len(_tags(np.ascontiguousarray(grey[:, ::-1]), board.dictionary, border)) >= 4:
         return "its markers are found once the image is mirrored: save the images as captured, not mirrored"
     return None
-
-
-def _markers(grey: Grey, dictionary: str, border: int = 1) -> list[int]:
-    if not hasattr(cv2.aruco, f"DICT_{dictionary.upper()}"):
-        return []
-    return list(_tags(grey, dictionary, border))
 
 
 def _grid_size(grey: Grey) -> tuple[int, int] | None:
     """The (columns, rows) of inner corners of the largest chessboard in an image."""
     scale = min(1.0, SMALL / grey.shape[1])
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    done, _, meta = cv2.findChessboardCornersSBWithMeta(
-        small, (3, 3), cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
-    )
+    flags = cv2.CALIB_CB_LARGER | cv2.CALIB_CB_NORMALIZE_IMAGE
+    done, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), flags)
     return (meta.shape[1], meta.shape[0]) if done else None

@@ -14,9 +14,9 @@ from jaxtyping import Float
 from arraygeom import Camera, Distortion, Pose, intrinsics
 from arraygeom.pixels import HW
 
+from .board import Board
 from .detect import Detection
 from .photos import FrameKey
-from .target import Board
 
 Lens = Literal["brown-conrady", "rational", "thin-prism", "tilted", "kannala-brandt", "none"]
 COEFFICIENTS: dict[Lens, int] = {"brown-conrady": 5, "rational": 8, "thin-prism": 12, "tilted": 14}
@@ -118,9 +118,9 @@ def _only(found: Detection, mask: np.ndarray) -> Detection:
 
 
 def _solved(name: str, views: BoardViews, board: Board, lens: Lens) -> tuple[Camera, dict[FrameKey, Pose]]:
-    solve = _pinhole if lens in COEFFICIENTS or lens == "none" else _fisheye
+    pinhole = lens in COEFFICIENTS or lens == "none"
     try:
-        K, coefficients, rotations, translations = solve(views, board, lens)
+        K, coefficients, rotations, translations = _pinhole(views, board, lens) if pinhole else _fisheye(views, board)
     except cv2.error as error:
         raise ValueError(
             f"{name}: OpenCV finds no camera that fits these boards ({error.err}): do all show the same board?"
@@ -200,8 +200,7 @@ def _linear_intrinsics(view: tuple[np.ndarray, np.ndarray], hw: HW) -> np.ndarra
     return np.array(intrinsics(float(np.clip(focal, 0.3 * max(hw), 30 * max(hw))), hw))
 
 
-def _fisheye(views: BoardViews, board: Board, lens: Lens) -> Solved:
-    del lens
+def _fisheye(views: BoardViews, board: Board) -> Solved:
     if not board.flat:
         raise ValueError("fisheyes need a flat board to start from: points of known position give pinhole cameras")
     points = [board.points[d.ids][:, None] for d in views.seen.values()]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .target import MarkedBoard, smallest_dictionary
+from .board import MarkedBoard, smallest_dictionary
 
 COLUMNS = ("id", "x", "y", "z"), ("id", "corner", "x", "y", "z")
 FEWEST = 6

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from arraygeom import Pose
+from arraygeom import stack
 
+from .board import Board
 from .bundle import BoardPoses, BundleProblem, Observations, readjusted
 from .camera_parameters import parameter_names
 from .intrinsics import BoardViews, Lens, board_pose
 from .photos import FrameKey
 from .rig import SingleCalibration, calibrate_single
-from .target import Board
 
 MODELS: tuple[Lens, ...] = ("none", "kannala-brandt", "brown-conrady", "rational", "thin-prism", "tilted")
 """By number of coefficients."""
@@ -90,7 +90,7 @@ def _frame_error(fit: SingleCalibration, key: FrameKey, views: BoardViews, board
     part = board.part[found.ids[:1]]
     problem = BundleProblem(
         {"": camera},
-        BoardPoses(Pose(pose.R[None], pose.t[None])),
+        BoardPoses(stack([pose])),
         {"": Observations(np.zeros(len(found.ids), dtype=int), board.points[found.ids], found.x)},
         shape=None if solved.shape is None else solved.shape.of_blocks(part),
     )

@@ -12,10 +12,10 @@ import torch
 
 from arraygeom import Camera, Pose
 
+from .board import Board
 from .detect import Detection
 from .intrinsics import BoardViews, board_pose
 from .photos import FrameKey
-from .target import Board
 
 TOLERANCE = 0.03
 """A frame agrees with a pose if it predicts the board to this share of the image width: one view of a small board
@@ -96,10 +96,9 @@ def pair_pose(a: CalibratedViews, b: CalibratedViews, board: Board) -> RelativeP
     candidates = [a.poses[key] @ symmetry @ b.poses[key].inverse() for key in tried for symmetry in symmetries]
     voted = max((_vote(a, b, pose, shared, board) for pose in candidates), key=lambda v: v.score)
     for _ in range(2):
-        averaged = average_pose(
-            [nearest_pose(voted.pose, a.poses[k], b.poses[k], symmetries) for k in voted.agreeing] or [voted.pose]
-        )
-        voted = max(voted, _vote(a, b, averaged, shared, board), key=lambda v: v.score)
+        poses = [nearest_pose(voted.pose, a.poses[k], b.poses[k], symmetries) for k in voted.agreeing]
+        averaged = _vote(a, b, average_pose(poses or [voted.pose]), shared, board)
+        voted = max(voted, averaged, key=lambda v: v.score)
     corners = sum(len(a.views.seen[k].ids) + len(b.views.seen[k].ids) for k in voted.agreeing)
     return RelativePose(voted.pose, voted.agreeing, shared, corners)
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from .target import Board
+from .board import Board
 
 PAPERS = {
     "A4": (210, 297),

@@ -8,11 +8,11 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from jaxtyping import Float
 
-from arraygeom import Camera, Pose, Rig
+from arraygeom import Camera, Pose, Rig, stack
 
+from .board import Board
 from .bundle import BoardPoses, BundleProblem, BundleResult, Free, Observations, adjust, loss, noise
 from .camera_parameters import CameraPrior, intrinsic_values, parameter_names
 from .intrinsics import BoardViews, InitialCamera, Lens, calibrate_camera, check_tilts, without_outliers
@@ -23,7 +23,6 @@ from .photos import FrameKey
 from .poses import CalibratedViews, InitialRig, initial_rig
 from .shape import LEAST_GAIN, BoardShape, described, fewest_frames, is_significant
 from .start import StartDeviations, rig_near_start, start_cameras, start_notes, start_prior
-from .target import Board
 from .validation import epipolar_errors, held_out_errors, misfit_notes, misfits
 
 SYNCHRONISED = "taken at the same moments, with matching numbers, not mirrored, with a stiff board"
@@ -94,14 +93,12 @@ def calibrate(
     single = {
         name: calibrate_single(name, v, board, lens=models[name], final=len(views) == 1) for name, v in views.items()
     }
-    initial = initial_rig(
-        [CalibratedViews(name, a.camera, a.views, a.cam_from_board) for name, a in single.items()], board
-    )
+    alone = [CalibratedViews(name, a.camera, a.views, a.cam_from_board) for name, a in single.items()]
+    initial = initial_rig(alone, board)
     cameras = {name: a.camera.replace(cam_from_world=initial.cam_from_world[name]) for name, a in single.items()}
-    together, initial = _joint_fit(initial, cameras, board, single)
-    return _finished(
-        *_scaled_covariance(together), initial, board, single, _images_left_out(views, single, initial.left_out)
-    )
+    fit, notes, initial = _joint_fit(initial, cameras, board, single)
+    notes = [*_images_left_out(views, single, initial.left_out), *notes]
+    return _finished(*_scaled_covariance(fit), initial, board, single, notes)
 
 
 def _from_start(
@@ -113,27 +110,27 @@ def _from_start(
     placed = {name: c.replace(cam_from_world=initial.cam_from_world[name]) for name, c in cameras.items()}
     detected, flat = initial.views, _flat(board, initial.world_from_board, initial.views)
     problem = replace(_problem(placed, initial.world_from_board, detected, board), priors=priors)
-    fit, free, notes = _fitted(problem, flat)
-    used = {name: _near_fit(fit, name, v, initial, board) for name, v in detected.items()}
+    fit, notes = _fitted(problem, flat)
+    used = {name: _near_fit(fit, name, v, initial.world_from_board, board) for name, v in detected.items()}
     if left_out := [note for name, v in detected.items() for note in _points_left_out(name, v, used[name])]:
         initial = initial._replace(views=used)
         boards = fit.problem.board_poses(initial.world_from_board)
-        fit, free, notes = _fitted(replace(_problem(fit.problem.cameras, boards, used, board), priors=priors), flat)
+        fit, notes = _fitted(replace(_problem(fit.problem.cameras, boards, used, board), priors=priors), flat)
     far = (f"{name}: left out {key}: its board contradicts the start" for name, key in initial.left_out)
-    together, factor = _scaled_covariance(_JointFit(fit, free, notes))
-    return _finished(together, factor, initial, board, {}, [*start_notes(together.fit, deviations), *far, *left_out])
+    fit, factor = _scaled_covariance(fit)
+    return _finished(fit, factor, initial, board, {}, [*start_notes(fit, deviations), *far, *left_out, *notes])
 
 
-def _near_fit(fit: BundleResult, name: str, views: BoardViews, initial: InitialRig, board: Board) -> BoardViews:
-    """A camera's views without the points that a fit of all cameras shows to be outliers."""
-    camera, boards = fit.problem.cameras[name], fit.problem.board_poses(initial.world_from_board)
+def _near_fit(fit: BundleResult, name: str, views: BoardViews, frames: Iterable[FrameKey], board: Board) -> BoardViews:
+    """A camera's views without the points that a fit shows to be outliers; `frames` are those of its blocks."""
+    camera, boards = fit.problem.cameras[name], fit.problem.board_poses(frames)
     poses = {key: camera.cam_from_world @ boards[key] for key in views.seen}
     points = board.points if fit.problem.shape is None else fit.problem.shape.deformed(board.points, board.part)
     return without_outliers(views, camera, poses, points, sigma=fit.sigma[name])
 
 
 def _finished(
-    together: _JointFit,
+    fit: BundleResult,
     factor: float,
     initial: InitialRig,
     board: Board,
@@ -141,22 +138,16 @@ def _finished(
     notes: Iterable[str],
 ) -> Calibration:
     """The calibration by a fit of all cameras, with its errors, and notes after those given."""
-    rig, frames = Rig(together.fit.problem.cameras), tuple(initial.world_from_board)
+    rig, frames = Rig(fit.problem.cameras), tuple(initial.world_from_board)
     return Calibration(
         rig=rig,
         board=board,
-        fit=together.fit,
+        fit=fit,
         frames=frames,
         views=initial.views,
         single={name: a.fit.problem.rms() for name, a in single.items()},
         epipolar=epipolar_errors(rig, initial.views),
-        notes=(
-            *notes,
-            *together.notes,
-            *together.shape_notes(board),
-            *misfit_notes(together.fit, frames),
-            *_noted(factor),
-        ),
+        notes=(*notes, *_shape_notes(fit, board), *misfit_notes(fit, frames), *_noted(factor)),
         raised=factor,
     )
 
@@ -197,10 +188,9 @@ def calibrate_single(
     shape = None
     for _ in range(ROUNDS):
         problem = replace(_problem({name: camera}, poses, {name: used}, board), shape=shape)
-        fit, _, notes = _fitted(problem, flat, final=final)
+        fit, notes = _fitted(problem, flat, final=final)
         camera, poses, shape = fit.problem.cameras[name], fit.problem.board_poses(poses), fit.problem.shape
-        points = board.points if shape is None else shape.deformed(board.points, board.part)
-        before, used = used, without_outliers(kept, camera, poses, points, sigma=fit.sigma[name])
+        before, used = used, _near_fit(fit, name, kept, poses, board)
         if _count_points(used) == _count_points(before):
             break
     found = SingleCalibration(fit, before, tuple(poses), tuple(notes))
@@ -208,23 +198,22 @@ def calibrate_single(
     return found
 
 
-def _scaled_covariance(together: _JointFit) -> tuple[_JointFit, float]:
+def _scaled_covariance(fit: BundleResult) -> tuple[BundleResult, float]:
     """The fit with its covariance raised if frames disagree considerably; and the largest factor of its deviations.
 
     The raised covariance is the mean of the jackknife's, which few frames make noisy, and of that of the points' noise,
     scaled to the jackknife's level: the median over the parameters, as frames that disagree about a focal length say
     nothing of the lens.
     """
-    fit = together.fit
     if fit.covariance is None or not len(fit.covariance) or len(fit.problem.structure) < FEWEST_TO_JACKKNIFE:
-        return together, 1.0
+        return fit, 1.0
     found = jackknife(fit.problem, fit.free(), fit.sigma)
     disagreement = float(np.sqrt(np.trace(np.linalg.solve(fit.covariance, found.covariance)) / len(fit.covariance)))
     if disagreement < CONSIDERABLE:
-        return together, 1.0
+        return fit, 1.0
     level = max(1.0, float(np.median(_ratio(found.left_out, fit.covariance))))
     raised = (level**2 * fit.covariance + found.left_out) / 2
-    return together._replace(fit=fit._replace(covariance=raised)), float(_ratio(raised, fit.covariance).max())
+    return fit._replace(covariance=raised), float(_ratio(raised, fit.covariance).max())
 
 
 def _ratio(a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -242,41 +231,32 @@ def _noted(factor: float) -> list[str]:
     ]
 
 
-class _JointFit(NamedTuple):
-    """The fit of all cameras, its free parameters and notes."""
-
-    fit: BundleResult
-    free: dict[str, np.ndarray]
-    notes: list[str]
-
-    def shape_notes(self, board: Board) -> list[str]:
-        """What the boards were found to be shaped like, if not flat."""
-        problem = self.fit.problem
-        if problem.shape is None:
-            return []
-        covariance = jackknife(problem, self.fit.free(), self.fit.sigma).shapes
-        deviations = np.sqrt(covariance.diagonal()).reshape(problem.shape.values.shape)
-        return described(problem.shape, deviations, board.extents)
+def _shape_notes(fit: BundleResult, board: Board) -> list[str]:
+    """What the boards were found to be shaped like, if not flat."""
+    shape = fit.problem.shape
+    if shape is None:
+        return []
+    covariance = jackknife(fit.problem, fit.free(), fit.sigma).shapes
+    return described(shape, np.sqrt(covariance.diagonal()).reshape(shape.values.shape), board.extents)
 
 
 def _joint_fit(
     initial: InitialRig, cameras: Mapping[str, Camera], board: Board, single: Mapping[str, SingleCalibration]
-) -> tuple[_JointFit, InitialRig]:
-    """All cameras at once; if they fit far worse than alone, with their single calibrations as priors.
+) -> tuple[BundleResult, list[str], InitialRig]:
+    """All cameras at once, with notes; if they fit far worse than alone, with their single calibrations as priors.
 
     Boards that move between the exposures of unsynchronised cameras would distort the lens models otherwise. A few
     images that contradict the others (boards detected a square off, say) are left out.
     """
     if len(cameras) == 1:
         (only,) = single.values()
-        fixed = {name: np.zeros(len(parameter_names(c)), dtype=bool) for name, c in cameras.items()}
-        return _JointFit(only.fit, fixed, list(only.notes)), initial
+        return only.fit, list(only.notes), initial
     problem = _problem(cameras, initial.world_from_board, initial.views, board)
-    fit, free, notes = _fitted(problem, _flat(board, initial.world_from_board, initial.views))
+    fit, notes = _fitted(problem, _flat(board, initial.world_from_board, initial.views))
     if wrong := _wrong_images(fit, initial, single):
         return _joint_fit(initial.without(wrong), cameras, board, single)
     if not (doubts := _inconsistent_cameras(fit, single)):
-        return _JointFit(fit, free, notes), initial
+        return fit, notes, initial
     priors = {name: _as_prior(name, a) for name, a in single.items()}
     free = {name: priors[name].information.diagonal() > 0 for name in problem.cameras}
     for index, mask in enumerate(free.values()):
@@ -284,7 +264,7 @@ def _joint_fit(
     fit = adjust(replace(problem, priors=priors, shape=fit.problem.shape), free, equal_noise=True)
     kept = "so each camera's intrinsics keep close to its own calibration"
     notes = [note for a in single.values() for note in a.notes]
-    return _JointFit(fit, free, [*notes, f"{doubts}; {kept}"]), initial
+    return fit, [*notes, f"{doubts}; {kept}"], initial
 
 
 def _wrong_images(
@@ -335,11 +315,9 @@ def _problem(
     cameras: Mapping[str, Camera], boards: Mapping[FrameKey, Pose], views: Mapping[str, BoardViews], board: Board
 ) -> BundleProblem:
     index = {key: i for i, key in enumerate(boards)}
-    poses = Pose(torch.stack([p.R for p in boards.values()]), torch.stack([p.t for p in boards.values()]))
     seen = {name: _observations(v, index, board) for name, v in views.items()}
-    return BundleProblem(
-        cameras, BoardPoses(poses), seen, {name: typical_prior(camera) for name, camera in cameras.items()}
-    )
+    priors = {name: typical_prior(camera) for name, camera in cameras.items()}
+    return BundleProblem(cameras, BoardPoses(stack(list(boards.values()))), seen, priors)
 
 
 def _flat(board: Board, boards: Iterable[FrameKey], views: Mapping[str, BoardViews]) -> BoardShape | None:
@@ -355,9 +333,7 @@ def _observations(views: BoardViews, index: Mapping[FrameKey, int], board: Board
     return Observations(*(np.concatenate(part) for part in zip(*parts)))
 
 
-def _fitted(
-    problem: BundleProblem, flat: BoardShape | None, *, final: bool = True
-) -> tuple[BundleResult, dict[str, np.ndarray], list[str]]:
+def _fitted(problem: BundleProblem, flat: BoardShape | None, *, final: bool = True) -> tuple[BundleResult, list[str]]:
     """Fit all observable parameters; those that turn out to be unobservable are fixed, until none is.
 
     Parameters fixed before the fit, when the noise was overestimated, may return after it; and boards that are clearly
@@ -378,7 +354,7 @@ def _fitted(
     while True:
         problem, free, dropped = gate(fit.problem, free, fit.sigma, final=final)
         if not dropped:
-            return fit, free, notes
+            return fit, notes
         notes, fit = notes + dropped, adjust(problem, free)
 
 

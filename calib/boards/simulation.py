@@ -21,9 +21,9 @@ from arraygeom import Camera, Pose, Rig, pixel_grid, rotation_from_vector, stack
 from arraygeom.atomic import write_atomically
 from arraygeom.viz import calibrated
 
+from .board import Board
 from .printing import draw_board
 from .shape import BoardShape
-from .target import Board
 
 FILLS = (0.35, 0.9)
 """Least and largest width of the board, as a share of the narrowest view."""
@@ -50,7 +50,7 @@ def simulate_photos(
         (folder / name).mkdir(parents=True, exist_ok=True)
         rays = fine_rays(camera)
         for i in range(count):
-            pose = camera.cam_from_world @ Pose(boards.R[i], boards.t[i])
+            pose = camera.cam_from_world @ boards[i]
             image = photograph(camera, pose, board, rays=rays) + random.normal(0, noise, camera.hw)
             png = cv2.imencode(".png", np.clip(image.round(), 0, 255).astype(np.uint8))[1]
             with write_atomically(folder / name / f"{i:03d}.png") as temporary:

@@ -10,12 +10,12 @@ import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig
 
+from .board import Board
 from .bundle import BundleResult
 from .camera_parameters import CameraPrior, centre_derivatives, intrinsic_values
 from .intrinsics import COEFFICIENTS, BoardViews, Lens, board_pose
 from .observability import typical_prior
 from .poses import CalibratedViews, InitialRig, average_pose, consistent_boards, nearest_pose, symmetry_poses
-from .target import Board
 
 FAR_FROM_START = 4.0
 """Standard deviations from the start beyond which a camera is named."""
@@ -73,10 +73,9 @@ def start_cameras(start: Rig, views: Mapping[str, BoardViews], lens: Mapping[str
             (h, w), (rows, columns) = camera.hw, v.hw
             raise ValueError(f"{name}: its images are {columns}x{rows} and the start states {w}x{h}")
         if camera.distortion is None and lens[name] != "none":
-            model, count = (
-                ("brown-conrady", COEFFICIENTS[lens[name]]) if lens[name] in COEFFICIENTS else ("kannala-brandt", 4)
-            )
-            camera = camera.replace(distortion=Distortion(model, torch.zeros(count, dtype=torch.float64)))
+            model = "brown-conrady" if lens[name] in COEFFICIENTS else "kannala-brandt"
+            coefficients = torch.zeros(COEFFICIENTS.get(lens[name], 4), dtype=torch.float64)
+            camera = camera.replace(distortion=Distortion(model, coefficients))
         found[name] = camera.to(torch.float64)
     return found
 

@@ -20,7 +20,6 @@ Points are (x, y, 0) in metres: x along the rows, y down the columns, z into the
 from __future__ import annotations
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,6 +34,9 @@ from matplotlib.patches import Circle, Rectangle
 
 from arraygeom.safe_yaml import load_yaml
 
+from .board import Board, MarkedBoard, marker_dictionary, smallest_dictionary, unit_grid
+from .known_points import known_points
+
 UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
 FORMS = (
     "chessboard:9x6:25mm (inner corners), charuco:8x6:30mm (squares), circles:7x5:20mm, acircles:4x11:20mm or "
@@ -42,75 +44,6 @@ FORMS = (
 )
 LARGEST = 100
 APRIL_TAGS = "apriltag_36h11"
-
-
-@dataclass(frozen=True)
-class Board(ABC):
-    """A flat grid of points, `columns` x `rows` of them, `spacing` metres apart."""
-
-    columns: int
-    rows: int
-    spacing: float
-    identified: ClassVar[bool] = False
-    """Whether points are identified one by one, by markers."""
-
-    @property
-    def flat(self) -> bool:
-        """Whether the points lie in a plane."""
-        return True
-
-    @property
-    def members(self) -> tuple[Board, ...]:
-        """The boards, if there are several."""
-        return (self,)
-
-    @cached_property
-    def points(self) -> Float[np.ndarray, "n 3"]:
-        """Positions of the points on the board, metres, row by row."""
-        return _grid(self.columns, self.rows) * self.spacing
-
-    @cached_property
-    def symmetries(self) -> tuple[Int[np.ndarray, " n"], ...]:
-        """The renumberings of the points under rotations of the board, the identity first; it alone with markers.
-
-        A detector may number the points in any of these ways: colours do not disambiguate them, as they are inverted
-        in some images (near infrared).
-        """
-        if self.identified:
-            return (np.arange(len(self.points)),)
-        points = self.points[:, :2] - (self.points[:, :2].max(0) + self.points[:, :2].min(0)) / 2
-        found = []
-        for quarter_turns in range(4):
-            rotated = points @ np.linalg.matrix_power(np.array([[0, 1], [-1, 0]]), quarter_turns)
-            distance = np.linalg.norm(rotated[:, None] - points[None], axis=-1)
-            image = distance.argmin(1)
-            if distance.min(1).max() < 0.01 * self.spacing:
-                found.append(image)
-        return tuple(found)
-
-    @property
-    def part(self) -> Int[np.ndarray, " n"]:
-        """The board that each point is on: 0, unless several boards are used at once."""
-        return np.zeros(len(self.points), dtype=int)
-
-    @property
-    def extents(self) -> list[tuple[float, float]]:
-        """`extent` of each board."""
-        return [self.extent]
-
-    @property
-    def extent(self) -> tuple[float, float]:
-        """Width and height of the print without its margin, metres: the squares around the corners."""
-        return (self.columns + 1) * self.spacing, (self.rows + 1) * self.spacing
-
-    @property
-    def offset(self) -> float:
-        """Distance of the first point from the upper and the left edge of the print without its margin, metres."""
-        return self.spacing
-
-    @abstractmethod
-    def _draw(self, axes: Any) -> None:
-        """Draw the board with its corner at (0, 0), in millimetres, y down."""
 
 
 @dataclass(frozen=True)
@@ -125,23 +58,6 @@ class Chessboard(Board):
         for row in range(self.rows + 1):
             for column in range(row % 2, self.columns + 1, 2):
                 axes.add_patch(_black(column * side, row * side, side, side))
-
-
-@dataclass(frozen=True)
-class MarkedBoard(Board):
-    """A board whose points are identified individually: a part of it is enough, its orientation is unambiguous.
-
-    first: the number of its first marker.
-    """
-
-    dictionary: str
-    first: int
-    identified: ClassVar[bool] = True
-
-    @property
-    @abstractmethod
-    def markers(self) -> Sequence[int]:
-        """The numbers of its markers."""
 
 
 @dataclass(frozen=True)
@@ -206,7 +122,7 @@ class AprilGrid(MarkedBoard):
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the tags' corners on the board, metres, row by row."""
-        grid = _grid(self.columns, self.rows)
+        grid = unit_grid(self.columns, self.rows)
         return (grid // 2) * (self.tag + self.gap) + (grid % 2) * self.tag
 
     @cached_property
@@ -289,7 +205,7 @@ class Circles(Board):
     @cached_property
     def points(self) -> Float[np.ndarray, "n 3"]:
         """Positions of the centres on the board, metres, row by row."""
-        grid = _grid(self.columns, self.rows)
+        grid = unit_grid(self.columns, self.rows)
         if self.asymmetric:
             grid[:, 0] = 2 * grid[:, 0] + grid[:, 1] % 2
         return grid * self.spacing
@@ -324,8 +240,6 @@ def parse_board(text: str) -> Board:
     if text.lower().endswith((".yaml", ".yml")):
         text = _kalibr_target(Path(text))
     if ".csv" in text:
-        from .known_points import known_points
-
         return known_points(text)
     kind, _, rest = text.strip().lower().partition(":")
     parts = rest.split(":")
@@ -364,11 +278,6 @@ def parse_boards(texts: Sequence[str]) -> Board:
     return Boards(first.columns, first.rows, first.spacing, tuple(boards))
 
 
-def marker_dictionary(name: str) -> cv2.aruco.Dictionary:
-    """OpenCV's dictionary of a name such as "4x4_50"."""
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name.upper()}"))
-
-
 def _draw_marker(
     axes: Any,
     dictionary: str,
@@ -393,12 +302,6 @@ def _draw_marker(
 
 def _black(x: float, y: float, width: float, height: float) -> Rectangle:
     return Rectangle((x, y), width, height, facecolor="black", edgecolor="none", snap=False)
-
-
-def _grid(columns: int, rows: int) -> np.ndarray:
-    grid = np.zeros((rows, columns, 3))
-    grid[..., 0], grid[..., 1] = np.arange(columns), np.arange(rows)[:, None]
-    return grid.reshape(-1, 3)
 
 
 def _charuco(text: str, columns: int, rows: int, spacing: float, options: list[str]) -> Charuco:
@@ -452,18 +355,6 @@ def _kalibr_target(path: Path) -> str:
     except (KeyError, TypeError, ValueError, RecursionError, yaml.YAMLError):
         pass
     raise ValueError(f"{path}: not a target of Kalibr's that is known here: an aprilgrid, or a checkerboard of squares")
-
-
-def smallest_dictionary(text: str, name: str, markers: int) -> str:
-    """The smallest dictionary of a kind that has enough markers; larger ones begin with the same markers.
-
-    `text` names the target in the ValueError where there is none.
-    """
-    names = [name.upper()] if "_" in name else [f"{name.upper()}_{n}" for n in (50, 100, 250, 1000)]
-    for full in names:
-        if hasattr(cv2.aruco, f"DICT_{full}") and len(marker_dictionary(full).bytesList) >= markers:
-            return full.lower()
-    raise ValueError(f"board '{text}': no dictionary '{name}' of OpenCV has the {markers} markers it needs; try 4x4")
 
 
 def _counts(text: str, part: str, *, fewest: int = 3) -> tuple[int, int]:

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from arraygeom import Pose, Rig, epipolar_distance
+from arraygeom import Rig, epipolar_distance
 
 from .bundle import BoardPoses, BundleProblem, BundleResult, readjusted
 from .intrinsics import LEAST_SIGMA, BoardViews
@@ -34,13 +34,12 @@ def without_blocks(problem: BundleProblem, kept: Bool[np.ndarray, " b"]) -> Bund
     """The problem with some of its boards only."""
     assert isinstance(problem.structure, BoardPoses)
     index, boards = np.cumsum(kept) - 1, problem.structure.world_from_board
-    mask = torch.from_numpy(kept)
     seen = {}
     for name, s in problem.seen.items():
         mine = kept[s.block]
         seen[name] = s._replace(block=index[s.block[mine]], p=s.p[mine], x=s.x[mine])
     shape = problem.shape and problem.shape.of_blocks(problem.shape.part[kept])
-    return replace(problem, structure=BoardPoses(Pose(boards.R[mask], boards.t[mask])), seen=seen, shape=shape)
+    return replace(problem, structure=BoardPoses(boards[torch.from_numpy(kept)]), seen=seen, shape=shape)
 
 
 def held_out_errors(

@@ -15,13 +15,13 @@ import numpy as np
 from arraygeom.atomic import write_text
 
 from .adequacy import intrinsics_of, next_views
+from .board import Board
 from .collect import detected
 from .detect import Detection
 from .intrinsics import BoardViews, Lens
 from .photos import FrameKey, Photos, find_photos
 from .report import STYLE, coverages
 from .rig import Calibration, calibrate
-from .target import Board
 
 WIDTH = 420
 """Of the images shown, pixels."""

@@ -8,7 +8,7 @@ better known by the points than by the prior; otherwise that combination of para
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,10 +17,8 @@ from torch import Tensor
 
 from arraygeom import Rig
 
-from .matches import Matches
+from .matches import Pairs
 from .residuals import match_depths
-
-Pairs = Mapping[tuple[str, str], Matches]
 
 SIGNIFICANT_CHANGE = 3.0
 """Standard deviations by which a mode of depth must change."""
@@ -77,10 +75,10 @@ def observed_depths(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     parts = []
     for names, matches in pairs.items():
         found = match_depths(rig.pair(*names), matches)
-        unknown = torch.full((len(matches.alpha),), torch.nan, dtype=torch.float64)
-        parts.append(
-            unknown if found is None else torch.where(found.front & found.observable, found.depth, unknown).detach()
-        )
+        depth = torch.full((len(matches.alpha),), torch.nan, dtype=torch.float64)
+        if found is not None:
+            depth = torch.where(found.front & found.observable, found.depth, depth)
+        parts.append(depth.detach())
     return torch.cat(parts)
 
 
@@ -161,8 +159,3 @@ def depth_modes(
     raised = (share * jackknife.square().sum(0)).sqrt().clamp(min=1)
     size = len(G) ** 0.5
     return DepthModes(root, a[0], raised * norm / size, prior / size, raised)
-
-
-def rms_deviation(G: Float[Tensor, "m n"]) -> float:
-    """The prior's relative deviation of depth: root mean square over the points."""
-    return float(G.square().sum(1).mean().sqrt())

@@ -19,8 +19,8 @@ from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 
-from .held_out import image_parts
-from .matches import Matches, match_cameras
+from .held_out import image_parts, trimmed_square
+from .matches import Images, Matches, Pairs, match_cameras
 from .plausibility import DriftEvidence, plausible
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
@@ -33,10 +33,8 @@ LARGEST_DISTANCE = 1000.0
 """Upper bound of a match's distance from its line, pixels; also for pixels without a ray."""
 HEALTHY_MISFIT = 0.2
 """A rig with a smaller misfit than this, in pixels, is healthy."""
-TRIMMED = 0.85
-"""The share of the points, those nearest to their lines, that statistics use."""
 OF_TRIMMED = 0.52
-"""The mean square of these of normal points of variance 1."""
+"""`trimmed_square` of normal points of variance 1."""
 EQUAL = (1.4, 0.03)
 """Explanations are indistinguishable whose misfit is less than 1.4 times the best one's plus 0.03 px."""
 WRONG_SIDE_PENALTY = 100.0
@@ -55,8 +53,6 @@ FEW = 10
 """Least number of points for a share."""
 BARREL, PINCUSHION = -0.6, 0.4
 """Bounds of k1 times the squared radius of the farthest corner, at z = 1."""
-
-Pairs = Mapping[tuple[str, str], Matches]
 
 
 class FitStatistics(NamedTuple):
@@ -170,7 +166,7 @@ def _rounded(figures: FitStatistics) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
 
 
-def diagnose(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Diagnosis:
+def diagnose(rig: Rig, images: Images) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by one image (C, H, W) of two or more of its cameras.
 
     Raises ValueError, one line, for a camera that the rig lacks, fewer than two images, equal ones, and images in
@@ -328,13 +324,7 @@ def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tu
             fits.append(torch.cat(left))
     left_over = min(fits, key=lambda e: float(e.abs().median()))
     inliers = left_over.abs() <= max(4 * float(left_over.abs().median()), 0.2)
-    return inliers, _trimmed_square(left_over[inliers])
-
-
-def _trimmed_square(off: Tensor) -> float:
-    """The trimmed mean square."""
-    squares = off.square().sort().values
-    return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
+    return inliers, trimmed_square(left_over[inliers])
 
 
 def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
@@ -354,7 +344,7 @@ def _figures(
     off: Tensor, depth: Tensor, front: Tensor, *, inliers: Tensor, floor: float, bounds: Depths | None, handed: float
 ) -> FitStatistics:
     off = off[inliers]
-    misfit = math.sqrt(max(_trimmed_square(off) - floor, 0.0))
+    misfit = math.sqrt(max(trimmed_square(off) - floor, 0.0))
     observable = ~depth.isnan()
     share = float(front[observable].double().mean()) if int(observable.sum()) >= FEW else math.nan
     seen = depth[observable & front]

@@ -16,7 +16,7 @@ from torch import Tensor
 from arraygeom import Rig, View, intrinsics
 from arraygeom.progress import part, stage
 
-from .held_out import line_distances, split
+from .held_out import median_off, split
 from .lenses import describe_lenses
 from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, matching_time, with_map
 from .refinement import refine_matches
@@ -85,17 +85,13 @@ def rig_from_images(
         refined = refine_matches(rig, [matched])
     if refined.accepted:
         rig = refined.rig
-        found.distance.update(_distances(rig, matched))
+        _, held_out = split([matched])
+        found.distance.update({names: median_off(rig, {names: m}) for names, m in held_out.items()})
     for names, matches in matched.items():
         fit = with_map(rig.pair(*names), matches)
         links[names] = fit.link
         found.points[names], found.displacement[names] = len(fit.matches.alpha), fit.displacement
     return found._replace(rig=rig.replace(links=links))
-
-
-def _distances(rig: Rig, matched: Mapping[tuple[str, str], Matches]) -> dict[tuple[str, str], float]:
-    _, held_out = split([matched])
-    return {names: float(line_distances(rig, {names: m}).abs().median()) for names, m in held_out.items()}
 
 
 def _fundamental(matches: Matches, K: Tensor | None, K_beta: Tensor | None) -> tuple[Tensor, float, bool]:

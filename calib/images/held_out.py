@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float, Int
@@ -10,11 +11,9 @@ from torch import Tensor
 
 from arraygeom import Rig
 
-from .matches import Matches
+from .matches import Matches, Pairs
 from .refined import LineStatistics
 from .residuals import epipolar_residuals
-
-Pairs = Mapping[tuple[str, str], Matches]
 
 HELD_OUT = 4
 """One in this many points or frames is held out."""
@@ -22,14 +21,21 @@ CELL = 24
 """Points are held out by squares of this many pixels of alpha, so that neighbours are in the same part."""
 SIGNIFICANT = 2.0
 """Standard errors by which the distances of held-out points must decrease."""
+TRIMMED = 0.85
+"""The share of the points, those nearest to their lines, that statistics use."""
 PARTS = 3
 """The jackknife leaves out one of so many by so many parts of the image."""
 
 
 def line_statistics(distance: Float[Tensor, " n"]) -> LineStatistics:
     """Statistics of the distances of points from their lines."""
-    nearest = distance.abs().sort().values[: max(1, int(0.85 * len(distance)))]
-    return LineStatistics(len(distance), float(distance.abs().median()), float(nearest.square().mean().sqrt()))
+    return LineStatistics(len(distance), float(distance.abs().median()), math.sqrt(trimmed_square(distance)))
+
+
+def trimmed_square(distance: Float[Tensor, " n"]) -> float:
+    """The mean square of the distances of those points that are nearest to their lines."""
+    squares = distance.square().sort().values
+    return float(squares[: max(1, int(TRIMMED * len(squares)))].mean())
 
 
 def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
@@ -41,6 +47,11 @@ def nearer(before: Float[Tensor, " n"], after: Float[Tensor, " n"]) -> bool:
 def line_distances(rig: Rig, pairs: Pairs) -> Float[Tensor, " n"]:
     """Signed distances in pixels of all points from their lines, in beta."""
     return torch.cat([epipolar_residuals(rig.pair(*n), m).line.detach() for n, m in pairs.items()])
+
+
+def median_off(rig: Rig, pairs: Pairs) -> float:
+    """The median size of these distances, pixels."""
+    return float(line_distances(rig, pairs).abs().median())
 
 
 def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:

@@ -73,12 +73,10 @@ def solve(residuals: Residuals, count: int, considered: int = 0) -> Solution:
     """
     total = count + considered
     active = torch.ones(total, dtype=torch.bool)
-    z = torch.zeros(total, dtype=torch.float64)
+    z, eye = torch.zeros(total, dtype=torch.float64), torch.eye(total, dtype=torch.float64)
     while True:
-        basis = torch.eye(total, dtype=torch.float64)[:, active]
-        z = most_probable(residuals, z * active, basis)
+        z = most_probable(residuals, z * active, eye[:, active])
         information, _ = _normal_equations(*jacobian(residuals, z), z)
-        eye = torch.eye(total, dtype=torch.float64)
         kept = active[:, None] & active
         covariance = torch.linalg.inv(torch.where(kept, information, eye))
         observable = covariance.diagonal().sqrt() <= LARGEST_POSTERIOR

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from arraygeom import Camera, Distortion, LensView, Rig, View, apply_homography, fit_homography, intrinsics
+from arraygeom import Camera, Distortion, LensView, Rig, apply_homography, fit_homography, intrinsics
 from arraygeom.pixels import coarse_grid
 
 TERMS = 4
@@ -25,14 +25,10 @@ def with_lenses(rig: Rig, names: Iterable[str]) -> Rig:
     for name in names:
         view = rig[name]
         if name in linked and not isinstance(view, LensView):
-            rig = rig.with_camera(name, _flat(view))
+            lens = Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
+            K = intrinsics(max(view.hw) / 2, view.hw)
+            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens))
     return rig
-
-
-def _flat(view: View) -> LensView:
-    lens = Distortion("brown-conrady", torch.zeros(TERMS, dtype=torch.float64))
-    K = intrinsics(max(view.hw) / 2, view.hw)
-    return LensView(hw=view.hw, sensor=view.sensor, K=K, distortion=lens)
 
 
 def describe_lenses(rig: Rig) -> str:

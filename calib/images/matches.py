@@ -55,6 +55,12 @@ class Matches(NamedTuple):
         return Matches(self.alpha[kept], self.beta[kept])
 
 
+Pairs = Mapping[tuple[str, str], Matches]
+"""Matches of pairs of cameras, by their names (alpha, beta)."""
+Images = Mapping[str, Float[Tensor, "_ _ _"]]
+"""An image (C, H, W) of each camera, by name."""
+
+
 def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
     """Mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
@@ -123,9 +129,7 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.ones_like(deviation, dtype=np.bool_)
 
 
-def match_cameras(
-    images: Mapping[str, Float[Tensor, "_ _ _"]], *, alpha: str | None = None
-) -> dict[tuple[str, str], Matches]:
+def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], Matches]:
     """Matches between the images of every two cameras that are consistent with some fundamental matrix.
 
     With `alpha`, only between that camera's image and each of the others, alpha first.
@@ -163,7 +167,7 @@ def match_cameras(
     return kept
 
 
-def matching_time(images: Mapping[str, Float[Tensor, "_ _ _"]], pairs: int) -> float:
+def matching_time(images: Images, pairs: int) -> float:
     """Roughly how long one core takes to match that many pairs of the images, seconds."""
     return sum(MEGAPIXEL * image[0].numel() / 1e6 for image in images.values()) + PAIR * pairs
 
@@ -180,14 +184,10 @@ def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> Matches:
 
 def agreeing(matches: Matches) -> Matches:
     """The matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if there are few."""
-    none = matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
-    if len(matches.alpha) < ENOUGH:
-        return none
-    try:
-        F = fit_fundamental(matches)
-    except ValueError:
-        return none
-    return near_lines(matches, F, within=AGREE)
+    if len(matches.alpha) >= ENOUGH:
+        with suppress(ValueError):
+            return near_lines(matches, fit_fundamental(matches), within=AGREE)
+    return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
 
 
 def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> Matches:
@@ -280,10 +280,8 @@ def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
         with suppress(cv2.error):
             found, _ = cv2.findFundamentalMat(x, y, method, 1.0, 0.999, 10_000)
         if found is not None and found.shape == (3, 3):
-            break
-    if found is None or found.shape != (3, 3):
-        raise ValueError("no fundamental matrix fits the points seen in both images")
-    return torch.from_numpy(found)
+            return torch.from_numpy(found)
+    raise ValueError("no fundamental matrix fits the points seen in both images")
 
 
 def similarity(matches: Matches) -> Float[Tensor, "3 3"]:

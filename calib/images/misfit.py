@@ -7,13 +7,12 @@ from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig
 
-from .held_out import line_distances
-from .matches import Matches, match_cameras
+from .held_out import median_off
+from .matches import Images, Pairs, match_cameras
 from .residuals import match_depths, own_distance, related
 
 LARGEST_SIDE = 1000
@@ -46,13 +45,13 @@ class Misfit(NamedTuple):
     text: str
 
 
-def misfit_warning(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> str | None:
+def misfit_warning(rig: Rig, images: Images) -> str | None:
     """The sentence of `find_misfit`, if any."""
     found = find_misfit(rig, images)
     return None if found is None else found.text
 
 
-def find_misfit(rig: Rig, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> Misfit | None:
+def find_misfit(rig: Rig, images: Images) -> Misfit | None:
     """What is wrong if the rig fits one image (C, H, W) of each of two or more of its cameras badly; else None.
 
     None too where nothing can be said: too few matched points, images of another size, cameras that are not related.
@@ -86,7 +85,7 @@ class _Compared(NamedTuple):
     """Matched points of reduced images: their median distance from their lines (pixels), and `share_outside`."""
 
     rig: Rig
-    pairs: Mapping[tuple[str, str], Matches]
+    pairs: Pairs
     off: float
     outside: float
 
@@ -109,11 +108,10 @@ def _compared(rig: Rig, images: Mapping[str, Tensor], largest: int) -> _Compared
         pairs = related(rig, match_cameras(reduced))
     except ValueError:
         return None
-    off = float(line_distances(rig, pairs).abs().median())
-    return _Compared(rig, pairs, off, share_outside(rig, pairs))
+    return _Compared(rig, pairs, median_off(rig, pairs), share_outside(rig, pairs))
 
 
-def share_outside(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:
+def share_outside(rig: Rig, pairs: Pairs) -> float:
     """The share of points of observable depth that are behind the cameras or outside the rig's depth range.
 
     Points of calibrated pairs only: 0 where there is no such pair, NaN for few points. The depth range counts with a

@@ -20,7 +20,7 @@ from torch.nn.functional import avg_pool2d, interpolate, pad, unfold
 from arraygeom import Positions, Rig, Segments, pixel_grid
 from arraygeom.fields import recorded_field
 
-from .matches import Matches, seen_depths
+from .matches import Images, Pairs, seen_depths
 
 
 @runtime_checkable
@@ -62,7 +62,7 @@ class PhotometricFrame:
     grid: Mapping[str, Tensor]
 
     @classmethod
-    def of(cls, images: Mapping[str, Float[Tensor, "_ _ _"]]) -> PhotometricFrame:
+    def of(cls, images: Images) -> PhotometricFrame:
         """The frame's images, reduced, with patches as features."""
         grey = {name: _reduced(image) for name, image in images.items()}
         keys = {name: patches(image) for name, image in grey.items()}
@@ -91,7 +91,7 @@ def photometric_errors(
     return torch.where(valid, confidence * (found.value - own)[0, 0], 0.0), valid
 
 
-def with_depths(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> Rig:
+def with_depths(rig: Rig, pairs: Pairs) -> Rig:
     """The rig with the depth range of the matched points, if it has none."""
     if rig.depth is not None:
         return rig

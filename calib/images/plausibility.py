@@ -8,7 +8,6 @@ mistake that a drift explains as well is not a mistake that can be named.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -19,13 +18,11 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Rig
 
 from .least_squares import JoinedResiduals, jacobian
-from .matches import Matches
+from .matches import Pairs
 from .parameters import SIGMA, UNCERTAIN, apply_change, free_parameters
 from .refinement import LARGEST_CHANGE, systematic_columns
 from .remedies import Remedy
 from .residuals import match_depths, sampson_of_pairs
-
-Pairs = Mapping[tuple[str, str], Matches]
 
 SCALES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """Drifts tried, in units of the prior deviations."""

@@ -28,29 +28,17 @@ from torch import Tensor
 from arraygeom import Camera, Rig
 from arraygeom.progress import log_step, part, stage
 
-from .depth_change import (
-    LARGE_CHANGE,
-    NEGLIGIBLE,
-    DepthChange,
-    depth_modes,
-    log_depths,
-    relative_change,
-    rms_deviation,
-    share_behind,
-)
-from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, nearer, split
+from .depth_change import LARGE_CHANGE, NEGLIGIBLE, DepthChange, depth_modes, log_depths, relative_change, share_behind
+from .held_out import PARTS, held_out_pixels, image_parts, line_distances, line_statistics, median_off, nearer, split
 from .least_squares import JoinedResiduals, Residuals, Solution, jacobian, left_out, most_probable, noise_scale, solve
 from .lenses import with_lenses
-from .matches import ENOUGH, Matches, match_cameras, matching_time, with_map
+from .matches import ENOUGH, Images, Pairs, match_cameras, matching_time, with_map
 from .parameters import FreeParameter, apply_change, considered_parameters, free_parameters
 from .photometric import Attend, PhotometricFrame, photometric_errors, with_depths
 from .refined import LineStatistics, ParameterChange, PhotometricResult, Refinement
 from .residuals import own_distance, related, sampson_of_pairs, systematic_modes
 
 LOG = logging.getLogger(__name__)
-
-Pairs = Mapping[tuple[str, str], Matches]
-Frame = Mapping[str, Float[Tensor, "_ _ _"]]
 
 FREE = ("rotation", "centre")
 EXTRA_FREE = ("focal", "translation")
@@ -76,7 +64,7 @@ FITTED = 1.4
 
 def refine(
     rig: Rig,
-    frames: Sequence[Frame],
+    frames: Sequence[Images],
     *,
     free: Iterable[str] = FREE,
     sigma: Mapping[str, float] | None = None,
@@ -164,7 +152,7 @@ def _at_its_best(fit: RefinementProblem, solution: Solution) -> bool:
     if fit.rig.links:
         return False
     rig = fit.after(solution.z)
-    return float(line_distances(rig, fit.held_out).abs().median()) < AT_BEST * own_distance(rig, fit.held_out)
+    return median_off(rig, fit.held_out) < AT_BEST * own_distance(rig, fit.held_out)
 
 
 @dataclass(frozen=True)
@@ -230,14 +218,6 @@ class RefinementProblem:
         """The posterior given the used points, whatever happens to depth."""
         return solve(JoinedResiduals(lambda z: sampson_of_pairs(self.after(z), self.used)), self.count, 0)
 
-    def depth_derivatives(self) -> Float[Tensor, "m k"] | None:
-        """Derivatives of the logarithm of the used points' depth by free and considered parameters.
-
-        None for uncalibrated rigs and for too few points whose depth is observable.
-        """
-        values = log_depths(self.after, [self.rig], self.used)
-        return None if values is None else jacobian(values, torch.zeros(self.uncertain, dtype=torch.float64))[1]
-
     def _determined(self, solution: Solution, residuals: Residuals, *, keep_depth: bool = False) -> Solution:
         """The solution without the modes of depth that the points do not determine.
 
@@ -282,7 +262,7 @@ class RefinementProblem:
         """The changes by a solution, and whether the held-out points, the prior and depth's uncertainty support it."""
         refined = self.after(solution.z)
         distances = [
-            (line_distances(self.rig, pairs), line_distances(refined, pairs)) for pairs in (self.used, self.held_out)
+            [line_distances(rig, pairs) for rig in (self.rig, refined)] for pairs in (self.used, self.held_out)
         ]
         fitted, held_out = ((line_statistics(before), line_statistics(after)) for before, after in distances)
         depth = self._depth_change(refined, solution)
@@ -306,9 +286,10 @@ class RefinementProblem:
 
     def _depth_change(self, refined: Rig, solution: Solution) -> DepthChange | None:
         """None for uncalibrated rigs and for too few points whose depth is observable."""
-        if (G := self.depth_derivatives()) is None:
+        if (values := log_depths(self.after, [self.rig], self.used)) is None:
             return None
-        before = rms_deviation(G)
+        _, G = jacobian(values, torch.zeros(self.uncertain, dtype=torch.float64))
+        before = float(G.square().sum(1).mean().sqrt())
         after = max(before**2 - solution.gained, 0.0) ** 0.5
         return DepthChange(relative_change(self.rig, refined, self.used), before, after, solution.known)
 
@@ -381,7 +362,7 @@ def systematic_columns(rig: Rig, pairs: Pairs) -> Float[Tensor, "m s"]:
 
 
 def polish(
-    fit: RefinementProblem, solution: Solution, frames: Sequence[Frame], attend: Attend
+    fit: RefinementProblem, solution: Solution, frames: Sequence[Images], attend: Attend
 ) -> tuple[Solution, PhotometricResult]:
     """Minimise the photometric error of the fusion, with the solution of the points as its prior.
 
@@ -432,7 +413,7 @@ def _with_maps(rig: Rig, pairs: Pairs) -> Rig:
     return rig.replace(links=links)
 
 
-def _check(rig: Rig, frame: Frame) -> None:
+def _check(rig: Rig, frame: Images) -> None:
     for name, image in frame.items():
         h, w = rig[name].hw
         if tuple(image.shape[1:]) != (h, w):

@@ -7,7 +7,7 @@ A batch of rigs (*b) takes the same points for each, or points (*b, n, 2).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -17,7 +17,7 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Link, Pair, Rig, View, essential_matrix, stack
 from arraygeom.pixels import to_homogeneous
 
-from .matches import Matches, fit_fundamental, line_distance, undistort_matches
+from .matches import Matches, Pairs, fit_fundamental, line_distance, undistort_matches
 
 
 class EpipolarResiduals(NamedTuple):
@@ -53,7 +53,7 @@ def epipolar_residuals(pair: Pair, matches: Matches) -> EpipolarResiduals:
     return _residuals(pair, matches)[0]
 
 
-def sampson_of_pairs(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> list[Float[Tensor, " n"]]:
+def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     """Sampson distances of the points of each pair, pixels; 0 where a pixel has no ray."""
     parts = [epipolar_residuals(rig.pair(*names), matches) for names, matches in pairs.items()]
     return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
@@ -139,7 +139,7 @@ def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
     return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
 
 
-def related(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> dict[tuple[str, str], Matches]:
+def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], Matches]:
     """Those of the pairs that the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
     found = {names: m for names, m in pairs.items() if (pair := rig.pair(*names)).calibrated or pair.link is not None}
     if not found:
@@ -188,7 +188,7 @@ def _rays(pair: Pair, x: Tensor, y: Tensor) -> tuple[tuple[Tensor, Tensor], Tens
     return (a, b), essential_matrix(pair.beta_from_alpha), a_valid & b_valid
 
 
-def own_distance(rig: Rig, pairs: Mapping[tuple[str, str], Matches]) -> float:
+def own_distance(rig: Rig, pairs: Pairs) -> float:
     """How near points can be to any lines: median distance, undistorted pixels, from those of an F fitted to them."""
     found = []
     for names, matches in pairs.items():

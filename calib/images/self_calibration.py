@@ -21,8 +21,8 @@ from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_
 from arraygeom.pixels import map_homogeneous
 from arraygeom.text import angle
 
-from .held_out import line_distances
-from .matches import ENOUGH, Matches, contrast_equalised, line_distance, near_lines
+from .held_out import median_off
+from .matches import ENOUGH, Images, Matches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
 from .refinement import refine_matches
 
@@ -98,7 +98,7 @@ def self_calibrated(
 
 def refined_by_depth(
     pair: RefinedPair,
-    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    images: Images,
     depth: Float[Tensor, "h w"],
     confidence: Float[Tensor, "h w"],
 ) -> RefinedPair:
@@ -135,7 +135,7 @@ def joined(pairs: Mapping[str, RefinedPair], scales: Mapping[str, float]) -> Rig
 
 def dense_matches(
     rig: Rig,
-    images: Mapping[str, Float[Tensor, "_ _ _"]],
+    images: Images,
     depth: Float[Tensor, "h w"],
     confidence: Float[Tensor, "h w"],
 ) -> Matches:
@@ -190,10 +190,7 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
 
 def _poses(matches: Matches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
     """Poses of beta by F and by an essential matrix fitted to the points."""
-    x, y = (
-        map_homogeneous(torch.linalg.inv(K), matches.alpha)[..., :2].numpy(),
-        map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2].numpy(),
-    )
+    x, y = (map_homogeneous(torch.linalg.inv(k), p)[..., :2].numpy() for k, p in zip((K, K_beta), matches))
     threshold = 1 / float(K_beta[0, 0])
     fitted, _ = cv2.findEssentialMat(x, y, np.eye(3), method=cv2.RANSAC, threshold=threshold)
     found = []
@@ -234,7 +231,7 @@ def _refined_pair(rig: Rig, matches: Matches, near: Matches) -> RefinedPair | No
     bounds = depth_bounds(refined, near)
     if bounds is None:
         return None
-    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), _distance(refined, near))
+    return RefinedPair(refined.replace(depth=bounds), len(near.alpha), median_off(refined, {(alpha, beta): near}))
 
 
 def _unit_baseline(rig: Rig) -> Rig:
@@ -242,10 +239,6 @@ def _unit_baseline(rig: Rig) -> Rig:
     camera = _pair(rig).cameras[1]
     pose = camera.cam_from_world
     return rig.with_camera(name, camera.replace(cam_from_world=Pose(pose.R, pose.t / pose.t.norm())))
-
-
-def _distance(rig: Rig, matches: Matches) -> float:
-    return float(line_distances(rig, {(rig.names[0], rig.names[1]): matches}).abs().median())
 
 
 def _pair(rig: Rig) -> Pair:
