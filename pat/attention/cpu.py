@@ -147,7 +147,9 @@ def _call(inputs: AttentionInputs) -> kernels.Call:
     query, key, value, _, bias, _ = inputs
     counted = accumulated(query)
     return kernels.Call(
-        *(_flat(channels_last(t)) for t in (query, key, value)),
+        _flat(channels_last(query)),
+        _flat(channels_last(key)),
+        _flat(channels_last(value)),
         geometry=_geometry(inputs),
         bias=_flat(query.new_empty(0, dtype=counted) if bias is None else bias.to(counted).contiguous()),
         biased=bias is not None,
