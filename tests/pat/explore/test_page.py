@@ -84,14 +84,24 @@ def drawn(driver, name):
 
 
 def click(driver, x, y):
-    """A click of the mouse on the middle of alpha's pixel (x, y); again if it was lost, as one soon after another is
-    that the browser takes for a double click."""
-    there = SCRIPT + f"const d = columns('pixel'); return Math.abs(d.x[0] - {x}) < 2 && Math.abs(d.y[0] - {y}) < 2"
+    """A click of the mouse on the middle of alpha's pixel (x, y)."""
+    click_until(
+        driver,
+        "alpha",
+        x,
+        y,
+        f"const d = columns('pixel'); return Math.abs(d.x[0] - {x}) < 2 && Math.abs(d.y[0] - {y}) < 2",
+    )
+
+
+def click_until(driver, name, x, y, there):
+    """A click on a pixel of the named figure; again if it was lost, as one soon after another is that the browser takes
+    for a double click."""
     for _ in range(PATIENCE // LOST):
-        click_in(driver, "alpha", x, y)
-        if holds_within(driver, there, LOST):
+        click_in(driver, name, x, y)
+        if holds_within(driver, SCRIPT + there, LOST):
             return
-    raise AssertionError(f"not at {(x, y)} after {PATIENCE} s")
+    raise AssertionError(f"not so after {PATIENCE} s: {there}")
 
 
 def click_in(driver, name, x, y):
@@ -161,8 +171,7 @@ def test_a_click_in_beta_goes_the_other_way(page):
     match = drawn(page, "match:colour")
     click(page, 100, 80)
     at = round(match["x"][0]), round(match["y"][0])
-    click_in(page, "beta:colour", *at)
-    until(page, SCRIPT + "return columns('backwards').x.length == 2")
+    click_until(page, "beta:colour", *at, "return columns('backwards').x.length == 2")
     pixel = drawn(page, "pixel")
     assert abs(pixel["x"][0] - 334) <= 3
     assert abs(pixel["y"][0] - 133) <= 3
