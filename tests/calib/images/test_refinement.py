@@ -8,7 +8,7 @@ import torch
 
 from arraygeom import Camera, Link, Rig, View
 from calib.images.depth_change import relative_change
-from calib.images.held_out import line_distances
+from calib.images.held_out import median_off
 from calib.images.matches import Matches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
 from calib.images.photometric import PhotometricFrame, photometric_errors
@@ -39,10 +39,6 @@ def worse(rig: Rig, *, seed=0) -> Rig:
     drawn = {k: torch.randn(v.shape, generator=g, dtype=torch.float64) for k, v in changes.items()}
     size = {"rotation": math.radians(0.3), "centre": 5.0}
     return rig.perturbed({k: v / v.norm() * size[k.rpartition(".")[2]] for k, v in drawn.items()})
-
-
-def median_off(rig: Rig, pairs) -> float:
-    return float(line_distances(rig, pairs).abs().median())
 
 
 @pytest.mark.parametrize("lens", [False, True])
