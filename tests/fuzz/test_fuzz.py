@@ -173,7 +173,7 @@ def test_numbers_that_no_camera_has_are_refused(old, new, tmp_path):
         Rig.load(tmp_path / "rig.yaml")
 
 
-@pytest.mark.parametrize(("cameras", "distorted"), [(200, True), (3000, False)])
+@pytest.mark.parametrize(("cameras", "distorted"), [(200, True), (1000, False)])
 def test_rigs_of_many_cameras_are_read_and_summarised_within_seconds(cameras, distorted, tmp_path, monkeypatch):
     """The tests' own checks of shapes take half of it; of so many, not every pair is described."""
     monkeypatch.setattr(sandbox, "SECONDS", 30)

@@ -107,7 +107,7 @@ def test_a_run_leaves_what_it_says(whole):
     ("step", "what"),
     [
         (5, "_advance"),
-        (6, "_save"),
+        pytest.param(6, "_save", marks=pytest.mark.slow),
         pytest.param(2, "_advance", marks=pytest.mark.slow),
         pytest.param(8, "_validate", marks=pytest.mark.slow),
     ],
