@@ -90,7 +90,7 @@ def test_empty_files(file, tmp_path):
 
 @pytest.mark.parametrize("format", [f for f in READERS if f != "colmap"])
 def test_wrong_formats(format, tmp_path):
-    """Every reader, told to read the others' files, and files that are no text or no rig at all."""
+    """Every reader on the others' files, and on files that are no text or no rig at all."""
     others = [f for f in TEXTS if formats(f) != format and f.parent == FIXTURES]
     assert len(others) > 10
     for file in others:
