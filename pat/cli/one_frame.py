@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from ..fusion.results import Frame
     from ..fusion.tiles import Plan
-    from ..networks.pieces import Tile
+    from ..matching.pieces import Tile
 
 LOG = logging.getLogger(__name__)
 

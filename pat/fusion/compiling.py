@@ -85,22 +85,23 @@ def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     given."""
     from numba import float32, float64, int16, int32, int64, uint8, uint64
 
-    from ..networks import band_kernels, kernels, semi_global_kernels
+    from ..matching import semi_global_numba, window_numba
+    from ..networks import kernels
 
     plane, bits, labels = float32[:, ::1], uint64[:, ::1], int32[:, ::1]
     planes, cost, sums = float32[:, :, ::1], uint8[:, :, ::1], int16[:, :, ::1]
     strided = float32[:, :, :]
     images, segments = (plane, bits, plane, bits), (planes, planes, plane, plane)
-    yield semi_global_kernels.census, (plane, bits)
-    yield semi_global_kernels.costs, (*images, *segments, cost)
-    yield semi_global_kernels.aggregate, (cost, plane, sums)
+    yield semi_global_numba.census, (plane, bits)
+    yield semi_global_numba.costs, (*images, *segments, cost)
+    yield semi_global_numba.aggregate, (cost, plane, sums)
     counts = int64, int64
-    yield semi_global_kernels.winners, (sums, *segments, *counts, *counts, int32[::1], plane, planes, labels, labels)
-    yield band_kernels.band_costs, (*images, *segments, labels, labels, cost)
-    yield band_kernels.band_aggregate, (cost, plane, labels, labels, float32, float32, planes)
+    yield semi_global_numba.winners, (sums, *segments, *counts, *counts, int32[::1], plane, planes, labels, labels)
+    yield window_numba.band_costs, (*images, *segments, labels, labels, cost)
+    yield window_numba.band_aggregate, (cost, plane, labels, labels, float32, float32, planes)
     order = int32[:, :, ::1]
-    yield band_kernels.band_winners, (planes, order, labels, labels, *segments[:3], *counts, plane, plane)
-    yield semi_global_kernels.regression, (*(plane,) * 6, float64, plane, plane)
+    yield window_numba.band_winners, (planes, order, labels, labels, *segments[:3], *counts, plane, plane)
+    yield semi_global_numba.regression, (*(plane,) * 6, float64, plane, plane)
     yield _attention()
     yield kernels.unshuffle, (strided, strided, strided)
     yield kernels.attend_rows, (planes, planes, planes, planes, int64, int64, int64)

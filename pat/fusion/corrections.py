@@ -1,8 +1,8 @@
 """What cameras and rig are off by, found once a frame from a fusion of reduced images.
 
 A pre-pass fuses the images at half the size or less. Where its matches are of high confidence, alpha's response is
-fitted (`pat.fusion.response`), and how far beta lies across its search segments (`pat.fusion.misalignment`). Both are
-put right before the frame is fused.
+fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
+(`pat.matching.epipolar_offset`). Both are put right before the frame is fused.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image, sample
 
+from ..matching.epipolar_offset import Misalignment, fit_misalignment, normals
+from ..matching.inputs import Beta, Inputs
+from ..matching.radiometry import Given, Response, fit, stated_response
+from ..matching.semi_global import Normalisation, blurred, reduced
 from ..networks.bandwise import BandwisePAT
 from ..networks.guided import GuidedPAT, brightness
-from ..networks.protocol import Beta, FusionNetwork, Inputs
-from ..networks.semi_global import Normalisation, blurred, reduced
+from ..networks.protocol import FusionNetwork
 from .inputs import FrameInputs, padded
-from .misalignment import Misalignment, fit_misalignment, normals
-from .response import Given, Response, fit, stated_response
 from .results import Frame
 
 LOG = logging.getLogger(__name__)

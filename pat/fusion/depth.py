@@ -10,7 +10,8 @@ from arraygeom import Segments, depth_from_track, pixel_grid
 from arraygeom.epipolar import Depth, Track
 from arraygeom.pixels import HW
 
-from ..networks.protocol import FusionOutput, Inputs
+from ..matching.inputs import Inputs
+from ..networks.protocol import FusionOutput
 from .inputs import Placement
 
 UNSEEN = 1e-4

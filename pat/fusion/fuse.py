@@ -11,8 +11,9 @@ import torch
 
 from arraygeom import ReceptiveField, Rig
 
+from ..matching.pieces import Tile
+from ..matching.radiometry import Given
 from ..media.images import Images
-from ..networks.pieces import Tile
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes
 from .checks import warn_of_confidence
@@ -21,7 +22,6 @@ from .depth import background_filled
 from .inputs import check_bands, prepared
 from .low_light import Noise, denoised_views
 from .luminance import SHARES, Luminance, check_luminance, with_alpha_detail
-from .response import Given
 from .results import Frame
 from .steps import steps_for
 from .tiles import Plan, fused_in_tiles, plan_frame

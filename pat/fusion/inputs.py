@@ -18,8 +18,9 @@ from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
 
+from ..matching.inputs import Beta, Inputs
 from ..networks.guided import GuidedPAT
-from ..networks.protocol import Beta, FusionNetwork, Inputs
+from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo
 from .views import Views
 

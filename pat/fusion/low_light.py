@@ -18,10 +18,10 @@ from torch import Tensor
 from arraygeom import sample
 from arraygeom.pixels import HW
 
+from ..matching.pieces import tiles_of
 from ..media.colour import luminance
 from ..networks.collaborative import luma_refined, without_noise
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
-from ..networks.pieces import tiles_of
 from ..networks.positions import Found, WithPositions, split
 from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_denoiser

@@ -12,11 +12,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ..matching.colour_transfer import MOST_DETAIL, local_slope
+from ..matching.semi_global import Normalisation
 from ..media.colour import luminance
 from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
-from ..networks.semi_global import Normalisation
-from ..networks.warped import MOST_DETAIL, local_slope
 from .results import Frame
 
 Luminance = Literal["alpha", "mix", "beta"]

@@ -24,6 +24,7 @@ from torch import Tensor
 from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields import default_field
 
+from ..matching.radiometry import Given, Response
 from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
@@ -32,7 +33,6 @@ from .frames import CachedFrames, DenoisedFrames, Frames
 from .fuse import corrections_of, fuse
 from .low_light import Noise, noise_levels
 from .optical_flow import flow_between, still, warped
-from .response import Given, Response
 from .results import Frame
 from .timeline import KeyFrame, Timeline
 from .views import grey_alpha

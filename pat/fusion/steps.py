@@ -37,9 +37,10 @@ from arraygeom.fields.default import default_field
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between, sampled_between
 
+from ..matching.inputs import box_around, ends_of
 from ..media.images import Images
 from ..media.raw import LIGHT, as_bright
-from ..networks.protocol import FusionNetwork, JoinsBands, box_around, ends_of
+from ..networks.protocol import FusionNetwork, JoinsBands
 from .results import Frame
 from .views import Fields, Views
 

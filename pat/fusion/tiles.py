@@ -18,8 +18,9 @@ from arraygeom import pixel_grid
 from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
-from ..networks.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
-from ..networks.protocol import FusionNetwork, Inputs, State
+from ..matching.inputs import Inputs
+from ..matching.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
+from ..networks.protocol import FusionNetwork, State
 from ..support.tensor_files import write_tensors
 from .depth import depth_and_confidence
 from .inputs import FrameInputs

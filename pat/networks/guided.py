@@ -1,7 +1,7 @@
 """GuidedPAT: C3 attention from coarse to fine, colour guided by alpha.
 
 Our own network, for one alpha whose detail is to be preserved and betas that have colour. Semi-global matching
-(`pat.networks.semi_global`) finds each pixel's position along its segment; attention samples a short window around it
+(`pat.matching.semi_global`) finds each pixel's position along its segment; attention samples a short window around it
 at full size. The network estimates the confidence that the match is the point that alpha sees, propagates colour from
 pixels of high confidence to the others, and adds it to alpha.
 """
@@ -19,20 +19,21 @@ from torch.nn.functional import avg_pool2d, conv2d, pixel_shuffle, pixel_unshuff
 from arraygeom import Local, Pair, Segments, View, lazily
 
 from ..attention import attend, attend_with_statistics
-from ..media.colour import luminance
-from .blocks import ResidualBlock, channels_last, conv, enlarge, plain, stacked
-from .configs import GuidedPATConfig
-from .pieces import Prepared
-from .protocol import Beta, FusionOutput, Inputs, JoinsBands
-from .semi_global import (
+from ..matching.colour_transfer import FILLS, likeness, matched_colours
+from ..matching.inputs import Beta, Inputs
+from ..matching.multiview import matched_together
+from ..matching.pieces import Prepared
+from ..matching.semi_global import (
     FINE,
     Extent,
     Normalisations,
     SemiGlobalMatches,
     matches,
 )
-from .several import matched_together
-from .warped import FILLS, likeness, matched_colours
+from ..media.colour import luminance
+from .blocks import ResidualBlock, channels_last, conv, enlarge, plain, stacked
+from .configs import GuidedPATConfig
+from .protocol import FusionOutput, JoinsBands
 from .windows import attend_to_windows
 
 COARSE = 4

@@ -16,9 +16,10 @@ from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention import Attended, attend_with_statistics
+from ..matching.inputs import Inputs
 from .blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
-from .protocol import FusionOutput, Inputs, JoinsBands
+from .protocol import FusionOutput, JoinsBands
 
 
 class PAT(nn.Module):

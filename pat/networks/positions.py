@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from .protocol import FusionNetwork, FusionOutput, Inputs
+from ..matching.inputs import Inputs
+from .protocol import FusionNetwork, FusionOutput
 
 
 class Found(NamedTuple):

@@ -14,10 +14,11 @@ from torch import Generator, Tensor, nn
 
 from arraygeom import Epipolar, sample
 from arraygeom.fields.grid import FieldOnGrid
+from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
 from pat.networks.collaborative import without_noise
 from pat.networks.denoiser import LowLightNetwork, NoisyView
-from pat.networks.protocol import FusionNetwork, Inputs
+from pat.networks.protocol import FusionNetwork
 from pat.sensors import NoiseLevel, generator_for
 from pat.synthesis.layered import LayeredScenes
 from pat.synthesis.photos import PhotoBank

@@ -26,8 +26,9 @@ from arraygeom.fields import FIELDS, pinhole_track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
+from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
-from pat.networks.protocol import FusionNetwork, Inputs
+from pat.networks.protocol import FusionNetwork
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank

@@ -31,8 +31,8 @@ from pat.fusion.inputs import frame_inputs
 from pat.fusion.steps import steps_for
 from pat.fusion.tiles import fuse_tile
 from pat.fusion.views import Views
+from pat.matching.pieces import Tile
 from pat.media.images import read_image
-from pat.networks.pieces import Tile
 from pat.networks.weights import load_weights
 from pat.systems import load_system, run_system
 

@@ -26,8 +26,8 @@ from pat.evaluation.conditions import regions_of
 from pat.evaluation.halves import of_half
 from pat.evaluation.protocols import mono_colour_task, rectified_fusion
 from pat.evaluation.tables import markdown_header, markdown_row
+from pat.matching.colour_transfer import FILLS
 from pat.networks.guided import BetaEstimate, Encoded, GuidedPAT
-from pat.networks.warped import FILLS
 from tests.benchmarks.printed import print_tables
 
 REGIONS = ("whole", "seen", "occluded", "beyond")

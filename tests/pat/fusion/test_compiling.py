@@ -53,7 +53,7 @@ compiling.main()
 print("torch" in sys.modules, flush=True)
 """
     assert run(code, NUMBA_CACHE_DIR=str(tmp_path)).strip() == "False"
-    assert [*tmp_path.glob("*/semi_global_kernels.census*.nbc")]
+    assert [*tmp_path.glob("*/semi_global_numba.census*.nbc")]
 
 
 def test_attention_is_compiled_first():

@@ -8,8 +8,8 @@ import torch
 
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import corrections_of, fuse
-from pat.fusion.misalignment import Misalignment, fit_misalignment
 from pat.fusion.sequence import SequenceFusion
+from pat.matching.epipolar_offset import Misalignment, fit_misalignment
 from pat.media.colour import luminance
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import ALPHA, BETA, load_sample

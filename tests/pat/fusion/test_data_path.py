@@ -14,11 +14,11 @@ from pat.fusion.fuse import fuse
 from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
+from pat.matching.pieces import tiles_of
 from pat.media.images import write_image
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig
 from pat.networks.guided import GuidedPAT
-from pat.networks.pieces import tiles_of
 
 HW = (64, 96)
 SMALL = {"widths": (8, 8, 8, 8)}

@@ -7,7 +7,8 @@ from arraygeom import Camera, Epipolar, Pose, Rig, Segments, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
 from pat.fusion.depth import background_filled, depth_and_confidence
 from pat.fusion.inputs import Placement
-from pat.networks.protocol import Beta, FusionOutput, Inputs
+from pat.matching.inputs import Beta, Inputs
+from pat.networks.protocol import FusionOutput
 
 NEAR, FAR, HW = 1.4, 20.0, (12, 40)
 

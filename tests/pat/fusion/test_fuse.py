@@ -8,7 +8,7 @@ import torch
 
 import pat.fusion.steps
 import pat.fusion.tiles
-import pat.networks.pieces
+import pat.matching.pieces
 from arraygeom import (
     Camera,
     Distortion,
@@ -32,6 +32,8 @@ from pat.fusion.inputs import FrameInputs, prepared
 from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
+from pat.matching.inputs import Inputs
+from pat.matching.pieces import Tile, matching_pieces, tiles_of
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT
@@ -39,8 +41,6 @@ from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig, PATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.paper import PAT
-from pat.networks.pieces import Tile, matching_pieces, tiles_of
-from pat.networks.protocol import Inputs
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import load_sample
 
@@ -109,8 +109,8 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     sample, network = load_sample(), load_weights("mono-colour")
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
-    monkeypatch.setattr(pat.networks.pieces, "MATCHED_AT_ONCE", 150_000)
-    monkeypatch.setattr(pat.networks.pieces, "MATCHING_HALO", 128)
+    monkeypatch.setattr(pat.matching.pieces, "MATCHED_AT_ONCE", 150_000)
+    monkeypatch.setattr(pat.matching.pieces, "MATCHING_HALO", 128)
     assert len(matching_pieces(sample.rig["mono"].hw, network.multiple)) > 1
     pieces = fuse(network, sample.rig, images, alpha="mono")
     ground_truth = sample.ground_truth

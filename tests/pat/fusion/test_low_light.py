@@ -16,11 +16,12 @@ from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.low_light import denoised, denoised_views, warped
 from pat.fusion.views import Views
+from pat.matching.inputs import Beta, Inputs
 from pat.media.colour import luminance
 from pat.networks import denoiser
 from pat.networks.denoiser import NoisyView
 from pat.networks.positions import Found, WithPositions
-from pat.networks.protocol import Beta, FusionOutput, Inputs
+from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
 from pat.support.steps import steps_shown

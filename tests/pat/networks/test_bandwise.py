@@ -8,9 +8,9 @@ from arraygeom.fields.grid import FieldOnGrid
 from pat import from_pretrained
 from pat.fusion.fuse import fuse
 from pat.fusion.steps import co_located
+from pat.matching.inputs import Inputs
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
-from pat.networks.protocol import Inputs
 from pat.networks.weights import save_weights
 
 from .test_spectral_mix import texture

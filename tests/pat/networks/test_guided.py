@@ -5,11 +5,11 @@ import torch
 
 from arraygeom import Camera, Epipolar, Pair, Pose, Rectified, Segments, View, intrinsics
 from arraygeom.fields.grid import FieldOnGrid
+from pat.matching.inputs import Inputs
 from pat.media.colour import luminance
 from pat.networks import guided
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT, window_around
-from pat.networks.protocol import Inputs
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8))
 HW = (32, 48)

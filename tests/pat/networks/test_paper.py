@@ -6,9 +6,9 @@ import torch
 from arraygeom import Pair, Rectified, Rig, View, sampling_locations
 from arraygeom.fields.grid import FieldOnGrid
 from pat.attention import attend
+from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
-from pat.networks.protocol import Inputs
 
 
 def fields(network: PAT, alpha: torch.Tensor, betas: list[torch.Tensor]) -> list[FieldOnGrid]:

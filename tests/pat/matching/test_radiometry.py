@@ -7,7 +7,7 @@ import torch
 
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
-from pat.fusion.response import SETTINGS, Response, fit, stated_response
+from pat.matching.radiometry import SETTINGS, Response, fit, stated_response
 from pat.media.colour import REC601, luminance
 from pat.networks.weights import load_weights
 from tests.pat.layered_array import ALPHA, BETA, load_sample

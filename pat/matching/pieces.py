@@ -14,7 +14,7 @@ from torch import Tensor
 from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
-from .protocol import Inputs
+from .inputs import Inputs
 from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches, matched_at_half_size
 
 LOG = logging.getLogger(__name__)

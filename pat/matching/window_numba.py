@@ -1,4 +1,4 @@
-"""The compiled loops of `pat.networks.matching`: semi-global matching over few labels around a known disparity.
+"""The compiled loops of `pat.matching.subpixel`: semi-global matching over few labels around a known disparity.
 
 Each pixel has two runs of `RUN` consecutive labels, from `low` and from `high`, which do not overlap. One image, one
 thread, without Python's lock.
@@ -14,7 +14,7 @@ from pat.attention.kernels.emit import LANES, Vector, compiled, instruction, sep
 from pat.attention.kernels.layout import pointers
 from pat.attention.kernels.vectors import add, from_index, load, splat, store
 
-from .semi_global_kernels import (
+from .semi_global_numba import (
     FARTHEST,
     HALF,
     MOST,

@@ -20,7 +20,7 @@ from arraygeom.sampling import on_image, sample
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
-from . import semi_global_kernels as kernels
+from . import semi_global_numba as kernels
 from .semi_global import CONSISTENT, Extent, Normalisation, enlarged, matches, numpy_of, smoothed
 
 LIKENESS = 0.08

@@ -17,19 +17,19 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments
 
-from .semi_global import (
-    Normalisation,
-    Normalisations,
-    matched_at_half_size,
-    reduced,
-)
-from .warped import (
+from .colour_transfer import (
     MOST_DETAIL,
     at_matches,
     box_mean,
     is_consistent,
     local_slope,
     match_weight,
+)
+from .semi_global import (
+    Normalisation,
+    Normalisations,
+    matched_at_half_size,
+    reduced,
 )
 
 OUTLIER = 0.06

@@ -1,4 +1,4 @@
-"""The compiled loops of `pat.networks.semi_global`, each on one image, in one thread and without Python's lock."""
+"""The compiled loops of `pat.matching.semi_global`, each on one image, in one thread and without Python's lock."""
 
 from __future__ import annotations
 
@@ -237,8 +237,8 @@ def winners(total, end, along, length, cut, rows, columns, top, left, claims, di
 
 @compiled(nogil=True, cache=True)
 def regression(brightness, total, first, second, colour, product, floor, along, mean_colour):
-    """A band of `pat.networks.warped.diffused`, from smoothed sums of weights (total), and of weights times brightness,
-    its square, the band (colour), and brightness times the band (product)."""
+    """A band of `colour_transfer.diffused_from`, from smoothed sums of weights (total), and of weights times
+    brightness, its square, the band (colour), and brightness times the band (product)."""
     height, width = brightness.shape
     for y in range(height):
         for x in range(width):

@@ -28,7 +28,7 @@ from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
-from . import semi_global_kernels as kernels
+from . import semi_global_numba as kernels
 
 FINE = 2
 """Matching is done on images this many times smaller."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-import pat.networks.semi_global
+import pat.matching.semi_global
 from arraygeom import (
     Camera,
     Epipolar,
@@ -19,8 +19,8 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
 )
-from pat.networks import semi_global_kernels as kernels
-from pat.networks.semi_global import (
+from pat.matching import semi_global_numba as kernels
+from pat.matching.semi_global import (
     Normalisation,
     SemiGlobalMatches,
     equalising_blurs,
@@ -29,7 +29,7 @@ from pat.networks.semi_global import (
     matches,
 )
 from pat.support.memory import limited
-from tests.pat.networks.matched_scenes import beside, blurred, faint, semi_global_matching
+from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
 HW = (64, 96)
 
@@ -158,8 +158,8 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(a, b) for a, b in zip(whole, again))
-    monkeypatch.setattr(pat.networks.semi_global, "BLOCK", 16)
-    monkeypatch.setattr(pat.networks.semi_global, "MOST_COSTS", 0)
+    monkeypatch.setattr(pat.matching.semi_global, "BLOCK", 16)
+    monkeypatch.setattr(pat.matching.semi_global, "MOST_COSTS", 0)
     pieces = semi_global_matching(*call)
     assert (pieces.disparity - whole.disparity).abs().median() < 1e-3
 
@@ -180,10 +180,10 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
     normalisation = Normalisation.of(alpha, beta)
-    monkeypatch.setattr(pat.networks.semi_global, "_block", block)
-    monkeypatch.setattr(pat.networks.semi_global, "BLOCK", 8)
-    monkeypatch.setattr(pat.networks.semi_global, "LONG_BLOCK", 8)
-    monkeypatch.setattr(pat.networks.semi_global, "MOST_COSTS", 0)
+    monkeypatch.setattr(pat.matching.semi_global, "_block", block)
+    monkeypatch.setattr(pat.matching.semi_global, "BLOCK", 8)
+    monkeypatch.setattr(pat.matching.semi_global, "LONG_BLOCK", 8)
+    monkeypatch.setattr(pat.matching.semi_global, "MOST_COSTS", 0)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
     with limited(limit):
         matched_at_half_size(alpha, beta, sampled_at(pair, 2), normalisation)
@@ -199,10 +199,10 @@ def test_blocks_know_what_others_claim(monkeypatch, threads):
     given = alpha, beta, sampled_at(pair, 2), Normalisation.of(alpha, beta)
     whole = matched_at_half_size(*given)
     for name, value in {"BLOCK": 12, "LONG_BLOCK": 20, "MARGIN": 1000, "MOST_COSTS": 0}.items():
-        monkeypatch.setattr(pat.networks.semi_global, name, value)
+        monkeypatch.setattr(pat.matching.semi_global, name, value)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     blocks = matched_at_half_size(*given)
-    assert (whole.facts[:, 0] > pat.networks.semi_global.CONSISTENT).any()
+    assert (whole.facts[:, 0] > pat.matching.semi_global.CONSISTENT).any()
     for one, other in zip(whole, blocks):
         assert torch.equal(one, other)
 
@@ -269,7 +269,7 @@ def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
     noise = 0.01 * torch.randn(2, *alpha.shape, generator=torch.Generator().manual_seed(9))
     found = semi_global_matching(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
     assert ((found.disparity[..., 48:72] - 40).abs() < 2).float().mean() > 0.98
-    assert (found.facts[:, 0, :, :17] > pat.networks.semi_global.CONSISTENT).float().mean() > 0.845
+    assert (found.facts[:, 0, :, :17] > pat.matching.semi_global.CONSISTENT).float().mean() > 0.845
 
 
 @pytest.mark.parametrize(("cut", "beyond"), [(1.0, kernels.UNSEEN), (0.0, kernels.NOWHERE)])

@@ -5,10 +5,10 @@ import pytest
 import torch
 
 from arraygeom import Segments, pixel_grid
+from pat.matching import colour_transfer as warped
+from pat.matching.colour_transfer import LIKENESS, _diffused, colour_noise, explained_share, match_weight
 from pat.media.colour import luminance
-from pat.networks import warped
-from pat.networks.warped import LIKENESS, _diffused, colour_noise, explained_share, match_weight
-from tests.pat.networks.matched_scenes import beside, blurred, faint, semi_global_matching
+from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
 
 def enlarged(image: torch.Tensor, times: int) -> torch.Tensor:

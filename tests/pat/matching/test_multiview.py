@@ -12,11 +12,12 @@ from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
+from pat.matching import multiview as several
+from pat.matching import pieces
+from pat.matching.multiview import SUPPORT, MatchedBeta, can_agree
+from pat.matching.pieces import tiles_of
 from pat.media.colour import luminance
-from pat.networks import pieces, several
 from pat.networks.guided import BetaEstimate, combined
-from pat.networks.pieces import tiles_of
-from pat.networks.several import SUPPORT, MatchedBeta, can_agree
 from pat.networks.weights import load_weights
 
 H, W = 96, 192

@@ -14,15 +14,15 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
-from . import band_kernels as kernels
-from .blocks import enlarge
+from . import window_numba as kernels
+from .colour_transfer import at_matches, box_mean
 from .semi_global import (
     BLOCK,
     CONSISTENT,
@@ -38,8 +38,7 @@ from .semi_global import (
     matched_at_half_size,
     numpy_of,
 )
-from .semi_global_kernels import census
-from .warped import at_matches, box_mean
+from .semi_global_numba import census
 
 NEIGHBOURHOOD = 5
 """Side of the neighbourhood at half the size, pixels."""
@@ -83,7 +82,8 @@ def matched(
         half = matched_at_half_size(alpha, guide, blocks, normalisations.half)
     rough, facts = half
     disparity, unlike = matched_at_full_size(alpha, guide, segments, rough, normalisations.whole)
-    disparity = precise(alpha, guide, segments, disparity, unlike, enlarge(rough), normalisations.whole)
+    rough = interpolate(rough, scale_factor=FINE, mode="bilinear")
+    disparity = precise(alpha, guide, segments, disparity, unlike, rough, normalisations.whole)
     return disparity, torch.cat([avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
 
 

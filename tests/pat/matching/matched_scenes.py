@@ -4,9 +4,9 @@ import cv2
 import torch
 
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
-from pat.networks.matching import matched
-from pat.networks.semi_global import Normalisations, SemiGlobalMatches
-from pat.networks.warped import diffused_from, matched_colours
+from pat.matching.colour_transfer import diffused_from, matched_colours
+from pat.matching.semi_global import Normalisations, SemiGlobalMatches
+from pat.matching.subpixel import matched
 
 
 def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:

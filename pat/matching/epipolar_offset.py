@@ -21,7 +21,7 @@ from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 
-from ..networks.semi_global import along
+from .semi_global import along
 
 Image = NDArray[Any]
 

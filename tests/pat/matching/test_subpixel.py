@@ -6,11 +6,12 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, pixel_grid
-from pat.networks import band_kernels, semi_global_kernels
-from pat.networks.band_kernels import HIGH, LANES, RUN
-from pat.networks.matching import PENALTIES, _runs, _surfaces, matched
-from pat.networks.semi_global import Normalisations, matched_at_half_size
-from tests.pat.networks.matched_scenes import beside, blurred
+from pat.matching import semi_global_numba as semi_global_kernels
+from pat.matching import window_numba as band_kernels
+from pat.matching.semi_global import Normalisations, matched_at_half_size
+from pat.matching.subpixel import PENALTIES, _runs, _surfaces, matched
+from pat.matching.window_numba import HIGH, LANES, RUN
+from tests.pat.matching.matched_scenes import beside, blurred
 
 H, W, NEAREST = 96, 160, 30
 FAR, NEAR = 6, 21

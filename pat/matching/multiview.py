@@ -26,9 +26,9 @@ from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
 from ..media.colour import to_bytes
-from .matching import matched
+from .colour_transfer import diffused_from
+from .inputs import Beta, Inputs
 from .pieces import Prepared, from_pieces, prepared, whole
-from .protocol import Beta, Inputs
 from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
@@ -40,7 +40,7 @@ from .semi_global import (
     enlarged,
     filled,
 )
-from .warped import diffused_from
+from .subpixel import matched
 
 SUPPORT = 1.5
 """A beta supports an inverse depth that is less than this many of its pixels from its own match."""
@@ -173,7 +173,7 @@ def matched_together(
 ) -> Prepared:
     """The matches of all betas, with the depth on which they agree if they can, coloured.
 
-    `common` and `comparison` are those of `pat.networks.pieces.prepared`; `colours` gives bands minus alpha at a beta's
+    `common` and `comparison` are those of `pat.matching.pieces.prepared`; `colours` gives bands minus alpha at a beta's
     matches, and their weight. Of betas that agree, those that have all bands (`full`, of each) share the colour that is
     diffused; any other has its own.
     """

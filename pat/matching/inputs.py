@@ -1,0 +1,121 @@
+"""What is matched and fused: alpha's image, and for each beta its image and the field of alpha's pixels in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from arraygeom import Positions, Segments
+from arraygeom.epipolar import Track
+from arraygeom.fields.grid import Box, FieldOnGrid
+from arraygeom.pixels import HW
+
+
+@dataclass(frozen=True)
+class Beta:
+    """One beta's image (B, C, H, W) and the field of alpha's pixels in it.
+
+    `offset` is the (x, y) of its first pixel in the whole image, other than (0, 0) for a part of an image.
+    `track` gives the tracks of alpha's pixels (*n, 2) in the image of a calibrated beta.
+    """
+
+    image: Float[Tensor, "b c h w"]
+    field: FieldOnGrid
+    offset: tuple[int, int] = (0, 0)
+    track: Callable[[Tensor], Track] | None = None
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """Alpha's image (B, C, H, W) and the betas, which may be of any sizes.
+
+    Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments. `luminance`
+    is alpha's share of the result's, for networks that keep it; the rest is beta's.
+    """
+
+    alpha: Float[Tensor, "b c h w"]
+    betas: tuple[Beta, ...]
+    multiple: int = 1
+    beta_halo: int = 0
+    luminance: float = 1.0
+
+    @classmethod
+    def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
+        """Alpha with each beta's image and field, in order."""
+        return cls(alpha, tuple(Beta(image, field) for image, field in zip(images, fields, strict=True)))
+
+    @property
+    def hw(self) -> HW:
+        """Height and width of alpha's image."""
+        return self.alpha.shape[-2], self.alpha.shape[-1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of images and fields."""
+        return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
+
+    def of_beta(self, i: int) -> Inputs:
+        """The same with one beta alone."""
+        return replace(self, betas=self.betas[i : i + 1])
+
+    def cut(self, box: Box) -> Inputs:
+        """A part of alpha, (top, bottom, left, right), with the part of each beta that its segments touch."""
+        top, bottom, left, right = box
+        return replace(
+            self, alpha=self.alpha[..., top:bottom, left:right], betas=tuple(self._cut(b, box) for b in self.betas)
+        )
+
+    def touched(self, beta: Beta, box: Box, step: int = 2) -> Box:
+        """The part of a beta that the segments of every `step`-th pixel of a box of alpha touch, with the halo."""
+        hw = beta.image.shape[-2], beta.image.shape[-1]
+        return box_around(_ends_in(beta.field, box, step), hw, self.beta_halo, self.multiple)
+
+    def _cut(self, beta: Beta, box: Box) -> Beta:
+        y0, y1, x0, x1 = self.touched(beta, box)
+        offset = (beta.offset[0] + x0, beta.offset[1] + y0)
+        track = beta.track and _part_of(beta.track, (box[2], box[0]), (x0, y0))
+        return Beta(beta.image[..., y0:y1, x0:x1], beta.field.cut(box, (x0, y0)), offset, track)
+
+
+def _part_of(
+    track: Callable[[Tensor], Track], own: tuple[int, int], other: tuple[int, int]
+) -> Callable[[Tensor], Track]:
+    """The tracks of a part of alpha in a part of beta, which begin at these pixels (x, y)."""
+
+    def shifted(v: Tensor) -> Tensor:
+        return torch.cat([v[..., :2] - v.new_tensor(other) * v[..., 2:], v[..., 2:]], -1)
+
+    return lambda x: Track(*map(shifted, track(x + x.new_tensor(own))))
+
+
+def ends_of(found: Segments | Positions) -> Float[Tensor, "n 2"]:
+    """The ends of valid segments, or the positions that count."""
+    if isinstance(found, Positions):
+        return found.xy[found.mask]
+    return torch.cat([found.start[found.valid], found.end[found.valid]])
+
+
+def box_around(points: Float[Tensor, "n 2"], hw: HW, halo: int, multiple: int) -> Box:
+    """The part of an image around points (x, y), with a halo, its corners at whole multiples or the image's end."""
+    if not len(points):
+        return 0, multiple, 0, multiple
+    low, high = points.amin(0) - halo, points.amax(0) + halo
+    (x0, y0), (x1, y1) = (
+        torch.div(v, multiple, rounding_mode="floor").long() * multiple for v in (low, high + multiple)
+    )
+    return max(int(y0), 0), min(int(y1), hw[0]), max(int(x0), 0), min(int(x1), hw[1])
+
+
+def _ends_in(field: FieldOnGrid, box: Box, step: int) -> Float[Tensor, "n 2"]:
+    """The ends of the segments, or the positions, of every `step`-th pixel of a box."""
+    top, bottom, left, right = box
+    rows, columns = torch.arange(top, bottom, step), torch.arange(left, right, step)
+    if field.pixels is None:
+        y, x = torch.meshgrid(rows, columns, indexing="ij")
+        return ends_of(field.at(torch.stack([x, y], -1).reshape(-1, 2).float()))
+    some = (slice(None), rows[:, None], columns)
+    return ends_of(Segments(field.pixels.start[some], field.pixels.end[some], field.pixels.valid[some]))
