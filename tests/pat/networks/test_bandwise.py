@@ -13,7 +13,7 @@ from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
 from pat.networks.weights import save_weights
 
-from .test_spectral_mix import texture
+from tests.pat.matching.test_spectral_mix import texture
 
 HW = (32, 48)
 
