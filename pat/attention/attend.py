@@ -172,8 +172,8 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
 
 def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local) -> bool:
     whole = field.size > 0 and field.size % 2 == 1 and float(field.spacing).is_integer()
-    on_cpu = query.dtype == torch.float32 and query.device.type == "cpu"
-    return whole and on_cpu and query.shape[2:] == key.shape[2:] and torch_op.is_plain(query, key, value)
+    taken = query.dtype == torch.float32 and query.device.type == "cpu" and query.shape[2:] == key.shape[2:]
+    return whole and taken and torch_op.is_plain(query, key, value) and not _missing(query, key, value)
 
 
 def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> Attended:
@@ -229,7 +229,8 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 
 def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
     chosen = _choose(backend, inputs.query.device.type)
-    missing = "" if chosen == "reference" else _missing(inputs)
+    tensors = inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias
+    missing = "" if chosen == "reference" else _missing(*tensors)
     if missing and backend != "auto":
         raise NotImplementedError(f"backend '{backend}' has no {missing}: ask for backend=\"reference\"")
     if missing or chosen == "reference":
@@ -237,12 +238,11 @@ def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
     return torch_op.attend(inputs, measured=measured, backend=chosen, strict=backend != "auto")
 
 
-def _missing(inputs: AttentionInputs) -> str:
+def _missing(*tensors: Tensor | None) -> str:
     """What is under way that compiled backends have not; empty if nothing."""
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
-    tensors = (inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias)
     if "Jvp" in under_way or any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""

@@ -21,16 +21,16 @@ from .backward import backward
 from .channels import scatter
 from .emit import LANES, compiled, separate_cache
 from .forward import forward
-from .local import ROWS, attend_rows
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
+from .local import ROWS, attend_rows
 
 __all__ = [
     "LANES",
+    "ROWS",
     "Call",
     "Geometry",
     "Gradients",
     "Outputs",
-    "ROWS",
     "Saved",
     "Share",
     "TapList",

@@ -42,13 +42,10 @@ def attend_rows(query, key, value, out, size, spacing, top):
             mean[:] = 0
             for t in range(size * size):
                 row, first, last, step = _sampled(t, y, size, spacing, height, width)
-                weight, other, of_some = (
-                    scores[t, first:last],
-                    value[c, row, first + step : last + step],
-                    mean[first:last],
-                )
+                weight, other = scores[t, first:last], value[c, row, first + step : last + step]
+                inner = mean[first:last]
                 for x in range(last - first):
-                    of_some[x] += weight[x] * other[x]
+                    inner[x] += weight[x] * other[x]
             for x in range(width):
                 mean[x] /= total[x] if total[x] != 0 else np.float32(1)
 

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.autograd import forward_ad
 
 from arraygeom import Local, Pair, View, lazily
 from pat.attention import attend, attend_with_statistics, cpu
@@ -73,6 +74,15 @@ def test_what_it_cannot_serve_others_do(asked, monkeypatch):
     monkeypatch.setattr(cpu, "forward_local", pytest.fail)
     found, wanted = (attend(*given, field, backend=backend, **options) for backend in ("auto", "reference"))
     torch.testing.assert_close(found, wanted, rtol=1e-2 if asked == "16 bits" else 1e-4, atol=1e-4)
+
+
+def test_forward_mode_is_the_references():
+    query, key, value = features()
+    with forward_ad.dual_level():
+        given = query, forward_ad.make_dual(key, torch.ones_like(key)), value
+        with pytest.raises(RuntimeError, match="derivatives"):
+            attend(*given, Local(3), interpolation="nearest", backend="local")
+        assert forward_ad.unpack_dual(attend(*given, Local(3), interpolation="nearest")).tangent is not None
 
 
 def test_statistics_are_by_the_others():
