@@ -110,7 +110,7 @@ class _Plane:
             shape = list(part.shape)
             for axis, n in zip(axes, lengths):
                 shape[axis] = n // self.factor
-            order = sorted(range(part.ndim), key=lambda axis: -part.stride(axis))
+            order = sorted(range(part.ndim), key=part.stride, reverse=True)
             self.whole = torch.empty_permuted(shape, order, dtype=part.dtype, device=part.device)
 
     def add(self, part: Tensor, tile: Tile) -> None:

@@ -212,4 +212,7 @@ def line_piece(
 
 
 def _between(pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> Segments:
-    return segments_by_rows(lambda x: segments_between(pinhole_track(pair, x), near, far, pair.beta.hw), pair, floating(x))
+    def between(x: Tensor) -> Segments:
+        return segments_between(pinhole_track(pair, x), near, far, pair.beta.hw)
+
+    return segments_by_rows(between, pair, floating(x))

@@ -248,7 +248,7 @@ def _attend_by_rows(
     Segments are small: they are gathered for the whole image. Explicit positions are used at once, and
     asked for again in backward.
     """
-    x, y = pixel_coordinates(query.shape[2:], dtype=accumulated(query), device=query.device)
+    x, y = pixel_coordinates((query.shape[2], query.shape[3]), dtype=accumulated(query), device=query.device)
 
     def at(x: Tensor, y: Tensor, kind: Any = None) -> Any:
         found = locations(torch.stack([x, y], -1).reshape(-1, 2))
