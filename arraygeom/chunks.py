@@ -67,31 +67,32 @@ def chunked(
     """
     axes = [axis] if isinstance(axis, int) else axis
     lengths = [tensors[0].shape[a] for a in axes]
-    tiles = tiles_of(lengths, rows, halo)
-    return from_tiles(lambda box: function(*(_cut(t, box, axes) for t in tensors)), lengths, tiles, axes)
+
+    def part(box: Box) -> Any:
+        return function(*(_cut(t, box, axes) for t in tensors))
+
+    return assembled(lengths, ((tile, part(tile.outer)) for tile in tiles_of(lengths, rows, halo)), axes)
 
 
-def from_tiles(
-    make: Callable[[Box], Any], lengths: Sequence[int], tiles: Iterable[Tile], axes: Sequence[int] = (-2, -1)
-) -> Any:
-    """What `make` gives for a frame (h, w), put together from the inner parts of what it gives for tiles.
+def assembled(lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: Sequence[int] = (-2, -1)) -> Any:
+    """Tensors of a frame (h, w), put together from the inner parts of those of its tiles.
 
-    `make` is given outer boxes, and gives a tensor or several, as large as the box or smaller by a whole factor.
+    Of each tile a tensor or several are given, as large as the outer box or smaller by a whole factor. A tile that is
+    the whole frame is given back as it is.
     """
     planes: list[_Plane] = []
     single = False
-    for tile in tiles:
-        made = make(tile.outer)
+    for tile, made in parts:
         single = isinstance(made, Tensor)
-        parts = (made,) if single else tuple(made)
+        tensors = (made,) if single else tuple(made)
         if tile.inner == whole(lengths).inner:
-            return made if single else parts
-        planes = planes or [_Plane(part, tile, lengths, axes) for part in parts]
-        for plane, part in zip(planes, parts):
-            plane.add(part, tile)
-        del made, parts, part
-    tensors = tuple(plane.tensor() for plane in planes)
-    return tensors[0] if single else tensors
+            return made if single else tensors
+        planes = planes or [_Plane(tensor, tile, lengths, axes) for tensor in tensors]
+        for plane, tensor in zip(planes, tensors):
+            plane.add(tensor, tile)
+        del made, tensors, tensor
+    joined = tuple(plane.tensor() for plane in planes)
+    return joined[0] if single else joined
 
 
 class _Plane:

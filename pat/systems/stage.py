@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig, stack
-from arraygeom.chunks import Box, from_tiles, tiles_of
+from arraygeom.chunks import Box, assembled, tiles_of
 from arraygeom.pose import matvec
 from pat.evaluation.ablation import sample_photographs
 from pat.synthesis.layered import LayeredScenes
@@ -77,7 +77,7 @@ class SystemScene(LayeredScenes):
             image, depth = self._seen(layers or self.scene, part, factor)[:2]
             return image, depth[0]
 
-        return from_tiles(rendered, (h, w), tiles_of((h, w), (rows, w), 1))
+        return assembled((h, w), ((tile, rendered(tile.outer)) for tile in tiles_of((h, w), (rows, w), 1)))
 
     def painted(self, values: Sequence[float]) -> Layers:
         """The scene with a grey value, 0..1, for each layer instead of its texture."""

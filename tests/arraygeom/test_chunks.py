@@ -8,7 +8,7 @@ import torch
 from torch.autograd import forward_ad, gradcheck
 from torch.nn.functional import avg_pool2d, max_pool2d, pad
 
-from arraygeom.chunks import area, chunked, from_tiles, spans, tiles_of, whole
+from arraygeom.chunks import area, assembled, chunked, spans, tiles_of, whole
 
 IMAGE = torch.rand(2, 3, 23, 37, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
 
@@ -97,7 +97,7 @@ def test_each_part_is_asked_for_once():
         return IMAGE[..., box[0] : box[1], box[2] : box[3]]
 
     tiles = list(tiles_of((23, 37), 16, 4))
-    assert torch.equal(from_tiles(make, (23, 37), tiles), IMAGE)
+    assert torch.equal(assembled((23, 37), ((tile, make(tile.outer)) for tile in tiles)), IMAGE)
     assert asked == [tile.outer for tile in tiles]
 
 
@@ -111,5 +111,5 @@ def test_parts_are_forgotten():
         memory.append(weakref.ref(array))
         return [torch.from_numpy(array)]
 
-    from_tiles(make, (40, 4), tiles_of((40, 4), (8, 4), 0))
+    assembled((40, 4), ((tile, make(tile.outer)) for tile in tiles_of((40, 4), (8, 4), 0)))
     assert len(memory) == 5

@@ -5,6 +5,7 @@ from functools import cache, partial
 
 import pytest
 import torch
+from pat.networks.positions import Found, WithPositions
 
 import pat.fusion.low_light
 import pat.fusion.tiles
@@ -20,7 +21,6 @@ from pat.matching.inputs import Beta, Inputs
 from pat.media.colour import luminance
 from pat.networks import denoiser
 from pat.networks.denoiser import NoisyView
-from pat.networks.positions import Found, WithPositions
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for

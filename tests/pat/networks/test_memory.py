@@ -10,11 +10,12 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views
 from pat.matching.multiview import agreed
-from pat.matching.pieces import Prepared, Tile
+from pat.matching.pieces import Prepared
 from pat.matching.semi_global import SemiGlobalMatches
 from pat.networks.weights import load_weights
 from pat.support.memory import give_back, limited, peak_memory, resident
