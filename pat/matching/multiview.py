@@ -21,14 +21,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
+from arraygeom.chunks import Box, assembled, spans
 from arraygeom.epipolar import FRONT, Track
-from arraygeom.fields.grid import Box
-from arraygeom.pixels import HW
 
 from ..media.colour import to_bytes
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches
-from .pieces import from_pieces
+from .pieces import matching_pieces
 from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
@@ -213,7 +212,7 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
     def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
         return MatchedBeta.of(inputs.betas[i], found[i], rows, between[i])
 
-    betas, strips = range(len(found)), _strips(inputs.hw)
+    betas, strips = range(len(found)), spans(inputs.hw[0], max(STRIP // inputs.hw[1] // FINE, 1) * FINE)
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
@@ -291,24 +290,20 @@ def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k
     return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < SUPPORT).to(own)
 
 
-def _strips(hw: HW) -> list[tuple[int, int]]:
-    """Even numbers of rows that are compared at a time."""
-    rows = max(STRIP // hw[1] // FINE, 1) * FINE
-    return [(top, min(top + rows, hw[0])) for top in range(0, hw[0], rows)]
-
-
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
     """Inverse depth diffused to where no match is consistent, and without outliers."""
 
-    def of(box: Box) -> list[Tensor]:
+    def of(box: Box) -> Tensor:
         part = (..., slice(box[0], box[1]), slice(box[2], box[3]))
         plane, known = (x[part].cpu().numpy() for x in (agreement.inverse_depth, agreement.known))
         guide = to_bytes(inputs.alpha[0, 0][part])
         smooth = filled(plane, known[0].astype(np.float32) + 1e-5, guide, DISPARITY_FILL)
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
-        return [torch.from_numpy(median)[None].to(inputs.alpha)]
+        return torch.from_numpy(median)[None].to(inputs.alpha)
 
-    return agreement._replace(inverse_depth=from_pieces(inputs.hw, inputs.multiple, of)[0])
+    pieces = matching_pieces(inputs.hw, inputs.multiple)
+    inverse_depth = assembled(inputs.hw, ((piece, of(piece.outer)) for piece in pieces))
+    return agreement._replace(inverse_depth=inverse_depth)
 
 
 def _of_beta(
