@@ -15,7 +15,7 @@ from ..compiled import can_compile
 from ..pixels import floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
-from ..tracing import traced, transformations
+from ..tracing import followed
 
 SamplingLocations = Segments | Positions
 
@@ -59,9 +59,8 @@ def _numbers(pair: Pair) -> Tensor | None:
 
 def compilable(x: Tensor) -> bool:
     """Whether compiled loops can take a tensor: plain numbers on the CPU that nothing follows."""
-    followed = traced() or transformations() or torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack()
     plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
-    return plain and not followed and can_compile()
+    return plain and not followed() and can_compile()
 
 
 CHUNK = 1 << 15

@@ -16,7 +16,7 @@ import importlib.util
 import os
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -24,8 +24,11 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
+from arraygeom.camera import View
 from arraygeom.chunks import chunked
+from arraygeom.fields import Local, lazily
 from arraygeom.pixels import pixel_coordinates
+from arraygeom.rig import Pair
 from arraygeom.segments import Positions, Segments
 from arraygeom.tracing import transformations
 from pat.attention import reference, torch_op
@@ -33,20 +36,24 @@ from pat.attention.reference import Attended, AttentionInputs, SamplePositions, 
 
 Locations = Segments | Positions
 Interpolation = Literal["bilinear", "nearest"]
-Backend = Literal["auto", "reference", "cpu", "triton"]
+Backend = Literal["auto", "reference", "cpu", "triton", "local"]
 
 DTYPES = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 CHUNK_SAMPLES = 2**22
 """How many explicit positions a callable is asked for at a time: 32 MiB of float32 (x, y)."""
 CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
+LOCAL_SERVES = (
+    "nearest values, without statistics, bias and derivatives, of `Local` windows of odd size and whole spacing "
+    "in float32 images of one size on the CPU"
+)
 
 
 def attend(
     query: Float[Tensor, "b d ha wa"],
     key: Float[Tensor, "b d hb wb"],
     value: Float[Tensor, "b dv hb wb"],
-    locations: Locations | Callable[[Tensor], Locations],
+    locations: Locations | Callable[[Tensor], Locations] | Local,
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
@@ -65,14 +72,16 @@ def attend(
         locations: the search segments or sampling locations in beta of each alpha pixel: Segments or Positions
             with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to
             either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a time and
-            again in backward, so that not all explicit positions exist at once.
+            again in backward, so that not all explicit positions exist at once. Or the field `Local`: windows, of
+            views of the same field of view.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
         backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
-            `triton`, or `auto`: the compiled one of the tensors' device, with forward-mode derivatives and
-            gradients of gradients by the reference, or the reference if there is none. An explicit compiled
-            backend that cannot serve raises.
+            `triton`, `local` (windows alone, see `LOCAL_SERVES`; its output is channels-first in memory), or
+            `auto`: `local` where that serves, or the compiled one of the tensors' device, with forward-mode
+            derivatives and gradients of gradients by the reference, or the reference if there is none. An explicit
+            compiled backend that cannot serve raises.
 
     Raises:
         ValueError: shapes, devices or options that do not fit together.
@@ -87,7 +96,7 @@ def attend_with_statistics(
     query: Float[Tensor, "b d ha wa"],
     key: Float[Tensor, "b d hb wb"],
     value: Float[Tensor, "b dv hb wb"],
-    locations: Locations | Callable[[Tensor], Locations],
+    locations: Locations | Callable[[Tensor], Locations] | Local,
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
@@ -105,7 +114,7 @@ def _attend(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    locations: Locations | Callable[[Tensor], Locations],
+    locations: Locations | Callable[[Tensor], Locations] | Local,
     samples: int | None,
     interpolation: Interpolation,
     bias: Tensor | None,
@@ -117,6 +126,14 @@ def _attend(
     query, key, value = _autocast(query, key, value)
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
+    if isinstance(locations, Local):
+        values_alone = nearest and samples is None and bias is None and not measured
+        if backend in ("auto", "local") and values_alone and _local_serves(query, key, value, locations):
+            return _attend_local(query, key, value, locations)
+        alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
+        locations = lazily(locations, Pair(alpha, beta))
+    if backend == "local":
+        raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
     def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
         form = _form(given, q, samples)
@@ -152,8 +169,20 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"query, key and value are on {query.device}, {key.device} and {value.device}: move them")
     if interpolation not in ("bilinear", "nearest"):
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
-    if backend not in ("auto", "reference", "cpu", "triton"):
-        raise ValueError(f"backend must be 'auto', 'reference', 'cpu' or 'triton', got {backend!r}")
+    if backend not in get_args(Backend):
+        raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, got {backend!r}")
+
+
+def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local) -> bool:
+    whole = field.size > 0 and field.size % 2 == 1 and float(field.spacing).is_integer()
+    taken = query.dtype == torch.float32 and query.device.type == "cpu" and query.shape[2:] == key.shape[2:]
+    return whole and taken and torch_op.is_plain(query, key, value) and not _missing(query, key, value)
+
+
+def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> tuple[Tensor, ...]:
+    from pat.attention import cpu
+
+    return (cpu.forward_local(query, key, value, field),)
 
 
 def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
@@ -202,7 +231,8 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 
 def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
     chosen = _choose(backend, inputs.query.device.type)
-    missing = "" if chosen == "reference" else _missing(inputs)
+    tensors = inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias
+    missing = "" if chosen == "reference" else _missing(*tensors)
     if missing and backend != "auto":
         raise NotImplementedError(f"backend '{backend}' has no {missing}: ask for backend=\"reference\"")
     if missing or chosen == "reference":
@@ -210,12 +240,11 @@ def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
     return torch_op.attend(inputs, measured=measured, backend=chosen, strict=backend != "auto")
 
 
-def _missing(inputs: AttentionInputs) -> str:
+def _missing(*tensors: Tensor | None) -> str:
     """What is under way that compiled backends have not; empty if nothing."""
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
-    tensors = (inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias)
     if "Jvp" in under_way or any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""

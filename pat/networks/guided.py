@@ -16,7 +16,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, conv2d, pixel_shuffle, pixel_unshuffle
 
-from arraygeom import Local, Pair, Segments, View, lazily
+from arraygeom import Local, Segments
 
 from ..attention import attend, attend_with_statistics
 from ..matching.colour_transfer import FILLS, likeness
@@ -28,10 +28,9 @@ from ..matching.semi_global import (
     matches,
 )
 from ..media.colour import luminance
-from .blocks import ResidualBlock, channels_last, conv, enlarge, plain, stacked
+from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
-from .windows import attend_to_windows
 
 COARSE = 4
 """Context is computed at a quarter of the size."""
@@ -297,14 +296,10 @@ class Propagation(nn.Module):
         self, features: Float[Tensor, "b d h w"], colour: Float[Tensor, "b c h w"], weight: Float[Tensor, "b 1 h w"]
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Colour and weight after one round."""
-        view = View(hw=(features.shape[-2], features.shape[-1]))
         query = torch.cat([self.query(features), torch.ones_like(weight)], 1)
         key = torch.cat([self.key(features), (weight + LEAST_WEIGHT).log()], 1)
         value = torch.cat([colour, weight], 1)
-        if all(plain(part) for part in (query, key, value)):
-            found = attend_to_windows(query, key, value, self.field.size, round(self.field.spacing))
-        else:
-            found = attend(query, key, value, lazily(self.field, Pair(view, view)), interpolation="nearest")
+        found = attend(query, key, value, self.field, interpolation="nearest")
         return found[:, :-1], found[:, -1:]
 
 
