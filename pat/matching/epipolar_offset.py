@@ -20,6 +20,7 @@ from torch import Tensor
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
+from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
 from .semi_global import along
 
@@ -196,10 +197,10 @@ class _Windows(NamedTuple):
 
 def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:
     """Weighted least squares with Cauchy's weights."""
-    found = np.zeros(len(design))
-    for _ in range(8):
-        rest = values - found @ design
-        deviation = max(1.4826 * float(np.median(np.abs(rest))), 0.05)
-        counts = weight / (1 + np.square(rest / (2 * deviation)))
-        found = np.linalg.solve((design * counts) @ design.T + 1e-3 * np.eye(len(design)), (design * counts) @ values)
-    return found
+    terms, wanted, counts = (torch.from_numpy(x).double() for x in (design, values, weight))
+
+    def weigh(rest: Tensor) -> Tensor:
+        return counts * cauchy(rest, 2 * normal_deviation(rest, 0.05))
+
+    eye = torch.eye(len(terms), dtype=torch.float64)
+    return robust_least_squares(terms, wanted, 0 * eye[0], weigh, precision=1e-3 * eye).coefficients.numpy()
