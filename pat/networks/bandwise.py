@@ -1,7 +1,7 @@
 """BandwisePAT: any number of bands, each treated alike, so that the order of the betas cannot matter.
 
 GuidedPAT mixes its bands in the order in which they come. Here the bands of a beta are matched and judged
-together, by the combination of them that is most like alpha (`pat.matching.spectral_mix`); then one GuidedPAT of a
+together, by the combination of them that is most like alpha (`pat.matching.radiometry`); then one GuidedPAT of a
 single band finishes each with the same weights. Permuting bands or betas permutes the output's bands and does
 nothing else.
 """
@@ -14,12 +14,12 @@ from dataclasses import asdict
 import torch
 from torch import Tensor, nn
 
-from ..matching.colour_transfer import matched_colours
+from ..matching.colour_transfer import coarse_mix, colours_of_bands, matched_colours
 from ..matching.inputs import Beta, Inputs
 from ..matching.multiview import matched_together
 from ..matching.pieces import Prepared
+from ..matching.radiometry import SpectralMix
 from ..matching.semi_global import FINE, Normalisations, SemiGlobalMatches
-from ..matching.spectral_mix import SpectralMix, coarse_mix, colours_of_bands
 from .configs import BandwisePATConfig, GuidedPATConfig
 from .guided import BetaEstimate, Encoded, GuidedPAT, output_of
 from .protocol import FusionOutput, JoinsBands
