@@ -1,7 +1,7 @@
 """Weighted linear least squares, with a prior or without, and the same where some of the values may be wrong.
 
-Wrong values are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977). `terms` (k, n) are
-what k coefficients are multiplied with in each of n values.
+Wrong values are down-weighted by iteratively reweighted least squares (Holland and Welsch 1977).
+`terms` (k, n) are what k coefficients are multiplied with in each of n values.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ def normal_deviation(rest: Float[Tensor, " n"], least: float) -> float:
 
 
 def cauchy(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
-    """The weights of Cauchy's loss: 1/2 for residuals of the scale's size; those of large ones fall as their square."""
+    """The weights of Cauchy's loss: 1/2 at the scale; large residuals' fall as their square."""
     return 1 / (1 + (rest / scale).square())
 
 
 def gaussian(rest: Float[Tensor, " n"], scale: float) -> Float[Tensor, " n"]:
-    """The weights of Welsch's loss: 1 / e for residuals of the scale's size; large ones do not count at all."""
+    """The weights of Welsch's loss: 1 / e at the scale; large residuals do not count at all."""
     return torch.exp(-(rest / scale).square())
 
 

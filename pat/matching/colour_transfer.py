@@ -1,5 +1,5 @@
-"""Beta's bands at alpha's view, by the matches: as bright as alpha, with its detail, and diffused to where they are not
-seen."""
+"""Beta's bands at alpha's view, by the matches: as bright as alpha, with its detail, and diffused to where
+they are not seen."""
 
 from __future__ import annotations
 
@@ -37,9 +37,11 @@ class ColourTransferSettings:
     likeness: float = 0.08
     # tuned on Middlebury: weight of a match that is not consistent, before the likeness
     inconsistent: float = 0.25
-    # tuned on Middlebury: strength, and 8-bit difference that counts as an edge, of the smoothing that diffuses colour
+    # tuned on Middlebury: strength, and 8-bit difference that counts as an edge, of the smoothing that
+    # diffuses colour
     fill: tuple[float, float] = (300.0, 3.0)
-    # tuned on Middlebury: regulariser (variance of brightness) of colour's regression where colour is diffused
+    # tuned on Middlebury: regulariser (variance of brightness) of colour's regression where colour is
+    # diffused
     fill_floor: float = 1e-3
     # tuned on Middlebury: within how many pixels the brightness of both views is compared
     surroundings: int = 24
@@ -51,20 +53,21 @@ class ColourTransferSettings:
     detail_radius: int = 2
     # tuned on Middlebury: its regulariser, a variance of brightness
     detail_floor: float = 1e-4
-    # tuned on Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by which beta
-    # is less sharp than alpha: within a smaller window beta shows one value
+    # tuned on Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by
+    # which beta is less sharp than alpha: within a smaller window beta shows one value
     radius_of_blur: float = 1.5
-    # tuned on Middlebury: where brightness explains no colour, colour differences grow with brightness by this part of
-    # their ratio to it
+    # tuned on Middlebury: where brightness explains no colour, colour differences grow with brightness by
+    # this part of their ratio to it
     saturated: float = 0.15
-    # tuned on SYNTIM and Middlebury: variance of colour's noise, of all bands, over that of what the views' brightness
-    # differs by ...
+    # tuned on SYNTIM and Middlebury: variance of colour's noise, of all bands, over that of what the views'
+    # brightness differs by ...
     noise_share: float = 20.0
     # tuned on SYNTIM and Middlebury: ... beyond this share of texture ...
     texture_share: float = 0.6
     # tuned on SYNTIM and Middlebury: ... where there is least of either, at this quantile
     lowest: float = 0.1
-    # size: less variance than this, two thirds of a level of 8 bits in each band, is left; taking it out takes time
+    # size: less variance than this, two thirds of a level of 8 bits in each band, is left; taking it out
+    # takes time
     least_noise: float = 2e-5
     # size: differences of brightness beyond this are no detail that beta lost
     most_detail: float = 0.2
@@ -86,8 +89,8 @@ def matched_colours(
     facts: Float[Tensor, "b 3 h2 w2"],
     normalisation: Normalisation,
 ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and beta has
-    not; their weight, 0 to 1."""
+    """Beta's bands minus alpha at the matches, colour as in alpha's light, with the detail that alpha has and
+    beta has not; their weight, 0 to 1."""
     bands = beta.shape[1]
     seen, valid = at_matches(torch.cat([beta, guide, normalisation.normalised(guide)], 1), segments, disparity)
     values, own, brightness = seen.split([bands, 1, 1], 1)
@@ -113,8 +116,8 @@ def coarse_mix(
 ) -> SpectralMix:
     """The combination of beta's bands that is most like alpha, found on images reduced by `factor`.
 
-    `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of alpha's
-    pixels, in pixels of the whole beta.
+    `segments` (B or 1, h / factor, w / factor) and `blocks` (half as many) are of the centres of blocks of
+    alpha's pixels, in pixels of the whole beta.
     """
     if beta.shape[1] == 1:
         return SpectralMix.equal(beta)
@@ -155,7 +158,8 @@ def _matched(values: Tensor, alpha: Tensor, mix: SpectralMix, normalisation: Nor
 def _scaled_to_alpha(colour: Tensor, brightness: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
     """Colour differences (B, C, H, W) and brightness of beta, larger where alpha is brighter around a pixel.
 
-    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in between.
+    What a lens or the light makes brighter keeps its saturation, a reflection does not: the power is in
+        between.
     """
     least, most = 1e-3, SETTINGS.most_brighter
     own, other = (box_mean(image * weight, SETTINGS.surroundings) + least for image in (alpha, brightness))
@@ -189,7 +193,8 @@ def match_weight(unlike: Float[Tensor, "b 1 h w"], consistent: Tensor, valid: Te
 
 
 def likeness(unlike: Float[Tensor, "b 1 h w"], scale: float) -> Float[Tensor, "b 1 h w"]:
-    """1 where two images have the same brightness around a pixel, 1 / e where they differ by `scale` there."""
+    """1 where two images have the same brightness around a pixel, 1 / e where they differ by `scale`
+    there."""
     unlike = avg_pool2d(unlike.abs(), 3, 1, 1, count_include_pad=False)
     return torch.exp(-(unlike / scale).square())
 
@@ -206,8 +211,8 @@ def diffused_from(
 def colour_noise(
     unlike: Float[Tensor, "b 1 h w"], texture: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """The variance of noise in colour at the matches, of all bands, from the difference of brightness (`unlike`): what
-    of it is fine, beyond what sampling changes of fine texture."""
+    """The variance of noise in colour at the matches, of all bands, from the difference of brightness
+    (`unlike`): what of it is fine, beyond what sampling changes of fine texture."""
     parts, radius = torch.cat([unlike, texture], 1), SETTINGS.detail_radius
     fine = box_mean((parts - box_mean(parts, radius)).square(), radius)
     fine = torch.where(weight > 0.5, fine, torch.nan)[..., ::4, ::4].flatten(2)
@@ -216,8 +221,8 @@ def colour_noise(
 
 
 def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
-    """Colour (B, C, H, W) nearer to its local regression on brightness, the more of what is beside it is noise (Lee
-    1980)."""
+    """Colour (B, C, H, W) nearer to its local regression on brightness, the more of what is beside it is
+    noise (Lee 1980)."""
     local = LocalMoments.within(SETTINGS.detail_radius, colour, brightness)
     slope = local.slope(SETTINGS.detail_floor)
     fitted = local.bands + slope * (brightness - local.image)
@@ -226,7 +231,8 @@ def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
 
 
 def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Sequence[int]) -> Tensor:
-    """`_detailed`, each of the batch with its own radius, and colour that brightness does not explain as saturated."""
+    """`_detailed`, each of the batch with its own radius, and colour that brightness does not explain as
+    saturated."""
     radii = [radii[0]] if len(set(radii)) == 1 else radii
     parts = zip(*(x.tensor_split(len(radii)) for x in (colour, brightness, alpha)), radii)
     return torch.cat([_detailed(c, b, a, SETTINGS.saturated, radius) for c, b, a, radius in parts])
@@ -235,7 +241,8 @@ def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Seq
 def _detailed(
     colour: Tensor, brightness: Tensor, alpha: Tensor, saturated: float = 0.0, radius: int = SETTINGS.detail_radius
 ) -> Tensor:
-    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has beyond it."""
+    """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has
+    beyond it."""
     return colour + local_slope(colour, brightness, saturated, radius) * SETTINGS.detail(alpha - brightness)
 
 
@@ -247,8 +254,9 @@ def local_slope(
 ) -> Float[Tensor, "b c h w"]:
     """The slope of the regression of colour on brightness around each pixel.
 
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution. The
-    less of colour's variance the regression explains, the nearer is the slope to that of `saturated` times the
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its
+    resolution. The less of colour's variance the regression explains, the nearer is the slope to that of
+    `saturated` times the
     saturation: few of a window's pixels are independent, so that even noise seems to be explained in part.
     """
     local = LocalMoments.within(radius, colour, brightness)
@@ -265,11 +273,11 @@ def _diffused(
     guide: NDArray[np.uint8],
     how: tuple[float, float] = SETTINGS.fill,
 ) -> NDArray[np.float32]:
-    """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on brightness
-    (h, w), and as it is.
+    """Colour (c, h, w) over what is connected in the guide, (fills, c, h, w): by its weighted regression on
+    brightness (h, w), and as it is.
 
-    The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no beta sees
-    has colour that varies with brightness as it does nearby.
+    The moments of the guided filter (He et al. 2013), diffused instead of averaged over a window: what no
+    beta sees has colour that varies with brightness as it does nearby.
     """
     totals = smoothed([weight * p for p in (1, brightness, brightness**2, *colour)], guide, how)
     products = smoothed([weight * brightness * p for p in colour], guide, how)

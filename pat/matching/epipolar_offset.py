@@ -1,8 +1,9 @@
-"""How far beta's points lie across their search segments: a camera that has moved a little since its calibration.
+"""How far beta's points lie across their search segments: a camera that has moved a little since its
+calibration.
 
-The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the optical
-axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade 1981), each
-freed of what it is off along its segment.
+The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the
+optical axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade
+1981), each freed of what it is off along its segment.
 """
 
 from __future__ import annotations
@@ -27,27 +28,29 @@ from .semi_global import along
 Image = NDArray[Any]
 
 
-class AlignmentSettings(NamedTuple):
-    """Constants of the fit, in pixels of the images it is given; chosen on the pairs that `ResponseSettings` names.
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury: its tune half."""
 
-    blur: standard deviation of the blur before gradients.
-    radius: of the windows.
-    steps: Gauss-Newton steps at most; a step below `finest` ends them.
-    contrast: mean squared gradient of a window that counts half.
-    farthest: a window's displacement in one step is at most this.
-    least: largest displacement of a pixel below which the rig is taken to be right.
-    better: residual with the displacement over that without, up to which it is accepted.
-    windows: fewest windows with texture.
-    """
-
+    # tuned on Middlebury: standard deviation of the blur before gradients
     blur: float = 1.5
+    # tuned on Middlebury: of the windows, to either side
     radius: int = 7
+    # size: Gauss-Newton steps at most
     steps: int = 6
+    # size: a step below this ends them
     finest: float = 5e-3
+    # tuned on Middlebury: mean squared gradient of a window that counts half
     contrast: float = 2e-5
+    # size: a window's displacement in one step is at most this
     farthest: float = 2.0
+    # size: the standard deviation of windows' displacements about the plane, at least
+    deviation: float = 0.05
+    # tuned on Middlebury: largest displacement of a pixel below which the rig is taken to be right
     least: float = 0.2
+    # tuned on Middlebury: residual with the displacement over that without, up to which it is accepted
     better: float = 0.98
+    # size: fewest windows with texture
     windows: int = 50
 
 
@@ -58,8 +61,9 @@ SETTINGS = AlignmentSettings()
 class Misalignment:
     """The displacement across the segments, in widths of alpha: `shift` + `across` u + `down` v.
 
-    (u, v) is a pixel's place from the middle of alpha, in widths of alpha. Beta has about alpha's angular resolution.
-    Across is where along the segment from its end, turned by a right angle from x towards y, points.
+    (u, v) is a pixel's place from the middle of alpha, in widths of alpha. Beta has about alpha's angular
+    resolution. Across is where along the segment from its end, turned by a right angle from x towards y,
+    points.
     """
 
     shift: float = 0.0
@@ -104,7 +108,8 @@ def fit_misalignment(
 ) -> Misalignment:
     """How far across its segments beta is, from matches; none if that explains the images hardly better.
 
-    `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is 0 to 1.
+    `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is
+    0 to 1.
     """
     own, other, where, across, counts = (
         t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight)
@@ -192,15 +197,17 @@ class _Windows(NamedTuple):
         found = towards[some][useful] / (strength[some][useful] + self.settings.contrast / 10)
         counts = strength[some][useful] / (strength[some][useful] + self.settings.contrast)
         limit = self.settings.farthest
-        return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts)
+        return _robust_plane(
+            self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts, self.settings.deviation
+        )
 
 
-def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:
-    """Weighted least squares with Cauchy's weights."""
+def _robust_plane(design: NDArray, values: NDArray, weight: NDArray, least: float) -> NDArray[np.float64]:
+    """Weighted least squares with Cauchy's weights; the deviation is at least this."""
     terms, wanted, counts = (torch.from_numpy(x).double() for x in (design, values, weight))
 
     def weigh(rest: Tensor) -> Tensor:
-        return counts * cauchy(rest, 2 * normal_deviation(rest, 0.05))
+        return counts * cauchy(rest, 2 * normal_deviation(rest, least))
 
     eye = torch.eye(len(terms), dtype=torch.float64)
     return robust_least_squares(terms, wanted, 0 * eye[0], weigh, precision=1e-3 * eye).coefficients.numpy()

@@ -1,4 +1,4 @@
-"""Images made comparable: means and standard deviations, of whole images, where a weight is and locally; sharpness."""
+"""Images made comparable: their moments (whole, where a weight is, and local), and their sharpness."""
 
 from __future__ import annotations
 
@@ -27,7 +27,8 @@ class NormalisationSettings:
 
     # size: the largest factor of brightness; images that differ by more show different things
     largest_gain: float = 4.0
-    # size: standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other
+    # size: standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the
+    # other
     blurs: tuple[float, ...] = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
     # tuned on Middlebury, tune half: contrast over the other's up to which an image is no sharper
     sharper: float = 1.05
@@ -69,8 +70,8 @@ def normalised(
 ) -> Float[Tensor, "*b c h w"]:
     """The image with another's mean and standard deviation.
 
-    With a weight, where that is: both show the same point at a pixel there. Statistics of whole images mean little
-    where these show different parts of a scene.
+    With a weight, where that is: both show the same point at a pixel there. Statistics of whole images mean
+    little where these show different parts of a scene.
     """
     return moments(image, weight).matched(image, moments(like, weight), largest_gain)
 
@@ -83,7 +84,8 @@ def mean_moments(images: Iterable[Float[Tensor, "c h w"]]) -> Moments:
 def explained_share(
     image: Float[Tensor, "b 1 h w"], of: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
 ) -> Float[Tensor, "b 1 1 1"]:
-    """The share of one image's variance that another explains where the weight is, 0 if one is the other's negative.
+    """The share of one image's variance that another explains where the weight is, 0 if one is the other's
+    negative.
 
     Small for an alpha in the near infrared: its detail says little of visible colours.
     """
@@ -148,9 +150,10 @@ def _levelled(image: Tensor, level: Tensor) -> Tensor:
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
+    """Standard deviations to blur either with until it is no sharper.
 
-    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the other.
+    Detail that only one has cannot be matched. Sharpness is the mean difference of neighbouring pixels; 0 for an
+    image that has hardly more than the other.
     """
     own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
     return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
@@ -181,7 +184,10 @@ def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
 
 
 class LocalMoments(NamedTuple):
-    """Moments within squares around each pixel: means, variances and covariance of bands (B, C, H, W) and one image."""
+    """Moments of bands (B, C, H, W) and an image (B, 1, H, W) within squares around each pixel.
+
+    `bands` and `image` are the means.
+    """
 
     bands: Tensor
     image: Tensor

@@ -1,12 +1,13 @@
 """Which combination of beta's bands alpha sees: of RGB (`Response`), and of any bands (`SpectralMix`).
 
-The network compares alpha with Rec. 601 luma of an RGB beta and keeps alpha as the result's luma. A real mono sensor
-weighs red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter. There alpha is
-explained as weights . (gain * beta^gamma) over points that match, and beta is mapped so that its luma is that: scaled,
-raised to the power, and sheared along grey, so that neutral stays neutral. The fused image is sheared back.
+The network compares alpha with Rec. 601 luma of an RGB beta and keeps alpha as the result's luma. A real mono
+sensor weighs red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter.
+There alpha is explained as weights . (gain * beta^gamma) over points that match, and beta is mapped so that
+its luma is that: scaled, raised to the power, and sheared along grey, so that neutral stays neutral. The
+fused image is sheared back.
 
-Of other bands alpha is explained as offset + weights . beta around each pixel, and how alpha's detail adds to each is
-found too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
+Of other bands alpha is explained as offset + weights . beta around each pixel, and how alpha's detail adds to
+each is found too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
 """
 
 from __future__ import annotations
@@ -30,19 +31,22 @@ from .normalisation import box_mean
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """Tuned: on Middlebury's Bowling1 and 2, Cloth1, 2 and 4, Flowerpots, Midd1, Plastic, Wood1 (its tune half).
+    """Tuned: on Middlebury's Bowling1 and 2, Cloth1, 2 and 4, Flowerpots, Midd1, Plastic, Wood1 (its tune
+    half).
 
-    A misfit is a sum of squares over independent observations, in standard deviations. In a scene of one hue several
-    responses explain alpha.
+    A misfit is a sum of squares over independent observations, in standard deviations. In a scene of one hue
+    several responses explain alpha.
     """
 
     # physics: weights of a usual sensor, when it is not Rec. 601's
     usual: tuple[float, float, float] = (0.32, 0.48, 0.20)
     # tuned on Middlebury: standard deviation of weights about these
     prior: float = 0.2
-    # tuned on Middlebury: as how many independent observations all points count: about as many as there are materials
+    # tuned on Middlebury: as how many independent observations all points count: about as many as there are
+    # materials
     independent: float = 20.0
-    # tuned on Middlebury: standard deviation of one of those, at least: light and surfaces differ between the views
+    # tuned on Middlebury: standard deviation of one of those, at least: light and surfaces differ between the
+    # views
     error: float = 0.012
     # tuned on Middlebury: residuals of this many robust deviations count half
     outlier: float = 2.0
@@ -58,24 +62,28 @@ class ResponseSettings:
     negative: float = 0.05
     # physics: weights of an unfiltered sensor, which sees more blue than Rec. 601
     sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
-    # tuned on Middlebury: logarithm of a gain up to which light that differs between the views may be its cause: where
-    # a sensor might, and where none would
+    # tuned on Middlebury: logarithm of a gain up to which light that differs between the views may be its
+    # cause: where a sensor might, and where none would
     light: tuple[float, float] = (0.035, 0.12)
-    # physics: share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's, and alpha
-    # is brighter than luma where an unfiltered sensor would be darker, or the other way round: that is light too
+    # physics: share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's,
+    # and alpha is brighter than luma where an unfiltered sensor would be darker, or the other way round: that
+    # is light too
     greenest: float = 0.62
     # tuned on Middlebury: a gain explains alpha as well as weights do if its misfit is up to this much larger
     alike: float = 2.0
-    # tuned on Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to be taken
-    # in their place: a sensor without filters; light may differ between the views by a gain of this deviation
+    # tuned on Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights,
+    # to be taken in their place: a sensor without filters; light may differ between the views by a gain of
+    # this deviation
     equal_weights: tuple[float, float] = (8.0, 0.006)
     # tuned on Middlebury: root mean square change of luma up to which the weights are left at Rec. 601's
     least_change: float = 0.01
     # tuned on Middlebury: the error over the least one up to which a gamma explains alpha as well
     equal: float = 1.1
-    # tuned on Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken
+    # tuned on Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be
+    # taken
     better: float = 0.8
-    # physics: logarithm of vignetting below which, at the points, there is none; above which, in a corner, no lens is
+    # physics: logarithm of vignetting below which, at the points, there is none; above which, in a corner, no
+    # lens is
     shading: tuple[float, float] = (0.08, 0.7)
     # size: share of alpha's variance that must be explained
     explained: float = 0.5
@@ -85,20 +93,22 @@ class ResponseSettings:
 class MixSettings:
     """Brightness is 0 to 1."""
 
-    # tuned on Middlebury, three bands: difference from alpha at which a match counts 1 / e in the second of two fits
+    # tuned on Middlebury, three bands: difference from alpha at which a match counts 1 / e in the second of
+    # two fits
     outlier: float = 0.06
     # size: how strongly the combination is drawn to one of equal parts: share of the bands' mean variance
     equal: float = 1e-4
-    # tuned on Middlebury, three bands: difference from alpha, averaged over `smooth` pixels to either side, at which
-    # the combination counts half
+    # tuned on Middlebury, three bands: difference from alpha, averaged over `smooth` pixels to either side,
+    # at which the combination counts half
     misfit: float = 0.016
     # size: see `misfit`
     smooth: int = 4
-    # tuned on Middlebury, three bands: where the combination's black and white are so near to alpha's, black is taken
-    # for black and white for white, and the difference for that of two exposures
+    # tuned on Middlebury, three bands: where the combination's black and white are so near to alpha's, black
+    # is taken for black and white for white, and the difference for that of two exposures
     alike: float = 0.08
-    # tuned on Middlebury, three bands: wrong matches make least squares' weights too small; they are enlarged until the
-    # combination varies as much as alpha, as if no less than this share of alpha's variance were explained
+    # tuned on Middlebury, three bands: wrong matches make least squares' weights too small; they are enlarged
+    # until the combination varies as much as alpha, as if no less than this share of alpha's variance were
+    # explained
     diluted: float = 0.8
     # size: bands are compared with alpha within squares whose radius is the image's longer side over this
     wide: int = 4
@@ -113,7 +123,8 @@ class Response(NamedTuple):
 
     The weights' sum is 1, where they are not stated otherwise.
     explained: the share of alpha's variance at the matches that this explains, 0 to 1.
-    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none without.
+    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none
+        without.
     """
 
     weights: Float[Tensor, "3"]
@@ -171,7 +182,8 @@ Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 
 
 def stated_response(weights: Sequence[float]) -> Response:
-    """The response of an alpha that is weights . beta. Raises ValueError unless these are three, none negative."""
+    """The response of an alpha that is weights . beta. Raises ValueError unless these are three, none
+    negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
         raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}")
@@ -186,8 +198,8 @@ def fit(
 ) -> Response:
     """The response by robust least squares over points: the most plausible of those that explain alpha.
 
-    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found too. Rec.
-    601's where there are too few points, or where a combination of bands does not explain alpha.
+    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
+    too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
     """
     most, fewest = settings.points
     step = max(alpha.numel() // most, 1)
@@ -211,7 +223,8 @@ def fit(
 
 
 class _Fit(NamedTuple):
-    """`counts` is what the square of each point's residual counts, in 1 / variance of independent observations."""
+    """`counts` is what the square of each point's residual counts, in 1 / variance of independent
+    observations."""
 
     weights: Float[Tensor, "3"]
     counts: Float[Tensor, " n"]
@@ -220,7 +233,8 @@ class _Fit(NamedTuple):
 
 
 def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
-    """1, or the gamma that explains alpha clearly better; of several the one with the most plausible response."""
+    """1, or the gamma that explains alpha clearly better; of several the one with the most plausible
+    response."""
     trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in settings.gammas}
     least = min(trial.error for trial in trials.values())
     if least > settings.better * trials[1.0].error:
@@ -247,7 +261,8 @@ def _plausible(slopes: Tensor, terms: Tensor, settings: ResponseSettings) -> boo
 
 
 def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
-    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's weights."""
+    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's
+    weights."""
     slopes = terms.new_zeros(len(terms))
     design = torch.cat([terms, torch.ones_like(terms[:1])])
     for _ in range(3):
@@ -303,7 +318,8 @@ class _Points(NamedTuple):
 
 
 class _Trial(NamedTuple):
-    """An explanation of alpha: its misfit with what it must gain to be taken, its weights of sum 1, and its gain."""
+    """An explanation of alpha: its misfit with what it must gain to be taken, its weights of sum 1, and its
+    gain."""
 
     misfit: float
     weights: Float[Tensor, "3"]
@@ -313,8 +329,8 @@ class _Trial(NamedTuple):
 def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
     """The most plausible of four explanations of alpha, and its misfit.
 
-    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit, and what
-    each must gain to be taken decides.
+    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit,
+    and what each must gain to be taken decides.
     """
     points, rec601 = _Points(x, y, found.counts), Response.rec601().weights
     usual = x.new_tensor(settings.usual)
@@ -351,8 +367,8 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
 def _is_light(
     points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor], settings: ResponseSettings
 ) -> bool:
-    """Whether light that differs between the views may be why other weights explain alpha better: a small gain explains
-    it as well, or no sensor has such weights."""
+    """Whether light that differs between the views may be why other weights explain alpha better: a small
+    gain explains it as well, or no sensor has such weights."""
     rec601, sensor = Response.rec601().weights, points.x.new_tensor(settings.sensor)
     unlike_sensors = (gain - 1) * float(((sensor - rec601) @ points.x) @ points.counts) < 0
     no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in weights)
@@ -373,12 +389,13 @@ def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseS
 
 
 class SpectralMix(NamedTuple):
-    """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times bands.
+    """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times
+    bands.
 
-    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next; less if
-        that explains alpha badly.
-    gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another spectrum. 0
-        for one band, where that cannot be known.
+    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next;
+        less if that explains alpha badly.
+    gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another
+        spectrum. 0 for one band, where that cannot be known.
     """
 
     weights: Float[Tensor, "b c"]
@@ -396,8 +413,8 @@ class SpectralMix(NamedTuple):
     def fitted(
         cls, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
     ) -> SpectralMix:
-        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the second time
-        without outliers."""
+        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
+        second time without outliers."""
         parts = [_mix(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
         return cls(*(torch.stack(part) for part in zip(*parts)))
 
@@ -439,8 +456,8 @@ def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, 
 
 
 def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
-    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones. The second time without
-    outliers."""
+    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones. The second time
+    without outliers."""
     share, mean = weight / weight.sum(), x.mean(0)
     scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
     equal = scale.expand(len(x)) / len(x)
@@ -457,7 +474,8 @@ def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
 
 
 def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
-    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views, slowly."""
+    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views,
+    slowly."""
     radius = max(planes.shape[-2:]) // MIX_SETTINGS.wide
     return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
 
@@ -468,7 +486,8 @@ def _detail(planes: Tensor) -> Tensor:
 
 
 def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
-    """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average out."""
+    """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average
+    out."""
     radius = MIX_SETTINGS.smooth
 
     def mean(plane: Tensor) -> Tensor:
