@@ -40,9 +40,6 @@ class ColourTransferSettings:
     # tuned on Middlebury: strength, and 8-bit difference that counts as an edge, of the smoothing that
     # diffuses colour
     fill: tuple[float, float] = (300.0, 3.0)
-    # tuned on Middlebury: regulariser (variance of brightness) of colour's regression where colour is
-    # diffused
-    fill_floor: float = 1e-3
     # tuned on Middlebury: within how many pixels the brightness of both views is compared
     surroundings: int = 24
     # tuned on Middlebury: the power of its ratio by which colour grows
@@ -51,8 +48,8 @@ class ColourTransferSettings:
     most_brighter: float = 2.0
     # tuned on Middlebury: window of the regression that gives matched colour the detail that beta lost
     detail_radius: int = 2
-    # tuned on Middlebury: its regulariser, a variance of brightness
-    detail_floor: float = 1e-4
+    # tuned on Middlebury: regulariser of colour's regressions on brightness, a variance of that
+    floor: float = 1e-4
     # tuned on Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by
     # which beta is less sharp than alpha: within a smaller window beta shows one value
     radius_of_blur: float = 1.5
@@ -224,7 +221,7 @@ def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
     """Colour (B, C, H, W) nearer to its local regression on brightness, the more of what is beside it is
     noise (Lee 1980)."""
     local = LocalMoments.within(SETTINGS.detail_radius, colour, brightness)
-    slope = local.slope(SETTINGS.detail_floor)
+    slope = local.slope(SETTINGS.floor)
     fitted = local.bands + slope * (brightness - local.image)
     rest = (local.variance_of_bands - slope * local.covariance).sum(1, keepdim=True).clamp(min=0)
     return torch.lerp(fitted, colour, (rest - noise).clamp(min=0) / (rest + 1e-9))
@@ -263,7 +260,7 @@ def local_slope(
     variances = (local.variance_of_image + 1e-6) * (local.variance_of_bands + 1e-6)
     explained = (local.covariance.square() / variances).clamp(max=1) ** 3
     otherwise = saturated * local.bands / local.image.clamp(min=0.05)
-    return torch.lerp(otherwise, local.slope(SETTINGS.detail_floor), explained)
+    return torch.lerp(otherwise, local.slope(SETTINGS.floor), explained)
 
 
 def _diffused(
@@ -283,6 +280,6 @@ def _diffused(
     products = smoothed([weight * brightness * p for p in colour], guide, how)
     out = np.empty((FILLS, *colour.shape), np.float32)
     planes = zip(totals[3:], products, *out)
-    floor = SETTINGS.fill_floor
+    floor = SETTINGS.floor
     in_parallel([partial(kernels.regression, brightness, *totals[:3], c, p, floor, *o) for c, p, *o in planes])
     return out

@@ -38,7 +38,7 @@ class ResponseSettings:
     several responses explain alpha.
     """
 
-    # physics: weights of a usual sensor, when it is not Rec. 601's
+    # physics: weights of a usual sensor that is not Rec. 601's: it sees more blue
     usual: tuple[float, float, float] = (0.32, 0.48, 0.20)
     # tuned on Middlebury: standard deviation of weights about these
     prior: float = 0.2
@@ -58,10 +58,6 @@ class ResponseSettings:
     )
     # tuned on Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken
     unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
-    # physics: standard deviation of negative weights: filters overlap, and matches are not exact
-    negative: float = 0.05
-    # physics: weights of an unfiltered sensor, which sees more blue than Rec. 601
-    sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
     # tuned on Middlebury: logarithm of a gain up to which light that differs between the views may be its
     # cause: where a sensor might, and where none would
     light: tuple[float, float] = (0.035, 0.12)
@@ -69,14 +65,9 @@ class ResponseSettings:
     # and alpha is brighter than luma where an unfiltered sensor would be darker, or the other way round: that
     # is light too
     greenest: float = 0.62
-    # tuned on Middlebury: a gain explains alpha as well as weights do if its misfit is up to this much larger
-    alike: float = 2.0
     # tuned on Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights,
-    # to be taken in their place: a sensor without filters; light may differ between the views by a gain of
-    # this deviation
-    equal_weights: tuple[float, float] = (8.0, 0.006)
-    # tuned on Middlebury: root mean square change of luma up to which the weights are left at Rec. 601's
-    least_change: float = 0.01
+    # to be taken in their place: a sensor without filters
+    equal_weights: float = 8.0
     # tuned on Middlebury: the error over the least one up to which a gamma explains alpha as well
     equal: float = 1.1
     # tuned on Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be
@@ -342,23 +333,17 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     scaled = torch.block_diag(free, precision / scale**2)
     both, (total, *rest) = points.explained(y, torch.stack([grey, *hues]), scaled)
     weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
-
-    def negative(weights: Tensor) -> float:
-        return float((weights.clamp(max=0) / settings.negative).square().sum())
-
     trials = [
         _Trial(only_gain + settings.unlikely[0], rec601, float(gain)),
-        _Trial(both + settings.unlikely[2] + negative(further), further, float(total)),
+        _Trial(both + settings.unlikely[2], further, float(total)),
     ]
     if gamma == 1:
-        trials.append(_Trial(only_weights + settings.unlikely[1] + negative(weights), weights, 1.0))
+        trials.append(_Trial(only_weights + settings.unlikely[1], weights, 1.0))
         trials.append(_Trial(points.misfit(rec601 @ x), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial.misfit)
-    if exposure == 1:
-        differing = float(((chosen - rec601) @ x).square().mean().sqrt())
-        as_well = only_gain < only_weights + settings.alike
-        if differing < settings.least_change or _is_light(points, float(gain), as_well, (weights, further), settings):
-            chosen = rec601
+    as_well = only_gain < only_weights
+    if exposure == 1 and _is_light(points, float(gain), as_well, (weights, further), settings):
+        chosen = rec601
     if chosen is not rec601:
         chosen, exposure = _or_equal(points, chosen, exposure, settings)
     return misfit, Response(chosen, exposure, gamma, found.explained)
@@ -369,23 +354,27 @@ def _is_light(
 ) -> bool:
     """Whether light that differs between the views may be why other weights explain alpha better: a small
     gain explains it as well, or no sensor has such weights."""
-    rec601, sensor = Response.rec601().weights, points.x.new_tensor(settings.sensor)
-    unlike_sensors = (gain - 1) * float(((sensor - rec601) @ points.x) @ points.counts) < 0
+    rec601, usual = Response.rec601().weights, points.x.new_tensor(settings.usual)
+    unlike_sensors = (gain - 1) * float(((usual - rec601) @ points.x) @ points.counts) < 0
     no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in weights)
-    small = abs(math.log(gain)) < settings.light[unlike_sensors]
-    return (as_well and small) or (unlike_sensors and no_sensor)
+    small = as_well and abs(math.log(gain)) < settings.light[unlike_sensors]
+    return small or (unlike_sensors and no_sensor)
 
 
 def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseSettings) -> tuple[Tensor, float]:
-    """1/3 of each band with the gain that fits best, if they explain alpha about as well as these weights."""
-    more, deviation = settings.equal_weights
-    precision = points.x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
+    """1/3 of each band if they explain alpha about as well as these weights, with the gain that fits best unless
+    that is 1."""
     equal = torch.full_like(weights, 1 / 3)
-    shades = [gain * (w @ points.x) for w in (weights, equal)]
-    (misfit, _), (of_equal, (light,)) = (points.explained(points.y - s, s[None], precision) for s in shades)
-    if of_equal > misfit + more:
-        return weights, gain
-    return equal, gain if gain == 1 else gain * (1 + float(light))
+
+    def best(weights: Tensor) -> tuple[float, float]:
+        shade = weights @ points.x
+        if gain == 1:
+            return points.misfit(shade), gain
+        misfit, (factor,) = points.explained(points.y, shade[None], points.x.new_zeros(1, 1))
+        return misfit, float(factor)
+
+    (misfit, _), (of_equal, its_gain) = best(weights), best(equal)
+    return (weights, gain) if of_equal > misfit + settings.equal_weights else (equal, its_gain)
 
 
 class SpectralMix(NamedTuple):
