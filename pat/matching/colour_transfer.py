@@ -19,6 +19,7 @@ from arraygeom.sampling import on_image, sample
 from arraygeom.threads import in_parallel
 
 from ..media.colour import to_bytes
+from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
 from .normalisation import SETTINGS as NORMALISATION
 from .normalisation import LocalMoments, Normalisation, Normalisations, box_mean, explained_share, normalised
@@ -31,43 +32,42 @@ FILLS = 2
 
 @dataclass(frozen=True)
 class ColourTransferSettings:
-    """Brightness is 0 to 1. Tuned: on Middlebury, tune half; with SYNTIM's where it says so."""
+    """Brightness is 0 to 1. Middlebury and SYNTIM are the pairs of their tune halves."""
 
-    # tuned on Middlebury: difference of brightness at which the weight of a match falls to 1 / e
-    likeness: float = 0.08
-    # tuned on Middlebury: weight of a match that is not consistent, before the likeness
-    inconsistent: float = 0.25
-    # tuned on Middlebury: strength, and 8-bit difference that counts as an edge, of the smoothing that
-    # diffuses colour
-    fill: tuple[float, float] = (300.0, 3.0)
-    # tuned on Middlebury: within how many pixels the brightness of both views is compared
-    surroundings: int = 24
-    # tuned on Middlebury: the power of its ratio by which colour grows
-    saturation: float = 0.6
-    # size: matched surroundings whose brightness differs by a larger factor are of different things
-    most_brighter: float = 2.0
-    # tuned on Middlebury: window of the regression that gives matched colour the detail that beta lost
-    detail_radius: int = 2
-    # tuned on Middlebury: regulariser of colour's regressions on brightness, a variance of that
-    floor: float = 1e-4
-    # tuned on Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by
-    # which beta is less sharp than alpha: within a smaller window beta shows one value
-    radius_of_blur: float = 1.5
-    # tuned on Middlebury: where brightness explains no colour, colour differences grow with brightness by
-    # this part of their ratio to it
-    saturated: float = 0.15
-    # tuned on SYNTIM and Middlebury: variance of colour's noise, of all bands, over that of what the views'
-    # brightness differs by ...
-    noise_share: float = 20.0
-    # tuned on SYNTIM and Middlebury: ... beyond this share of texture ...
-    texture_share: float = 0.6
-    # tuned on SYNTIM and Middlebury: ... where there is least of either, at this quantile
-    lowest: float = 0.1
-    # size: less variance than this, two thirds of a level of 8 bits in each band, is left; taking it out
-    # takes time
-    least_noise: float = 2e-5
-    # size: differences of brightness beyond this are no detail that beta lost
-    most_detail: float = 0.2
+    likeness: float = tuned(0.08, "Middlebury: difference of brightness at which the weight of a match falls to 1 / e")
+    inconsistent: float = tuned(0.25, "Middlebury: weight of a match that is not consistent, before the likeness")
+    fill: tuple[float, float] = tuned(
+        (300.0, 3.0),
+        "Middlebury: strength, and 8-bit difference that counts as an edge, of the smoothing that diffuses colour",
+    )
+    surroundings: int = tuned(24, "Middlebury: within how many pixels the brightness of both views is compared")
+    saturation: float = tuned(0.6, "Middlebury: the power of its ratio by which colour grows")
+    most_brighter: float = size(
+        2.0, "Matched surroundings whose brightness differs by a larger factor are of different things"
+    )
+    detail_radius: int = tuned(
+        2, "Middlebury: window of the regression that gives matched colour the detail that beta lost"
+    )
+    floor: float = tuned(1e-4, "Middlebury: regulariser of colour's regressions on brightness, a variance of that")
+    radius_of_blur: float = tuned(
+        1.5,
+        "Middlebury, reduced 4 and 8 times: the window's radius for each pixel of standard deviation by "
+        "which beta is less sharp than alpha: within a smaller window beta shows one value",
+    )
+    noise_share: float = tuned(
+        20.0,
+        "SYNTIM and Middlebury: variance of colour's noise, of all bands, over that of what the views' "
+        "brightness differs by",
+    )
+    texture_share: float = tuned(
+        0.6, "SYNTIM and Middlebury: texture's share that is taken off that"
+    )
+    lowest: float = tuned(0.1, "SYNTIM and Middlebury: the quantile of either that is taken for where there is least")
+    least_noise: float = size(
+        2e-5,
+        "Less variance than this, two thirds of a level of 8 bits in each band, is left; taking it out takes time",
+    )
+    most_detail: float = size(0.2, "Differences of brightness beyond this are no detail that beta lost")
 
     def detail(self, difference: Tensor) -> Tensor:
         """What of a difference of brightness is detail that beta lost."""
@@ -228,39 +228,33 @@ def _without_noise(colour: Tensor, brightness: Tensor, noise: Tensor) -> Tensor:
 
 
 def _each_detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radii: Sequence[int]) -> Tensor:
-    """`_detailed`, each of the batch with its own radius, and colour that brightness does not explain as
-    saturated."""
+    """`_detailed`, each of the batch with its own radius."""
     radii = [radii[0]] if len(set(radii)) == 1 else radii
     parts = zip(*(x.tensor_split(len(radii)) for x in (colour, brightness, alpha)), radii)
-    return torch.cat([_detailed(c, b, a, SETTINGS.saturated, radius) for c, b, a, radius in parts])
+    return torch.cat([_detailed(c, b, a, radius) for c, b, a, radius in parts])
 
 
-def _detailed(
-    colour: Tensor, brightness: Tensor, alpha: Tensor, saturated: float = 0.0, radius: int = SETTINGS.detail_radius
-) -> Tensor:
+def _detailed(colour: Tensor, brightness: Tensor, alpha: Tensor, radius: int = SETTINGS.detail_radius) -> Tensor:
     """Colour (B, C, H, W) moved along its local regression on brightness by what alpha's brightness has
     beyond it."""
-    return colour + local_slope(colour, brightness, saturated, radius) * SETTINGS.detail(alpha - brightness)
+    return colour + local_slope(colour, brightness, radius) * SETTINGS.detail(alpha - brightness)
 
 
 def local_slope(
     colour: Float[Tensor, "b c h w"],
     brightness: Float[Tensor, "b 1 h w"],
-    saturated: float = 0.0,
     radius: int = SETTINGS.detail_radius,
 ) -> Float[Tensor, "b c h w"]:
     """The slope of the regression of colour on brightness around each pixel.
 
-    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its
-    resolution. The less of colour's variance the regression explains, the nearer is the slope to that of
-    `saturated` times the
-    saturation: few of a window's pixels are independent, so that even noise seems to be explained in part.
+    The guided filter's linear model (He et al. 2013): it gives back the detail that beta lost by its resolution.
+    The less of colour's variance the regression explains, the flatter it is: few of a window's pixels are
+    independent, so that even noise seems to be explained in part.
     """
     local = LocalMoments.within(radius, colour, brightness)
     variances = (local.variance_of_image + 1e-6) * (local.variance_of_bands + 1e-6)
     explained = (local.covariance.square() / variances).clamp(max=1) ** 3
-    otherwise = saturated * local.bands / local.image.clamp(min=0.05)
-    return torch.lerp(otherwise, local.slope(SETTINGS.floor), explained)
+    return explained * local.slope(SETTINGS.floor)
 
 
 def _diffused(

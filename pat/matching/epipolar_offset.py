@@ -23,6 +23,7 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
+from ..support.settings import size, tuned
 from .semi_global import along
 
 Image = NDArray[Any]
@@ -30,28 +31,20 @@ Image = NDArray[Any]
 
 @dataclass(frozen=True)
 class AlignmentSettings:
-    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury: its tune half."""
+    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury is its tune half."""
 
-    # tuned on Middlebury: standard deviation of the blur before gradients
-    blur: float = 1.5
-    # tuned on Middlebury: of the windows, to either side
-    radius: int = 7
-    # size: Gauss-Newton steps at most
-    steps: int = 6
-    # size: a step below this ends them
-    finest: float = 5e-3
-    # tuned on Middlebury: mean squared gradient of a window that counts half
-    contrast: float = 2e-5
-    # size: a window's displacement in one step is at most this
-    farthest: float = 2.0
-    # size: the standard deviation of windows' displacements about the plane, at least
-    deviation: float = 0.05
-    # tuned on Middlebury: largest displacement of a pixel below which the rig is taken to be right
-    least: float = 0.2
-    # tuned on Middlebury: residual with the displacement over that without, up to which it is accepted
-    better: float = 0.98
-    # size: fewest windows with texture
-    windows: int = 50
+    blur: float = tuned(1.5, "Middlebury: standard deviation of the blur before gradients")
+    radius: int = tuned(7, "Middlebury: of the windows, to either side")
+    steps: int = size(6, "Gauss-Newton steps at most")
+    finest: float = size(5e-3, "A step below this ends them")
+    contrast: float = tuned(2e-5, "Middlebury: mean squared gradient of a window that counts half")
+    farthest: float = size(2.0, "A window's displacement in one step is at most this")
+    deviation: float = size(0.05, "The standard deviation of windows' displacements about the plane, at least")
+    least: float = tuned(0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right")
+    better: float = tuned(
+        0.98, "Middlebury: residual with the displacement over that without, up to which it is accepted"
+    )
+    windows: int = size(50, "Fewest windows with texture")
 
 
 SETTINGS = AlignmentSettings()

@@ -17,21 +17,24 @@ from torch.nn.functional import avg_pool2d
 
 from arraygeom.fields.protocol import compilable
 
+from ..support.settings import size, tuned
+
 LEAST_WEIGHT = 1e-6
 """Size: added to weights, so that there are moments where all are 0."""
 
 
 @dataclass(frozen=True)
 class NormalisationSettings:
-    """How far one image is brought to another's brightness and sharpness."""
+    """How far one image is brought to another's brightness and sharpness. Middlebury is its tune half."""
 
-    # size: the largest factor of brightness; images that differ by more show different things
-    largest_gain: float = 4.0
-    # size: standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the
-    # other
-    blurs: tuple[float, ...] = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-    # tuned on Middlebury, tune half: contrast over the other's up to which an image is no sharper
-    sharper: float = 1.05
+    largest_gain: float = size(
+        4.0, "The largest factor of brightness; images that differ by more show different things"
+    )
+    blurs: tuple[float, ...] = size(
+        (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
+        "Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other",
+    )
+    sharper: float = tuned(1.05, "Middlebury: contrast over the other's up to which an image is no sharper")
 
 
 SETTINGS = NormalisationSettings()

@@ -26,83 +26,98 @@ from arraygeom import pixel_grid
 from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
 
 from ..media.colour import REC601
+from ..support.settings import physics, size, tuned
 from .normalisation import box_mean
+
+GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
 
 
 @dataclass(frozen=True)
 class ResponseSettings:
-    """Tuned: on Middlebury's Bowling1 and 2, Cloth1, 2 and 4, Flowerpots, Midd1, Plastic, Wood1 (its tune
-    half).
+    """Middlebury is the nine pairs of its tune half.
 
     A misfit is a sum of squares over independent observations, in standard deviations. In a scene of one hue
     several responses explain alpha.
     """
 
-    # physics: weights of a usual sensor that is not Rec. 601's: it sees more blue
-    usual: tuple[float, float, float] = (0.32, 0.48, 0.20)
-    # tuned on Middlebury: standard deviation of weights about these
-    prior: float = 0.2
-    # tuned on Middlebury: as how many independent observations all points count: about as many as there are
-    # materials
-    independent: float = 20.0
-    # tuned on Middlebury: standard deviation of one of those, at least: light and surfaces differ between the
-    # views
-    error: float = 0.012
-    # tuned on Middlebury: residuals of this many robust deviations count half
-    outlier: float = 2.0
-    # size: pixels used at most, and the fewest that are enough
-    points: tuple[int, int] = (6000, 300)
-    # size: gammas that are tried
-    gammas: tuple[float, ...] = (
-        *(0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6),
+    usual: tuple[float, float, float] = physics(
+        (0.32, 0.48, 0.20), "Weights of a usual sensor that is not Rec. 601's: it sees more blue"
     )
-    # tuned on Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken
-    unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
-    # tuned on Middlebury: logarithm of a gain up to which light that differs between the views may be its
-    # cause: where a sensor might, and where none would
-    light: tuple[float, float] = (0.035, 0.12)
-    # physics: share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's,
-    # and alpha is brighter than luma where an unfiltered sensor would be darker, or the other way round: that
-    # is light too
-    greenest: float = 0.62
-    # tuned on Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights,
-    # to be taken in their place: a sensor without filters
-    equal_weights: float = 8.0
-    # tuned on Middlebury: the error over the least one up to which a gamma explains alpha as well
-    equal: float = 1.1
-    # tuned on Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be
-    # taken
-    better: float = 0.8
-    # physics: logarithm of vignetting below which, at the points, there is none; above which, in a corner, no
-    # lens is
-    shading: tuple[float, float] = (0.08, 0.7)
-    # size: share of alpha's variance that must be explained
-    explained: float = 0.5
+    prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
+    independent: float = tuned(
+        20.0,
+        "Middlebury: as how many independent observations all points count: about as many as there are materials",
+    )
+    error: float = tuned(
+        0.012,
+        "Middlebury: standard deviation of one of those, at least: light and surfaces differ between the views",
+    )
+    outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
+    points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
+    gammas: tuple[float, ...] = size(GAMMAS, "Gammas that are tried")
+    unlikely: tuple[float, float, float] = tuned(
+        (22.0, 12.0, 45.0),
+        "Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken",
+    )
+    light: tuple[float, float] = tuned(
+        (0.035, 0.12),
+        "Middlebury: logarithm of a gain up to which light that differs between the views may be its cause: "
+        "where a sensor might, and where none would",
+    )
+    greenest: float = physics(
+        0.62,
+        "Share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's, and "
+        "alpha is brighter than luma where an unfiltered sensor would be darker, or the other way round: "
+        "that is light too",
+    )
+    equal_weights: float = tuned(
+        8.0,
+        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to "
+        "be taken in their place: a sensor without filters",
+    )
+    equal: float = tuned(1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well")
+    better: float = tuned(
+        0.8,
+        "Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken",
+    )
+    shading: tuple[float, float] = physics(
+        (0.08, 0.7),
+        "Logarithm of vignetting below which, at the points, there is none; above which, in a corner, no lens is",
+    )
+    explained: float = size(0.5, "Share of alpha's variance that must be explained")
 
 
 @dataclass(frozen=True)
 class MixSettings:
     """Brightness is 0 to 1."""
 
-    # tuned on Middlebury, three bands: difference from alpha at which a match counts 1 / e in the second of
-    # two fits
-    outlier: float = 0.06
-    # size: how strongly the combination is drawn to one of equal parts: share of the bands' mean variance
-    equal: float = 1e-4
-    # tuned on Middlebury, three bands: difference from alpha, averaged over `smooth` pixels to either side,
-    # at which the combination counts half
-    misfit: float = 0.016
-    # size: see `misfit`
-    smooth: int = 4
-    # tuned on Middlebury, three bands: where the combination's black and white are so near to alpha's, black
-    # is taken for black and white for white, and the difference for that of two exposures
-    alike: float = 0.08
-    # tuned on Middlebury, three bands: wrong matches make least squares' weights too small; they are enlarged
-    # until the combination varies as much as alpha, as if no less than this share of alpha's variance were
-    # explained
-    diluted: float = 0.8
-    # size: bands are compared with alpha within squares whose radius is the image's longer side over this
-    wide: int = 4
+    outlier: float = tuned(
+        0.06,
+        "Middlebury, three bands: difference from alpha at which a match counts 1 / e in the second of two fits",
+    )
+    equal: float = size(
+        1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
+    )
+    misfit: float = tuned(
+        0.016,
+        "Middlebury, three bands: difference from alpha, averaged over `smooth` pixels to either side, at "
+        "which the combination counts half",
+    )
+    smooth: int = size(4, "See `misfit`")
+    alike: float = tuned(
+        0.08,
+        "Middlebury, three bands: where the combination's black and white are so near to alpha's, black is "
+        "taken for black and white for white, and the difference for that of two exposures",
+    )
+    diluted: float = tuned(
+        0.8,
+        "Middlebury, three bands: wrong matches make least squares' weights too small; they are enlarged "
+        "until the combination varies as much as alpha, as if no less than this share of alpha's variance "
+        "were explained",
+    )
+    wide: int = size(
+        4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
+    )
 
 
 SETTINGS = ResponseSettings()
@@ -308,15 +323,6 @@ class _Points(NamedTuple):
         return float(self.counts @ (self.y - shade).square())
 
 
-class _Trial(NamedTuple):
-    """An explanation of alpha: its misfit with what it must gain to be taken, its weights of sum 1, and its
-    gain."""
-
-    misfit: float
-    weights: Float[Tensor, "3"]
-    gain: float
-
-
 def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
     """The most plausible of four explanations of alpha, and its misfit.
 
@@ -334,13 +340,13 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     both, (total, *rest) = points.explained(y, torch.stack([grey, *hues]), scaled)
     weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
     trials = [
-        _Trial(only_gain + settings.unlikely[0], rec601, float(gain)),
-        _Trial(both + settings.unlikely[2], further, float(total)),
+        (only_gain + settings.unlikely[0], rec601, float(gain)),
+        (both + settings.unlikely[2], further, float(total)),
     ]
     if gamma == 1:
-        trials.append(_Trial(only_weights + settings.unlikely[1], weights, 1.0))
-        trials.append(_Trial(points.misfit(rec601 @ x), rec601, 1.0))
-    misfit, chosen, exposure = min(trials, key=lambda trial: trial.misfit)
+        trials.append((only_weights + settings.unlikely[1], weights, 1.0))
+        trials.append((points.misfit(rec601 @ x), rec601, 1.0))
+    misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
     as_well = only_gain < only_weights
     if exposure == 1 and _is_light(points, float(gain), as_well, (weights, further), settings):
         chosen = rec601
@@ -362,8 +368,7 @@ def _is_light(
 
 
 def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseSettings) -> tuple[Tensor, float]:
-    """1/3 of each band if they explain alpha about as well as these weights, with the gain that fits best unless
-    that is 1."""
+    """1/3 of each band if they explain alpha about as well, with the gain that fits best unless that is 1."""
     equal = torch.full_like(weights, 1 / 3)
 
     def best(weights: Tensor) -> tuple[float, float]:
