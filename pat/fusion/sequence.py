@@ -24,6 +24,7 @@ from torch import Tensor
 from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields import default_field
 
+from ..matching.normalisation import mean_moments
 from ..matching.radiometry import Given, Response
 from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
@@ -264,9 +265,8 @@ class SequenceFusion:
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
         around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
-        wanted = torch.tensor([_levels(self.grey(k.alpha)) for k in around]).mean(0)
-        mean, deviation = torch.tensor([_levels(self.frames[name][k.betas[name]]) for k in around]).mean(0)
-        return (image - mean) / deviation.clamp(min=1e-6) * wanted[1] + wanted[0]
+        own = mean_moments([self.frames[name][k.betas[name]] for k in around])
+        return own.matched(image, mean_moments([self.grey(k.alpha) for k in around]))
 
 
 class KeyContribution(NamedTuple):
@@ -351,8 +351,3 @@ def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tens
         change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)
         changes.append(float(change[still(grey_a, grey_b)].mean()))
     return sum(changes) / len(changes)
-
-
-def _levels(image: Tensor) -> tuple[float, float]:
-    """Mean and standard deviation."""
-    return float(image.mean()), float(image.std())
