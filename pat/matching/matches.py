@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.fields.grid import Box
+from arraygeom.chunks import Box
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 

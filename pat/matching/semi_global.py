@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
+from arraygeom.chunks import Box
 from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
@@ -65,7 +66,7 @@ class SemiGlobalMatches(NamedTuple):
     matched: Tensor
     colour: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> SemiGlobalMatches:
+    def cut(self, box: Box) -> SemiGlobalMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
@@ -83,7 +84,7 @@ class HalfSizeMatches(NamedTuple):
     disparity: Tensor
     facts: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> HalfSizeMatches:
+    def cut(self, box: Box) -> HalfSizeMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = (n // FINE for n in box)
         return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
