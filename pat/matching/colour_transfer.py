@@ -38,7 +38,8 @@ class ColourTransferSettings:
     inconsistent: float = tuned(0.25, "Middlebury: weight of a match that is not consistent, before the likeness")
     fill: tuple[float, float] = tuned(
         (300.0, 3.0),
-        "Middlebury: strength, and 8-bit difference that counts as an edge, of the smoothing that diffuses colour",
+        "Source not recorded: strength, and 8-bit difference that counts as an edge, of the smoothing that "
+        "diffuses colour",
     )
     surroundings: int = tuned(24, "Middlebury: within how many pixels the brightness of both views is compared")
     saturation: float = tuned(0.6, "Middlebury: the power of its ratio by which colour grows")
@@ -46,7 +47,7 @@ class ColourTransferSettings:
         2.0, "Matched surroundings whose brightness differs by a larger factor are of different things"
     )
     detail_radius: int = tuned(
-        2, "Middlebury: window of the regression that gives matched colour the detail that beta lost"
+        2, "Source not recorded: window of the regression that gives matched colour the detail that beta lost"
     )
     floor: float = tuned(1e-4, "Middlebury: regulariser of colour's regressions on brightness, a variance of that")
     radius_of_blur: float = tuned(

@@ -25,7 +25,7 @@ LEAST_WEIGHT = 1e-6
 
 @dataclass(frozen=True)
 class NormalisationSettings:
-    """How far one image is brought to another's brightness and sharpness. Middlebury is its tune half."""
+    """How far one image is brought to another's brightness and sharpness."""
 
     largest_gain: float = size(
         4.0, "The largest factor of brightness; images that differ by more show different things"
@@ -34,7 +34,7 @@ class NormalisationSettings:
         (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
         "Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other",
     )
-    sharper: float = tuned(1.05, "Middlebury: contrast over the other's up to which an image is no sharper")
+    sharper: float = tuned(1.05, "Source not recorded: contrast over the other's up to which an image is no sharper")
 
 
 SETTINGS = NormalisationSettings()

@@ -26,7 +26,7 @@ from arraygeom import pixel_grid
 from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
 
 from ..media.colour import REC601
-from ..support.settings import physics, size, tuned
+from ..support.settings import size, tuned
 from .normalisation import box_mean
 
 GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
@@ -40,8 +40,8 @@ class ResponseSettings:
     several responses explain alpha.
     """
 
-    usual: tuple[float, float, float] = physics(
-        (0.32, 0.48, 0.20), "Weights of a usual sensor that is not Rec. 601's: it sees more blue"
+    usual: tuple[float, float, float] = tuned(
+        (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
     )
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
     independent: float = tuned(
@@ -64,11 +64,11 @@ class ResponseSettings:
         "Middlebury: logarithm of a gain up to which light that differs between the views may be its cause: "
         "where a sensor might, and where none would",
     )
-    greenest: float = physics(
+    greenest: float = tuned(
         0.62,
-        "Share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's, and "
-        "alpha is brighter than luma where an unfiltered sensor would be darker, or the other way round: "
-        "that is light too",
+        "Middlebury: share of green beyond which weights are of no sensor, if they have less blue than Rec. "
+        "601's, and alpha is brighter than luma where an unfiltered sensor would be darker, or the other "
+        "way round: that is light too",
     )
     equal_weights: float = tuned(
         8.0,
@@ -80,11 +80,12 @@ class ResponseSettings:
         0.8,
         "Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken",
     )
-    shading: tuple[float, float] = physics(
+    shading: tuple[float, float] = tuned(
         (0.08, 0.7),
-        "Logarithm of vignetting below which, at the points, there is none; above which, in a corner, no lens is",
+        "Middlebury: logarithm of vignetting below which, at the points, there is none; above which, in a "
+        "corner, no lens is",
     )
-    explained: float = size(0.5, "Share of alpha's variance that must be explained")
+    explained: float = tuned(0.5, "Middlebury: share of alpha's variance that must be explained")
 
 
 @dataclass(frozen=True)
@@ -93,27 +94,27 @@ class MixSettings:
 
     outlier: float = tuned(
         0.06,
-        "Middlebury, three bands: difference from alpha at which a match counts 1 / e in the second of two fits",
+        "Source not recorded: difference from alpha at which a match counts 1 / e in the second of two fits",
     )
     equal: float = size(
         1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
     )
     misfit: float = tuned(
         0.016,
-        "Middlebury, three bands: difference from alpha, averaged over `smooth` pixels to either side, at "
-        "which the combination counts half",
+        "Source not recorded: difference from alpha, averaged over `smooth` pixels to either side, at which "
+        "the combination counts half",
     )
     smooth: int = size(4, "See `misfit`")
     alike: float = tuned(
         0.08,
-        "Middlebury, three bands: where the combination's black and white are so near to alpha's, black is "
+        "Source not recorded: where the combination's black and white are so near to alpha's, black is "
         "taken for black and white for white, and the difference for that of two exposures",
     )
     diluted: float = tuned(
         0.8,
-        "Middlebury, three bands: wrong matches make least squares' weights too small; they are enlarged "
-        "until the combination varies as much as alpha, as if no less than this share of alpha's variance "
-        "were explained",
+        "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
+        "the combination varies as much as alpha, as if no less than this share of alpha's variance were "
+        "explained",
     )
     wide: int = size(
         4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
