@@ -46,7 +46,8 @@ class PrePassSettings:
     small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")
     margin: float = tuned(
         0.1,
-        "The first value tried, which held: by how much a match must be better than others to count, as of `BetaMatches.facts`",
+        "The first value tried, which held: by how much a match must be better than others to "
+        "count, as of `BetaMatches.facts`",
     )
     blur: float = tuned(
         1.0,
