@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import partial, reduce
 from typing import NamedTuple
 
 import cv2
@@ -29,23 +30,31 @@ from arraygeom.threads import in_parallel
 from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
 from . import semi_global_numba as kernels
+from .cost import planes_of
 
 FINE = 2
 """Matching is done on images this many times smaller."""
-BLOCK = 320
-"""Sides of what is processed at a time, in pixels of the reduced images."""
-LONG_BLOCK = 640
-"""The longer side of the blocks of large images, along the segments."""
-MARGIN = 64
-"""What is matched around a block."""
-PIXEL_BYTES, LABEL_BYTES = 128, 3
-"""What a block takes for each pixel, and for each label of each pixel: cost, and sum of costs."""
-MOST_COSTS = 2**25
-"""Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
-CONSISTENT = 0.2
-"""A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
-DISPARITY_FILL = (50.0, 4.0)
-"""Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
+
+
+@dataclass(frozen=True)
+class SemiGlobalSettings:
+    """The numbers of a run of semi-global matching."""
+
+    step: float = 12.0  # tuned on Middlebury (tune): the penalty of neighbours whose labels differ by one, in `cost`'s
+    jump: float = 100.0  # tuned with it: of neighbours whose labels differ by more, where alpha shows no edge
+    margin: int = 64  # size: pixels that are matched around a block
+    block: int = 320  # size: sides of what is processed at a time, pixels
+    long_block: int = 640  # size: the longer side of the blocks of large images, along the segments
+    most_costs: int = 2**25  # size: up to it a block is as high as the image, and needs no margins above and below
+    pixel_bytes: int = 128  # size: what a block takes for each pixel
+    label_bytes: int = 3  # size: and for each label of each pixel: cost, and sum of costs
+    consistent: float = 0.2  # tuned on Middlebury (tune): matching back ends less than this (times 8 pixels) away
+    fill: tuple[float, float] = (50.0, 4.0)  # tuned with it: strength, and 8-bit difference that counts as an edge, of
+    # the smoothing that fills (Min et al. 2014)
+
+
+HALF_SIZE = SemiGlobalSettings()
+CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 """Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other."""
 
@@ -133,6 +142,26 @@ class Normalisations(NamedTuple):
         return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
 
 
+class Windows(NamedTuple):
+    """The labels of each pixel: one or two runs of `count` labels, from `first` (B, h, w, runs), int32. Two runs of at
+    most 5, which do not overlap."""
+
+    first: NDArray[np.int32]
+    count: int
+
+    @classmethod
+    def all(cls, geometry: _Geometry) -> Windows:
+        """All labels of the longest segment, and one more."""
+        first = np.broadcast_to(np.int32(0), (*geometry.length.shape, 1))
+        return cls(first, int(max(geometry.length.max(), 0)) + 2)
+
+    @property
+    def lanes(self) -> tuple[int, int]:
+        """How many runs there are, and in how many lanes each is computed."""
+        runs = self.first.shape[-1]
+        return runs, kernels.NARROW if runs == 2 else -(-self.count // kernels.LANES) * kernels.LANES
+
+
 class _Geometry(NamedTuple):
     """Segments as the kernels want them, in pixels of the reduced beta: (B, h, w, ...), float32.
 
@@ -153,13 +182,9 @@ def matched_at_half_size(
     own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
     geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
     del guide, blocks
-    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry)
-    consistent = (measured[..., 0] < CONSISTENT).astype(np.float32)
-    planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
-    dense = np.stack([filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
-    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, dense)])
-    disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
-    return HalfSizeMatches(disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha))
+    guides = to_bytes(avg_pool2d(alpha, FINE)[:, 0])
+    disparity, facts = matched_by_labels(own, other, geometry, Windows.all(geometry), guides, HALF_SIZE)
+    return HalfSizeMatches(FINE * disparity[:, None].to(alpha), facts.movedim(-1, 1).to(alpha))
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
@@ -175,32 +200,61 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
     return _Geometry(*planes)
 
 
-def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
-    """Reach (B, h, w) in pixels of the reduced beta, and facts (B, h, w, 3)."""
-    labels = int(max(geometry.length.max(), 0)) + 2
-    disparity = np.zeros(own.shape, np.float32)
-    facts = np.ones((*own.shape, 3), np.float32)
-    bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
-    in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
-    tasks, nbytes = [], 1.0
-    label, place = np.empty((2, *own.shape), np.int32)
-    claims: list[list[NDArray[np.int32]]] = [[] for _ in own]
-    for i, (a, b) in enumerate(zip(own, other)):
-        views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
-        small = a.shape[0] * (BLOCK + 2 * MARGIN) * labels <= MOST_COSTS
+def matched_by_labels(
+    own: Float[Tensor, "b 1 h w"],
+    other: Float[Tensor, "b 1 hb wb"],
+    geometry: _Geometry,
+    windows: Windows,
+    guides: NDArray[np.uint8],
+    settings: SemiGlobalSettings,
+    facts: int = 3,
+) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w facts"]]:
+    """Semi-global matching of the labels in each pixel's window: disparity, and so many of the facts (`disagreement`
+    alone, or all three).
+
+    Where matching back from beta disagrees, disparity is diffused from where it does not, along `guides` (B, h, w).
+    """
+    planes = own[:, 0], other[:, 0]
+    found, measured = _matched_blocks(*(numpy_of(x) for x in planes), geometry, windows, settings, facts)
+    consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
+    dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, guides))
+    smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
+    return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
+
+
+def _matched_blocks(
+    own: NDArray, other: NDArray, geometry: _Geometry, windows: Windows, settings: SemiGlobalSettings, count: int
+) -> tuple[NDArray, NDArray]:
+    """Reach (B, h, w) in pixels of beta, and so many facts (B, h, w, count)."""
+    (batch, h, w), hw = own.shape, other.shape[1:]
+    disparity, facts, place = np.empty(own.shape, np.float32), np.empty((*own.shape, count), np.float32), None
+    place = np.empty(own.shape, np.int32)
+    planes: dict[tuple[int, int], tuple[NDArray, ...]] = {}
+    in_parallel([partial(_prepare, planes, (k, i), x[i]) for k, x in enumerate((own, other)) for i in range(batch)])
+    tasks, nbytes, size = [], 1.0, math.prod(windows.lanes)
+    claims: list[list[NDArray[np.int32]]] = [[] for _ in range(batch)]
+    small = h * (settings.block + 2 * settings.margin) * windows.first.shape[-1] * windows.count <= settings.most_costs
+    for i in range(batch):
         across = np.abs(geometry.along[i]).max((0, 1))
-        large = (BLOCK, LONG_BLOCK) if across[0] > across[1] else (LONG_BLOCK, BLOCK)
-        boxes = list(inner_and_outer(a.shape, MARGIN, *((a.shape[0], BLOCK) if small else large)))
-        found = disparity[i], facts[i], label[i], place[i]
-        tasks += [partial(_block, views, box, labels, claims[i], found) for box in boxes]
-        largest = max(_pixels_in(outer, a.shape) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (PIXEL_BYTES + LABEL_BYTES * labels))
+        sides = settings.block, settings.long_block
+        large = sides if across[0] > across[1] else sides[::-1]
+        boxes = list(inner_and_outer((h, w), settings.margin, *((h, settings.block) if small else large)))
+        views = (*planes[0, i], windows.first[i], *(g[i] for g in geometry))
+        found = disparity[i], facts[i], place[i]
+        flat = tuple(x.reshape(-1, *x.shape[2:]) for x in planes[1, i])
+        tasks += [partial(_block, views, flat, hw, box, windows, settings, claims[i], found) for box in boxes]
+        largest = max(_pixels_in(outer, (h, w)) for _, outer in boxes)
+        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * size))
     in_parallel(tasks, most=how_many_fit(nbytes))
-    for unlike, tables, own_label, its in zip(facts[..., 0], claims, label, place):
-        claimed = np.minimum.reduce(tables)[its] & 0xFFFF
-        apart = np.abs(claimed - own_label) / kernels.FARTHEST
-        np.minimum(apart, 1, out=unlike, where=its < other[0].size)
+    for fact, tables, its in zip(facts[..., 0], claims, place):
+        claimed = reduce(np.minimum, tables)[its] & 0xFFFF
+        apart = np.minimum(np.abs(claimed - fact) / kernels.FARTHEST, 1)
+        fact[:] = np.where(its < math.prod(hw), apart, 1)
     return disparity, facts
+
+
+def _prepare(planes: dict[tuple[int, int], tuple[NDArray, ...]], key: tuple[int, int], image: NDArray) -> None:
+    planes[key] = planes_of(image)
 
 
 def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
@@ -208,7 +262,7 @@ def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
 
 
 def inner_and_outer(
-    hw: tuple[int, ...], margin: int, rows: int = BLOCK, columns: int = BLOCK
+    hw: tuple[int, ...], margin: int, rows: int, columns: int
 ) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Inner and outer blocks of so many rows and columns: the result, and what is computed for it."""
     for top in range(0, hw[0], rows):
@@ -217,24 +271,33 @@ def inner_and_outer(
             yield inner, tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in inner)
 
 
-def _block(views: tuple, box: tuple, labels: int, claims: list[NDArray[np.int32]], found: Sequence[NDArray]) -> None:
+def _block(
+    views: tuple,
+    other: tuple[NDArray, ...],
+    hw: tuple[int, int],
+    box: tuple,
+    windows: Windows,
+    settings: SemiGlobalSettings,
+    claims: list[NDArray[np.int32]],
+    found: Sequence[NDArray],
+) -> None:
     """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is of one
     thread at a time; what all claim is the least of them."""
-    own, own_bits, other, other_bits, end, along, length, cut = views
     inner, outer = box
-    planes = (own, own_bits, end, along, length, cut)
-    a, a_bits, e, u, n, c = (np.ascontiguousarray(x[outer]) for x in planes)
-    cost = np.empty((*a.shape, labels), np.uint8)
-    kernels.costs(a, a_bits, other, other_bits, e, u, n, c, cost)
+    *own, first, end, along, length, cut = (np.ascontiguousarray(x[outer]) for x in views)
+    guide, flat = own[0], tuple(x.reshape(-1, *x.shape[2:]) for x in own)
+    cost = np.empty((*length.shape, *windows.lanes), np.uint8)
+    kernels.costs(flat, other, first, windows.count, end, along, length, cut, *hw, cost)
     total = np.empty(cost.shape, np.int16)
-    kernels.aggregate(cost, a, total)
+    step, jump = np.float32(settings.step), np.float32(settings.jump)
+    kernels.aggregate(cost, guide, first, windows.count, step, jump, total)
     try:
         table = claims.pop()
     except IndexError:
-        table = np.full(other.size + 1, 2**31 - 1, np.int32)
+        table = np.full(math.prod(hw) + 1, 2**31 - 1, np.int32)
     parts = [np.ascontiguousarray(plane[inner]) for plane in found]
     corner = (i.start - o.start for i, o in zip(inner, outer))
-    kernels.winners(total, e, u, n, c, *other.shape, *corner, table, *parts)
+    kernels.winners(total, first, windows.count, end, along, length, cut, *hw, *corner, jump, table, *parts)
     claims.append(table)
     for plane, part in zip(found, parts):
         plane[inner] = part
