@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import warnings
+from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -100,6 +102,13 @@ def cache_folder(entry: Any) -> str | None:
 def is_kept(entry: Any, signature: Any) -> bool:
     """Whether an entry point's code for such arguments is in the cache."""
     return entry._cache._index_key(signature, entry.targetctx.codegen()) in cache_file(entry)._load_index()
+
+
+def renew_with(entry: Any, sources: Iterable[Path]) -> None:
+    """Let numba's cache of an entry point be renewed when any of these files changes, not when its own does alone."""
+    if (file := cache_file(entry)) is not None:
+        text = b"".join(path.read_bytes() for path in sorted(sources))
+        file._source_stamp = hashlib.sha256(text).hexdigest()
 
 
 def separate_cache(entry: Any) -> None:

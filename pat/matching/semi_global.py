@@ -209,52 +209,75 @@ def matched_by_labels(
     settings: SemiGlobalSettings,
     facts: int = 3,
 ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w facts"]]:
-    """Semi-global matching of the labels in each pixel's window: disparity, and so many of the facts (`disagreement`
-    alone, or all three).
+    """Semi-global matching of the labels in each pixel's window: disparity, and the first so many of the facts
+    of `SemiGlobalMatches` (1 or 3).
 
     Where matching back from beta disagrees, disparity is diffused from where it does not, along `guides` (B, h, w).
     """
-    planes = own[:, 0], other[:, 0]
-    found, measured = _matched_blocks(*(numpy_of(x) for x in planes), geometry, windows, settings, facts)
+    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
     dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, guides))
     smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
     return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
 
 
+class _Image(NamedTuple):
+    """What the blocks of one image are matched by, and where what they find goes.
+
+    `views` are planes of alpha's size: brightness, first labels, geometry, and what `cost` compares; `other` are the
+    flat planes that it compares them with, of a beta of `hw`. `found`: disparity, facts, and pixels of beta. `claims`
+    are tables of `winners`.
+    """
+
+    views: tuple[NDArray, ...]
+    other: tuple[NDArray, ...]
+    hw: tuple[int, int]
+    found: tuple[NDArray, ...]
+    claims: list[NDArray[np.int32]]
+
+
 def _matched_blocks(
-    own: NDArray, other: NDArray, geometry: _Geometry, windows: Windows, settings: SemiGlobalSettings, count: int
+    own: NDArray, other: NDArray, geometry: _Geometry, windows: Windows, settings: SemiGlobalSettings, facts: int
 ) -> tuple[NDArray, NDArray]:
-    """Reach (B, h, w) in pixels of beta, and so many facts (B, h, w, count)."""
-    (batch, h, w), hw = own.shape, other.shape[1:]
-    disparity, facts, place = np.empty(own.shape, np.float32), np.empty((*own.shape, count), np.float32), None
-    place = np.empty(own.shape, np.int32)
-    planes: dict[tuple[int, int], tuple[NDArray, ...]] = {}
-    in_parallel([partial(_prepare, planes, (k, i), x[i]) for k, x in enumerate((own, other)) for i in range(batch)])
-    tasks, nbytes, size = [], 1.0, math.prod(windows.lanes)
-    claims: list[list[NDArray[np.int32]]] = [[] for _ in range(batch)]
-    small = h * (settings.block + 2 * settings.margin) * windows.first.shape[-1] * windows.count <= settings.most_costs
-    for i in range(batch):
-        across = np.abs(geometry.along[i]).max((0, 1))
-        sides = settings.block, settings.long_block
-        large = sides if across[0] > across[1] else sides[::-1]
-        boxes = list(inner_and_outer((h, w), settings.margin, *((h, settings.block) if small else large)))
-        views = (*planes[0, i], windows.first[i], *(g[i] for g in geometry))
-        found = disparity[i], facts[i], place[i]
-        flat = tuple(x.reshape(-1, *x.shape[2:]) for x in planes[1, i])
-        tasks += [partial(_block, views, flat, hw, box, windows, settings, claims[i], found) for box in boxes]
-        largest = max(_pixels_in(outer, (h, w)) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * size))
+    """Disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
+    hw, beta_hw = own.shape[1:], other.shape[1:]
+    disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
+    measured = np.empty((*own.shape, facts), np.float32)
+    planes: list[tuple[NDArray, ...]] = [()] * (2 * len(own))
+    in_parallel([partial(_prepare, planes, i, image) for i, image in enumerate((*own, *other))])
+    images, tasks, nbytes = [], [], 1.0
+    for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
+        views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
+        images.append(_Image(views, _flat(its), beta_hw, (disparity[i], measured[i], place[i]), []))
+        boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.count, settings)
+        tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
+        largest = max(_pixels_in(outer, hw) for _, outer in boxes)
+        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)))
     in_parallel(tasks, most=how_many_fit(nbytes))
-    for fact, tables, its in zip(facts[..., 0], claims, place):
-        claimed = reduce(np.minimum, tables)[its] & 0xFFFF
-        apart = np.minimum(np.abs(claimed - fact) / kernels.FARTHEST, 1)
-        fact[:] = np.where(its < math.prod(hw), apart, 1)
-    return disparity, facts
+    for image, fact, its in zip(images, measured[..., 0], place):
+        label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)
+        apart = np.minimum(np.abs(label - fact) / kernels.FARTHEST, 1)
+        fact[:] = np.where(its < math.prod(beta_hw), apart, 1)
+    return disparity, measured
 
 
-def _prepare(planes: dict[tuple[int, int], tuple[NDArray, ...]], key: tuple[int, int], image: NDArray) -> None:
-    planes[key] = planes_of(image)
+def _prepare(planes: list[tuple[NDArray, ...]], i: int, image: NDArray) -> None:
+    planes[i] = planes_of(image)
+
+
+def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+    """Planes (h, w, ...) as lists of pixels."""
+    return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
+
+
+def _boxes(hw: tuple[int, ...], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[tuple]:
+    """Blocks with their margins: as high as an image with few costs, else longer along the segments than across."""
+    side, margin = settings.block, settings.margin
+    if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
+        return list(inner_and_outer(hw, margin, hw[0], side))
+    across, down = np.abs(along).max((0, 1))
+    sides = (side, settings.long_block) if across > down else (settings.long_block, side)
+    return list(inner_and_outer(hw, margin, *sides))
 
 
 def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
@@ -271,35 +294,26 @@ def inner_and_outer(
             yield inner, tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in inner)
 
 
-def _block(
-    views: tuple,
-    other: tuple[NDArray, ...],
-    hw: tuple[int, int],
-    box: tuple,
-    windows: Windows,
-    settings: SemiGlobalSettings,
-    claims: list[NDArray[np.int32]],
-    found: Sequence[NDArray],
-) -> None:
+def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSettings) -> None:
     """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is of one
     thread at a time; what all claim is the least of them."""
     inner, outer = box
-    *own, first, end, along, length, cut = (np.ascontiguousarray(x[outer]) for x in views)
-    guide, flat = own[0], tuple(x.reshape(-1, *x.shape[2:]) for x in own)
+    guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
+    labels, segments = (first, windows.count), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)
-    kernels.costs(flat, other, first, windows.count, end, along, length, cut, *hw, cost)
+    kernels.costs(_flat(own), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
     step, jump = np.float32(settings.step), np.float32(settings.jump)
-    kernels.aggregate(cost, guide, first, windows.count, step, jump, total)
+    kernels.aggregate(cost, guide, *labels, step, jump, total)
     try:
-        table = claims.pop()
+        claims = image.claims.pop()
     except IndexError:
-        table = np.full(math.prod(hw) + 1, 2**31 - 1, np.int32)
-    parts = [np.ascontiguousarray(plane[inner]) for plane in found]
+        claims = np.full(math.prod(image.hw) + 1, 2**31 - 1, np.int32)
+    parts = [np.ascontiguousarray(plane[inner]) for plane in image.found]
     corner = (i.start - o.start for i, o in zip(inner, outer))
-    kernels.winners(total, first, windows.count, end, along, length, cut, *hw, *corner, jump, table, *parts)
-    claims.append(table)
-    for plane, part in zip(found, parts):
+    kernels.winners(total, *labels, *segments, *image.hw, *corner, jump, claims, *parts)
+    image.claims.append(claims)
+    for plane, part in zip(image.found, parts):
         plane[inner] = part
 
 
