@@ -28,7 +28,10 @@ def seems_compiled() -> bool:
     """Whether numba's cache has code of attention for this version of Python, of whatever age; numba is not imported
     for it."""
     cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folders = [ROOT / "pat" / "attention" / "kernels" / "__pycache__", *Path(cache_home, "numba").glob("kernels_*")]
+    folders = [
+        ROOT / "pat" / "attention" / "kernels" / "__pycache__",
+        *Path(cache_home, "numba").glob("kernels_*"),
+    ]
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         folders = [*Path(chosen).glob("kernels_*")]
     index = f"forward.forward-*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
@@ -43,7 +46,9 @@ def compile_beside() -> None:
         return
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet
+    )
     atexit.register(_end, process)
 
 

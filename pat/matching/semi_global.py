@@ -40,16 +40,25 @@ FINE = 2
 class SemiGlobalSettings:
     """The numbers of a run of semi-global matching."""
 
-    step: float = 12.0  # tuned on Middlebury (tune): the penalty of neighbours whose labels differ by one, in `cost`'s
+    step: float = (
+        12.0  # tuned on Middlebury (tune): the penalty of neighbours whose labels differ by one, in `cost`'s
+    )
     jump: float = 100.0  # tuned with it: of neighbours whose labels differ by more, where alpha shows no edge
     margin: int = 64  # size: pixels that are matched around a block
     block: int = 320  # size: sides of what is processed at a time, pixels
     long_block: int = 640  # size: the longer side of the blocks of large images, along the segments
-    most_costs: int = 2**25  # size: up to it a block is as high as the image, and needs no margins above and below
+    most_costs: int = (
+        2**25
+    )  # size: up to it a block is as high as the image, and needs no margins above and below
     pixel_bytes: int = 128  # size: what a block takes for each pixel
     label_bytes: int = 3  # size: and for each label of each pixel: cost, and sum of costs
-    consistent: float = 0.2  # tuned on Middlebury (tune): matching back ends less than this (times 8 pixels) away
-    fill: tuple[float, float] = (50.0, 4.0)  # tuned with it: strength, and 8-bit difference that counts as an edge, of
+    consistent: float = (
+        0.2  # tuned on Middlebury (tune): matching back ends less than this (times 8 pixels) away
+    )
+    fill: tuple[float, float] = (
+        50.0,
+        4.0,
+    )  # tuned with it: strength, and 8-bit difference that counts as an edge, of
     # the smoothing that fills (Min et al. 2014)
 
 
@@ -80,7 +89,9 @@ class SemiGlobalMatches(NamedTuple):
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
+        return SemiGlobalMatches(
+            self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole]
+        )
 
     def stored(self) -> SemiGlobalMatches:
         """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
@@ -112,7 +123,9 @@ class Normalisation(NamedTuple):
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
         """What makes the means and standard deviations the same, and then the sharpness."""
-        (deviation, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
+        (deviation, mean), (wanted, middle) = (
+            torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha)
+        )
         level = torch.stack([mean, (wanted / deviation.clamp(min=1e-3)).clamp(max=4), middle])
         return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
 
@@ -139,7 +152,9 @@ class Normalisations(NamedTuple):
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
         """Of alpha and beta's brightness; all sides are even."""
-        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
+        return cls(
+            Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE))
+        )
 
 
 class Windows(NamedTuple):
@@ -175,7 +190,10 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(
-    alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, normalisation: Normalisation
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    blocks: Segments,
+    normalisation: Normalisation,
 ) -> HalfSizeMatches:
     """Matches of images at half the size; `normalisation` is that of half the size."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
@@ -214,7 +232,9 @@ def matched_by_labels(
 
     Where matching back from beta disagrees, disparity is diffused from where it does not, along `guides` (B, h, w).
     """
-    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry, windows, settings, facts)
+    found, measured = _matched_blocks(
+        numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry, windows, settings, facts
+    )
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
     dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, guides))
     smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
@@ -237,7 +257,12 @@ class _Image(NamedTuple):
 
 
 def _matched_blocks(
-    own: NDArray, other: NDArray, geometry: _Geometry, windows: Windows, settings: SemiGlobalSettings, facts: int
+    own: NDArray,
+    other: NDArray,
+    geometry: _Geometry,
+    windows: Windows,
+    settings: SemiGlobalSettings,
+    facts: int,
 ) -> tuple[NDArray, NDArray]:
     """Disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
     hw, beta_hw = own.shape[1:], other.shape[1:]
@@ -252,7 +277,9 @@ def _matched_blocks(
         boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.count, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
         largest = max(_pixels_in(outer, hw) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)))
+        nbytes = max(
+            nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes))
+        )
     in_parallel(tasks, most=how_many_fit(nbytes))
     for image, fact, its in zip(images, measured[..., 0], place):
         label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)

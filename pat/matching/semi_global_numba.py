@@ -220,7 +220,9 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
     """
     height, width, runs, lanes = shape
     cost, first, total = pointers(planes)
-    paths, fewest, ahead, above, behind, beside = pointers((paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3]))
+    paths, fewest, ahead, above, behind, beside = pointers(
+        (paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3])
+    )
     known = cost, first, total, paths, fewest, runs, lanes, pad, reach, _repeat(np.int16(small * PARTS))
     side, none = 3 * width + 4 * height + 4, 3 * width + 4 * height + 6
     step = 1 - 2 * way
@@ -230,7 +232,13 @@ def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, j
             dx, dy = ((1 - k) * step, -step) if k < 3 else (-step, 0)
             if row > 0 or k == 3:
                 left, right = max(-dx, 0), width - max(dx, 0)
-                _jumps(guide[y, left:right], guide[y + dy, left + dx : right + dx], small, large, jumps[k, left:right])
+                _jumps(
+                    guide[y, left:right],
+                    guide[y + dy, left + dx : right + dx],
+                    small,
+                    large,
+                    jumps[k, left:right],
+                )
         from_above, from_behind = width + 2 * height + 1 - row, 2 * (width + 2 * height + 1 - row)
         for i in range(width):
             x = i if way == 0 else width - 1 - i
@@ -257,7 +265,14 @@ def _advance(known, p, q, before, now, jump, is_first):
     for lane in range(0, runs * lanes, LANES):
         at = p * runs * lanes + lane
         stay = _reached(
-            paths, start + lane, from_index(first, runs * p), from_index(first, runs * q), reach, stride, runs, penalty
+            paths,
+            start + lane,
+            from_index(first, runs * p),
+            from_index(first, runs * q),
+            reach,
+            stride,
+            runs,
+            penalty,
         )
         path = _add(_costs_at(cost, at), _subtract(_less(stay, leap), base))
         _keep(paths, end + lane, stride, runs, penalty, path)
@@ -295,7 +310,22 @@ def _keep(paths, start, stride, runs, penalty, path):
 
 @compiled(nogil=True, cache=True)
 def winners(
-    total, first, count, end, along, length, cut, rows, columns, top, left, large, claims, disparity, facts, positions
+    total,
+    first,
+    count,
+    end,
+    along,
+    length,
+    cut,
+    rows,
+    columns,
+    top,
+    left,
+    large,
+    claims,
+    disparity,
+    facts,
+    positions,
 ):
     """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity); facts (h, w,
     1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels counted row by row
@@ -320,7 +350,10 @@ def winners(
                 sums, start, at = total[here][run], starts[run], places[run * lanes :]
                 within = _count_within(far, start, count)
                 for k in range(within):
-                    claim, place = np.int32(sums[k]) << 16 | np.int32(start + k), at[k] if at[k] >= 0 else nowhere
+                    claim, place = (
+                        np.int32(sums[k]) << 16 | np.int32(start + k),
+                        at[k] if at[k] >= 0 else nowhere,
+                    )
                     claims[place] = min(claims[place], claim)
                     best = min(best, claim)
                 # The very first label is taken if there is no other.

@@ -50,18 +50,17 @@ class SubpixelSettings:
 
     run: int = 5  # size: labels in a run, of which each pixel has two
     neighbourhood: int = 5  # size: side of the neighbourhood at half the size, pixels
-    same: float = (
-        0.7  # tuned on Middlebury (tune): matches at both sizes that are nearer are of the same surface, pixels
-    )
+    same: float = 0.7  # tuned on Middlebury (tune): matches at both sizes that are nearer are of the same surface, pixels
     step_radius: int = 3  # size: window of the step to a fraction of a pixel
     step_floor: float = 2e-5  # tuned with `flat`: its regulariser, a variance of brightness
     most_step: float = 0.25  # physics: a step is from the nearest half of a pixel; the most pixels of it
-    flat: float = (
-        3e-6  # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match
-    )
+    flat: float = 3e-6  # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match
     # weighs half in the smoothing of surfaces
     least_weight: float = 0.01  # tuned with it: what any consistent match weighs
-    surface: tuple[float, float] = (30.0, 4.0)  # tuned on Middlebury (tune): strength of that smoothing, and the 8-bit
+    surface: tuple[float, float] = (
+        30.0,
+        4.0,
+    )  # tuned on Middlebury (tune): strength of that smoothing, and the 8-bit
     # difference that counts as an edge
     pixel: float = 8.0  # tuned with it: how many such levels a pixel of disparity counts
 
@@ -133,7 +132,9 @@ def precise(
     start = torch.where(near, (disparity + rough) / 2, disparity)
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
     extent = Extent.of(segments)
-    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start, extent)[0].split(1, 1)
+    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start, extent)[0].split(
+        1, 1
+    )
     towards = extent.towards.movedim(-1, 1).to(other)
     mean = partial(box_mean, radius=2 * SETTINGS.step_radius)
     rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
@@ -141,8 +142,12 @@ def precise(
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.step_radius).split(1, 1)
     step = (common / (slope + SETTINGS.step_floor)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
     weight = torch.where(consistent, slope / (slope + SETTINGS.flat) + SETTINGS.least_weight, 0.0) + 1e-5
-    planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
-    smooth = np.stack([filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes])
+    planes = zip(
+        numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0])
+    )
+    smooth = np.stack(
+        [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
+    )
     return torch.from_numpy(smooth).to(disparity)
 
 
@@ -158,7 +163,9 @@ def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:
     """First labels (h, w, 2) of both runs at full size, from disparity at half the size: around the least of its
     neighbourhood and around the greatest, or, where these are near each other, one beside the other."""
     window, run = np.ones((SETTINGS.neighbourhood,) * 2, np.uint8), SETTINGS.run
-    low, high = (np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate))
+    low, high = (
+        np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate)
+    )
     low = np.maximum(np.where(high < low + run, (low + high) // 2 - run // 2, low), 0)
     return np.stack([low, np.maximum(high, low + run)], -1)
 
