@@ -6,11 +6,14 @@ it, and then what betas recorded there.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom.chunks import spans
 from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
@@ -63,10 +66,10 @@ def sums_of_alike(
     out = np.zeros((len(values) + 1, h, w), np.float32)
     sharpness = np.float32(1 / (8 * 9 * len(guide) * scale**2))
 
-    def rows(top: int) -> None:
-        add_alike(*planes, around, radius, step, sharpness, top, out[:, top : top + ROWS])
+    def rows(top: int, bottom: int) -> None:
+        add_alike(*planes, around, radius, step, sharpness, top, out[:, top:bottom])
 
-    in_parallel([lambda top=top: rows(top) for top in range(0, h, ROWS)])
+    in_parallel([partial(rows, *span) for span in spans(h, ROWS)])
     sums = torch.from_numpy(out).to(values)
     return sums[:-1], sums[-1:]
 

@@ -46,9 +46,7 @@ def compile_beside() -> None:
         return
     code = f"import sys; sys.path[:] = {sys.path!r}; from {__name__} import main; main()"
     quiet = subprocess.DEVNULL
-    process = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet
-    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
     atexit.register(_end, process)
 
 
@@ -90,8 +88,9 @@ def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     given."""
     from numba import float32, float64, int16, int32, int64, types, uint8, uint64
 
+    from ..attention.kernels import attend_rows
     from ..matching import cost, semi_global_numba
-    from ..networks import kernels
+    from ..networks.unshuffle_numba import unshuffle
 
     plane, bits, labels = float32[:, ::1], uint64[:, ::1], int32[:, :, ::1]
     planes, costs, sums = float32[:, :, ::1], uint8[:, :, :, ::1], int16[:, :, :, ::1]
@@ -104,8 +103,8 @@ def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     yield semi_global_numba.winners, (sums, *windows, *segments, *hw, int64, int64, float32, *found)
     yield semi_global_numba.regression, (*(plane,) * 6, float64, plane, plane)
     yield _attention()
-    yield kernels.unshuffle, (strided, strided, strided)
-    yield kernels.attend_rows, (planes, planes, planes, planes, int64, int64, int64)
+    yield unshuffle, (strided, strided, strided)
+    yield attend_rows, (planes, planes, planes, planes, int64, int64, int64)
 
 
 def _attention() -> tuple[Any, tuple[Any, ...]]:

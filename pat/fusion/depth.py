@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Segments, depth_from_track, pixel_grid
+from arraygeom.chunks import chunked
 from arraygeom.epipolar import Depth, Track
 from arraygeom.pixels import HW
 
@@ -67,8 +68,6 @@ def depth_and_confidence(
     return depth.to(output.image), overall[0, :h, :w]
 
 
-ROWS = 512
-"""Rows whose depth is filled at a time."""
 LOST = 0.3
 """Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
 
@@ -94,16 +93,12 @@ def background_filled(
         return depth
     across, down = apart.sum(0).abs().tolist()
     if across < down:
-        return _filled_along_rows(depth.mT, confidence.mT).mT
-    return _filled_along_rows(depth, confidence)
-
-
-def _filled_along_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Some rows at a time: what is computed on the way is seven times as large."""
-    return torch.cat([_filled_rows(*part) for part in zip(depth.split(ROWS), confidence.split(ROWS))])
+        return chunked(_filled_rows, depth.mT, confidence.mT).mT
+    return chunked(_filled_rows, depth, confidence)
 
 
 def _filled_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """What is computed on the way is seven times as large."""
     inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
     known = (confidence >= LOST) & depth.isfinite()
     before = _nearest_known(inverse, known)

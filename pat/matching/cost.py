@@ -1,8 +1,8 @@
 """What two pixels cost: how unlike they are by the order of brightness around them, and by brightness itself.
 
-Another cost is another file with these names: `planes_of` prepares an image (numbers, 64-bit words, a few channels a
-pixel), `pixel_of` takes a pixel of that, `dissimilarity` compares two, and `UNSEEN` and `NOWHERE` are on its scale. One
-image, one thread, without Python's lock, without torch.
+Another cost is another file with these names: `planes_of` prepares an image (numbers, 64-bit words, a few
+channels a pixel), `pixel_of` takes a pixel of that, `dissimilarity` compares two, and `UNSEEN` and `NOWHERE`
+are on its scale. One image, one thread, without Python's lock, without torch.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from arraygeom.compiled import compiled, separate_cache
 class CensusSettings:
     """The numbers of this cost, whose unit is a bit of the census."""
 
-    brightness: float = (
-        30.0  # tuned on synthetic scenes and Middlebury: a difference of 1 in (normalised) brightness
-    )
+    brightness: float = 30.0  # tuned on synthetic scenes and Middlebury: a difference of 1 in (normalised) brightness
     truncated: float = 20.0  # tuned with it: brightness counts up to this
-    unseen: int = 24  # physics: about a mismatch, half of the bits; of a label beyond beta's edge, where the point may be
+    unseen: int = (
+        24  # physics: about a mismatch, half of the bits; of a label beyond beta's edge, where the point may be
+    )
     nowhere: int = 80  # physics: more than any other cost, 48 + `truncated`; of a label that is not on beta
 
 

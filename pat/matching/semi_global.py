@@ -1,9 +1,10 @@
 """Semi-global matching along the search segments, before attention samples around the matches.
 
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
-semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
-are positions along each pixel's own segment, so it works for any rig with straight fields, rectified or not. Here it
-is computed on images of half the size; `matching` goes on from there to the full size. Without gradients.
+semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its
+labels are positions along each pixel's own segment, so it works for any rig with straight fields, rectified
+or not. Here it is computed on images of half the size; `matching` goes on from there to the full size.
+Without gradients.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
+from arraygeom.chunks import Box
 from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
@@ -40,21 +42,15 @@ FINE = 2
 class SemiGlobalSettings:
     """The numbers of a run of semi-global matching."""
 
-    step: float = (
-        12.0  # tuned on Middlebury (tune): the penalty of neighbours whose labels differ by one, in `cost`'s
-    )
+    step: float = 12.0  # tuned on Middlebury (tune): the penalty of neighbours whose labels differ by one, in `cost`'s
     jump: float = 100.0  # tuned with it: of neighbours whose labels differ by more, where alpha shows no edge
     margin: int = 64  # size: pixels that are matched around a block
     block: int = 320  # size: sides of what is processed at a time, pixels
     long_block: int = 640  # size: the longer side of the blocks of large images, along the segments
-    most_costs: int = (
-        2**25
-    )  # size: up to it a block is as high as the image, and needs no margins above and below
+    most_costs: int = 2**25  # size: up to it a block is as high as the image, and needs no margins above and below
     pixel_bytes: int = 128  # size: what a block takes for each pixel
     label_bytes: int = 3  # size: and for each label of each pixel: cost, and sum of costs
-    consistent: float = (
-        0.2  # tuned on Middlebury (tune): matching back ends less than this (times 8 pixels) away
-    )
+    consistent: float = 0.2  # tuned on Middlebury (tune): matching back ends less than this (times 8 pixels) away
     fill: tuple[float, float] = (
         50.0,
         4.0,
@@ -71,11 +67,12 @@ BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
 class SemiGlobalMatches(NamedTuple):
     """The matches of images of H x W.
 
-    disparity: (B, 1, H, W), how far from its segment's end the match is, pixels of beta; where the match is not
-        consistent, diffused from where it is.
-    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
-        others, and its cost; each 0 to 1.
-    matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
+    disparity: (B, 1, H, W), how far from its segment's end the match is, pixels of beta; where the match is
+        not consistent, diffused from where it is.
+    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better
+        than others, and its cost; each 0 to 1.
+    matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has
+    not.
     colour: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
     """
 
@@ -84,14 +81,12 @@ class SemiGlobalMatches(NamedTuple):
     matched: Tensor
     colour: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> SemiGlobalMatches:
+    def cut(self, box: Box) -> SemiGlobalMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
         whole = (..., slice(top, bottom), slice(left, right))
-        return SemiGlobalMatches(
-            self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole]
-        )
+        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
 
     def stored(self) -> SemiGlobalMatches:
         """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
@@ -99,12 +94,13 @@ class SemiGlobalMatches(NamedTuple):
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `SemiGlobalMatches`."""
+    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of
+    `SemiGlobalMatches`."""
 
     disparity: Tensor
     facts: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> HalfSizeMatches:
+    def cut(self, box: Box) -> HalfSizeMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = (n // FINE for n in box)
         return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
@@ -123,9 +119,7 @@ class Normalisation(NamedTuple):
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
         """What makes the means and standard deviations the same, and then the sharpness."""
-        (deviation, mean), (wanted, middle) = (
-            torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha)
-        )
+        (deviation, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
         level = torch.stack([mean, (wanted / deviation.clamp(min=1e-3)).clamp(max=4), middle])
         return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
 
@@ -152,17 +146,15 @@ class Normalisations(NamedTuple):
     @classmethod
     def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
         """Of alpha and beta's brightness; all sides are even."""
-        return cls(
-            Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE))
-        )
+        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
 
 
 class Windows(NamedTuple):
-    """The labels of each pixel: one or two runs of `count` labels, from `first` (B, h, w, runs), int32. Two runs of at
-    most 5, which do not overlap."""
+    """The labels of each pixel: one or two runs of `labels` labels, from `first` (B, h, w, runs), int32. Two
+    runs of at most 5, which do not overlap."""
 
     first: NDArray[np.int32]
-    count: int
+    labels: int
 
     @classmethod
     def all(cls, geometry: _Geometry) -> Windows:
@@ -174,7 +166,7 @@ class Windows(NamedTuple):
     def lanes(self) -> tuple[int, int]:
         """How many runs there are, and in how many lanes each is computed."""
         runs = self.first.shape[-1]
-        return runs, kernels.NARROW if runs == 2 else -(-self.count // kernels.LANES) * kernels.LANES
+        return runs, kernels.NARROW if runs == 2 else -(-self.labels // kernels.LANES) * kernels.LANES
 
 
 class _Geometry(NamedTuple):
@@ -206,7 +198,8 @@ def matched_at_half_size(
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
-    """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no pixel.
+    """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no
+    pixel.
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
@@ -227,14 +220,13 @@ def matched_by_labels(
     settings: SemiGlobalSettings,
     facts: int = 3,
 ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w facts"]]:
-    """Semi-global matching of the labels in each pixel's window: disparity, and the first so many of the facts
-    of `SemiGlobalMatches` (1 or 3).
+    """Semi-global matching of the labels in each pixel's window: disparity, and the first so many of the
+    facts of `SemiGlobalMatches` (1 or 3).
 
-    Where matching back from beta disagrees, disparity is diffused from where it does not, along `guides` (B, h, w).
+    Where matching back from beta disagrees, disparity is diffused from where it does not, along `guides` (B,
+    h, w).
     """
-    found, measured = _matched_blocks(
-        numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry, windows, settings, facts
-    )
+    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
     dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, guides))
     smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
@@ -244,9 +236,9 @@ def matched_by_labels(
 class _Image(NamedTuple):
     """What the blocks of one image are matched by, and where what they find goes.
 
-    `views` are planes of alpha's size: brightness, first labels, geometry, and what `cost` compares; `other` are the
-    flat planes that it compares them with, of a beta of `hw`. `found`: disparity, facts, and pixels of beta. `claims`
-    are tables of `winners`.
+    `views` are planes of alpha's size: brightness, first labels, geometry, and what `cost` compares; `other`
+    are the flat planes that it compares them with, of a beta of `hw`. `found`: disparity, facts, and pixels
+    of beta. `claims` are tables of `winners`.
     """
 
     views: tuple[NDArray, ...]
@@ -265,7 +257,7 @@ def _matched_blocks(
     facts: int,
 ) -> tuple[NDArray, NDArray]:
     """Disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
-    hw, beta_hw = own.shape[1:], other.shape[1:]
+    (_, *hw), (_, rows, columns) = own.shape, other.shape
     disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
     measured = np.empty((*own.shape, facts), np.float32)
     planes: list[tuple[NDArray, ...]] = [()] * (2 * len(own))
@@ -273,18 +265,16 @@ def _matched_blocks(
     images, tasks, nbytes = [], [], 1.0
     for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
         views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
-        images.append(_Image(views, _flat(its), beta_hw, (disparity[i], measured[i], place[i]), []))
-        boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.count, settings)
+        images.append(_Image(views, _flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
+        boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
         tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
         largest = max(_pixels_in(outer, hw) for _, outer in boxes)
-        nbytes = max(
-            nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes))
-        )
+        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)))
     in_parallel(tasks, most=how_many_fit(nbytes))
     for image, fact, its in zip(images, measured[..., 0], place):
         label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)
         apart = np.minimum(np.abs(label - fact) / kernels.FARTHEST, 1)
-        fact[:] = np.where(its < math.prod(beta_hw), apart, 1)
+        fact[:] = np.where(its < rows * columns, apart, 1)
     return disparity, measured
 
 
@@ -297,8 +287,9 @@ def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
     return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
 
 
-def _boxes(hw: tuple[int, ...], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[tuple]:
-    """Blocks with their margins: as high as an image with few costs, else longer along the segments than across."""
+def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[tuple]:
+    """Blocks with their margins: as high as an image with few costs, else longer along the segments than
+    across."""
     side, margin = settings.block, settings.margin
     if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
         return list(inner_and_outer(hw, margin, hw[0], side))
@@ -307,12 +298,12 @@ def _boxes(hw: tuple[int, ...], along: NDArray, labels: int, settings: SemiGloba
     return list(inner_and_outer(hw, margin, *sides))
 
 
-def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
+def _pixels_in(box: tuple[slice, slice], hw: Sequence[int]) -> int:
     return math.prod(min(s.stop, n) - s.start for s, n in zip(box, hw))
 
 
 def inner_and_outer(
-    hw: tuple[int, ...], margin: int, rows: int, columns: int
+    hw: Sequence[int], margin: int, rows: int, columns: int
 ) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Inner and outer blocks of so many rows and columns: the result, and what is computed for it."""
     for top in range(0, hw[0], rows):
@@ -322,11 +313,11 @@ def inner_and_outer(
 
 
 def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSettings) -> None:
-    """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is of one
-    thread at a time; what all claim is the least of them."""
+    """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is
+    of one thread at a time; what all claim is the least of them."""
     inner, outer = box
     guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
-    labels, segments = (first, windows.count), (end, along, length, cut)
+    labels, segments = (first, windows.labels), (end, along, length, cut)
     cost = np.empty((*length.shape, *windows.lanes), np.uint8)
     kernels.costs(_flat(own), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
@@ -352,9 +343,11 @@ def _normalised(image: Tensor, level: Tensor) -> Tensor:
 def equalising_blurs(
     image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
 ) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
+    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be
+    matched.
 
-    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the other.
+    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the
+    other.
     """
     own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
     return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
@@ -386,10 +379,11 @@ def matches(
     beyond_edge: bool = False,
     extent: Extent | None = None,
 ) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels.
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's
+    pixels.
 
-    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is the
-    segments', if it is known.
+    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is
+    the segments', if it is known.
     """
     length, towards = extent or Extent.of(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
@@ -412,7 +406,8 @@ class Extent(NamedTuple):
 
 
 def length_of(segments: Segments) -> Float[Tensor, "*n"]:
-    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the same."""
+    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the
+    same."""
     step = segments.end - segments.start
     if step.requires_grad or not compilable(step):
         return segments.length
@@ -421,7 +416,8 @@ def length_of(segments: Segments) -> Float[Tensor, "*n"]:
 
 
 def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
-    """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is known."""
+    """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is
+    known."""
     length = length_of(segments) if length is None else length
     step, divisor = segments.start - segments.end, torch.where(length > 0, length, 1.0)
     if step.requires_grad or not compilable(step):
@@ -450,8 +446,8 @@ def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, f
 
 
 def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[float, float]) -> list[NDArray]:
-    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several threads, but
-    has its own."""
+    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several
+    threads, but has its own."""
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
     return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
 

@@ -1,8 +1,9 @@
-"""The compiled loops of `pat.matching.semi_global`, each on one image, in one thread and without Python's lock.
+"""The compiled loops of `pat.matching.semi_global`, each on one image, in one thread and without Python's
+lock.
 
-Each pixel has one or two *runs* of `count` consecutive labels, which begin at `first` (h, w, runs) and do not overlap.
-Costs and sums of a run are in lanes, of which those after the last label mean nothing: a single run has as many as it
-needs, a multiple of 16; of two, each has 8, of which at most 5 are labels.
+Each pixel has one or two *runs* of `count` consecutive labels, which begin at `first` (h, w, runs) and do not
+overlap. Costs and sums of a run are in lanes, of which those after the last label mean nothing: a single run
+has as many as it needs, a multiple of 16; of two, each has 8, of which at most 5 are labels.
 """
 
 from __future__ import annotations
@@ -33,7 +34,8 @@ MOST_BEYOND = np.float32(0.3)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PARTS = 16
-"""Sums of costs are whole numbers of a 16th, of 16 bits: twice as many as floats go through memory in the same time."""
+"""Sums of costs are whole numbers of a 16th, of 16 bits: twice as many as floats go through memory in the
+same time."""
 WALL = np.int16(30000)
 """More than a sum of costs along a path can be, in parts."""
 
@@ -46,8 +48,8 @@ def _halves(first, runs, lane):
 
 @compiled(inline="always")
 def _places(end, along, low, high, last, rows, columns, out):
-    """Where a vector of labels, whose halves begin at `low` and `high`, is in beta, pixels counted row by row; -1 for
-    those that are not on it or beyond the last."""
+    """Where a vector of labels, whose halves begin at `low` and `high`, is in beta, pixels counted row by
+    row; -1 for those that are not on it or beyond the last."""
     for k in range(LANES):
         label = np.float32(low + k if k < NARROW else high + k - NARROW)
         column = np.int32(np.floor(end[0] + label * along[0] + HALF))
@@ -64,11 +66,11 @@ def _count_within(length, first, count):
 
 @compiled(nogil=True, cache=True)
 def costs(own, other, first, count, end, along, length, cut, rows, columns, out):
-    """Cost of alpha's pixel and beta's at each label: out (h, w, runs, lanes). `own` and `other` are flat planes of
-    `cost`.
+    """Cost of alpha's pixel and beta's at each label: out (h, w, runs, lanes). `own` and `other` are flat
+    planes of `cost`.
 
-    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere, or, where
-    it is beta's edge that cuts the segment, not seen.
+    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere,
+    or, where it is beta's edge that cuts the segment, not seen.
     """
     height, width, runs, lanes = out.shape
     size, places, found = runs * lanes, np.empty(runs * lanes, np.int32), np.empty(lanes, np.uint8)
@@ -154,8 +156,8 @@ def _subtract(code, a, b):
 
 @instruction(lambda path, small: path)
 def _spread(code, path, small):
-    """Of two runs, each in half a vector: what their labels, and those beside them, cost a neighbour that has not a
-    penalty for a jump. One lane farther on, so that lane 0 is of the label before the run."""
+    """Of two runs, each in half a vector: what their labels, and those beside them, cost a neighbour that has
+    not a penalty for a jump. One lane farther on, so that lane 0 is of the label before the run."""
     back = [[half + (k - n) % NARROW for half in (0, NARROW) for k in range(NARROW)] for n in (1, 2)]
     own, before = (code.shuffle(path, None, lanes) for lanes in back)
     return _lesser(code, own, code.add(_lesser(code, before, path), small))
@@ -163,8 +165,8 @@ def _spread(code, path, small):
 
 @instruction(lambda *_: types.UniTuple(types.int64, 4))
 def _shifts(code, here, there, reach: index):
-    """From the neighbour's first labels to a pixel's, or so far that they have no labels in common, not even beside
-    them: to the first and second from the first and second, and from the second and first."""
+    """From the neighbour's first labels to a pixel's, or so far that they have no labels in common, not even
+    beside them: to the first and second from the first and second, and from the second and first."""
     a, b = (code.get(kind, at, ir.IntType(64)(0), 2) for kind, at in zip(code.kinds, (here, there)))
     a, b = code.shuffle(a, None, [0, 1, 0, 1]), code.shuffle(b, None, [0, 1, 1, 0])
     most = code.repeat(code.trunc(reach, ir.IntType(32)), 4)
@@ -185,16 +187,19 @@ def _least(code, path):
 
 @compiled(inline="always")
 def _jumps(own, other, small, large, out):
-    """The penalties of labels that differ by more than one, between pixels of alpha's brightness; in parts."""
+    """The penalties of labels that differ by more than one, between pixels of alpha's brightness; in
+    parts."""
     for i in range(len(own)):
         out[i] = np.int16(max(small + ONE, large / (ONE + abs(own[i] - other[i]) / EDGE)) * PARTS + HALF)
 
 
 @compiled(nogil=True, cache=True)
 def aggregate(cost, guide, first, count, small, large, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008), in parts: total (h, w, runs, lanes), int16.
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008), in parts: total (h, w, runs,
+    lanes), int16.
 
-    Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no edge).
+    Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no
+    edge).
     """
     height, width, runs, lanes = cost.shape
     reach = count + 1
@@ -212,17 +217,15 @@ def aggregate(cost, guide, first, count, small, large, total):
 
 @compiled(error_model="numpy")
 def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, jumps):
-    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the row, and
-    from three of the row before. With `way` 1 rows and columns are taken from the last.
+    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the
+    row, and from three of the row before. With `way` 1 rows and columns are taken from the last.
 
-    Paths lie where those of pixels were that are no longer needed: in each row 0, 1, or 2 slots before where they lay
-    in the one before, so that what a pixel reads is one slot from what it writes.
+    Paths lie where those of pixels were that are no longer needed: in each row 0, 1, or 2 slots before where
+    they lay in the one before, so that what a pixel reads is one slot from what it writes.
     """
     height, width, runs, lanes = shape
     cost, first, total = pointers(planes)
-    paths, fewest, ahead, above, behind, beside = pointers(
-        (paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3])
-    )
+    paths, fewest, ahead, above, behind, beside = pointers((paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3]))
     known = cost, first, total, paths, fewest, runs, lanes, pad, reach, _repeat(np.int16(small * PARTS))
     side, none = 3 * width + 4 * height + 4, 3 * width + 4 * height + 6
     step = 1 - 2 * way
@@ -283,8 +286,8 @@ def _advance(known, p, q, before, now, jump, is_first):
 
 @compiled(inline="always")
 def _reached(paths, start, ours, theirs, reach, stride, runs, penalty):
-    """What a vector of a pixel's labels cost if they come from a neighbour's without a jump; the path of the neighbour
-    begins at `start`, its runs `stride` apart. `ours` and `theirs` are the first labels of both.
+    """What a vector of a pixel's labels cost if they come from a neighbour's without a jump; the path of the
+    neighbour begins at `start`, its runs `stride` apart. `ours` and `theirs` are the first labels of both.
 
     Around a path are walls, so that what is read for labels that the neighbour has not is more than any jump.
     """
@@ -300,8 +303,8 @@ def _reached(paths, start, ours, theirs, reach, stride, runs, penalty):
 
 @compiled(inline="always")
 def _keep(paths, start, stride, runs, penalty, path):
-    """Keep a vector of a path for `_reached`. Of two runs, what labels beside cost is known here already: then a pixel
-    after it reads 4 half vectors instead of 12, which takes half the time."""
+    """Keep a vector of a path for `_reached`. Of two runs, what labels beside cost is known here already:
+    then a pixel after it reads 4 half vectors instead of 12, which takes half the time."""
     if runs == 1:
         _store(paths, start, path)
     else:
@@ -327,12 +330,13 @@ def winners(
     facts,
     positions,
 ):
-    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity); facts (h, w,
-    1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels counted row by row
-    (positions; rows * columns: not on it). `total` is in parts, the larger penalty `large` the unit of the facts.
+    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity); facts
+    (h, w, 1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels
+    counted row by row (positions; rows * columns: not on it). `total` is in parts, the larger penalty `large`
+    the unit of the facts.
 
-    `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it, and that
-    pixel's label: 16 bits of either.
+    `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
+    and that pixel's label: 16 bits of either.
     """
     height, width, measured = facts.shape[0], facts.shape[1], facts.shape[2] > 1
     _, _, runs, lanes = total.shape

@@ -1,7 +1,9 @@
-"""Where alpha's pixels are in beta: semi-global matching at half the size, then at full size over few labels around it.
+"""Where alpha's pixels are in beta: semi-global matching at half the size, then at full size over few labels
+around it.
 
-At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at full
-size, between labels around the least and around the greatest disparity of its neighbourhood at half the size.
+At half the size an object's edge is some two pixels off and a slope is in steps. Here each pixel chooses, at
+full size, between labels around the least and around the greatest disparity of its neighbourhood at half the
+size.
 """
 
 from __future__ import annotations
@@ -50,11 +52,13 @@ class SubpixelSettings:
 
     run: int = 5  # size: labels in a run, of which each pixel has two
     neighbourhood: int = 5  # size: side of the neighbourhood at half the size, pixels
-    same: float = 0.7  # tuned on Middlebury (tune): matches at both sizes that are nearer are of the same surface, pixels
+    same: float = 0.7  # tuned on Middlebury (tune): nearer matches at both sizes are of one surface, pixels
     step_radius: int = 3  # size: window of the step to a fraction of a pixel
     step_floor: float = 2e-5  # tuned with `flat`: its regulariser, a variance of brightness
     most_step: float = 0.25  # physics: a step is from the nearest half of a pixel; the most pixels of it
-    flat: float = 3e-6  # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match
+    flat: float = (
+        3e-6  # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match
+    )
     # weighs half in the smoothing of surfaces
     least_weight: float = 0.01  # tuned with it: what any consistent match weighs
     surface: tuple[float, float] = (
@@ -80,10 +84,10 @@ def matched(
     """Agree on where the pixels of alpha are in beta, whose brightness is `guide`: `disparity` and `facts` of
     `SemiGlobalMatches`.
 
-    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the centres
-    of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole images if these
-    are parts, and `half` what is known of these parts from the whole images. On the CPU, with as many threads as torch
-    may use; the same whatever their number.
+    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the
+    centres of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole
+    images if these are parts, and `half` what is known of these parts from the whole images. On the CPU, with
+    as many threads as torch may use; the same whatever their number.
     """
     if half is None:
         assert blocks is not None, "matching without blocks begins with matches at half the size"
@@ -123,18 +127,16 @@ def precise(
     rough: Float[Tensor, "b 1 h w"],
     normalisation: Normalisation,
 ) -> Float[Tensor, "b 1 h w"]:
-    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both; from there
-    a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the result smoothed within
-    surfaces, where brightness says little of the position more than elsewhere."""
+    """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both;
+    from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
+    result smoothed within surfaces, where brightness says little of the position more than elsewhere."""
     own, other = normalisation.equally_sharp(alpha, normalisation.normalised(guide))
     consistent = unlike < CONSISTENT
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
     across, down = (torch.gradient(other, dim=side)[0] for side in (3, 2))
     extent = Extent.of(segments)
-    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start, extent)[0].split(
-        1, 1
-    )
+    seen, across, down = at_matches(torch.cat([other, across, down], 1), segments, start, extent)[0].split(1, 1)
     towards = extent.towards.movedim(-1, 1).to(other)
     mean = partial(box_mean, radius=2 * SETTINGS.step_radius)
     rise, rest = across * towards[:, :1] + down * towards[:, 1:], own - seen
@@ -142,30 +144,24 @@ def precise(
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.step_radius).split(1, 1)
     step = (common / (slope + SETTINGS.step_floor)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
     weight = torch.where(consistent, slope / (slope + SETTINGS.flat) + SETTINGS.least_weight, 0.0) + 1e-5
-    planes = zip(
-        numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0])
-    )
-    smooth = np.stack(
-        [filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes]
-    )
+    planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
+    smooth = np.stack([filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes])
     return torch.from_numpy(smooth).to(disparity)
 
 
 def _surfaces(disparity: NDArray[np.float32], brightness: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A guide (h, w, 3) whose edges are those of disparity and of brightness. Disparity as two triangular waves, one of
-    which has a slope where the other turns: it may be larger than 8 bits hold."""
+    """A guide (h, w, 3) whose edges are those of disparity and of brightness. Disparity as two triangular
+    waves, one of which has a slope where the other turns: it may be larger than 8 bits hold."""
     levels = (disparity * SETTINGS.pixel).astype(np.int32)
     waves = ((n ^ -(n >> 8 & 1)).astype(np.uint8) for n in (levels, levels + 128))
     return np.stack([brightness, *waves], -1)
 
 
 def _runs(half: NDArray[np.float32]) -> NDArray[np.int32]:
-    """First labels (h, w, 2) of both runs at full size, from disparity at half the size: around the least of its
-    neighbourhood and around the greatest, or, where these are near each other, one beside the other."""
+    """First labels (h, w, 2) of both runs at full size, from disparity at half the size: around the least of
+    its neighbourhood and around the greatest, or, where these are near each other, one beside the other."""
     window, run = np.ones((SETTINGS.neighbourhood,) * 2, np.uint8), SETTINGS.run
-    low, high = (
-        np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate)
-    )
+    low, high = (np.rint(_doubled(f(half, window))).astype(np.int32) - run // 2 for f in (cv2.erode, cv2.dilate))
     low = np.maximum(np.where(high < low + run, (low + high) // 2 - run // 2, low), 0)
     return np.stack([low, np.maximum(high, low + run)], -1)
 

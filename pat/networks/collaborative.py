@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom.chunks import spans
 from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
@@ -121,18 +122,17 @@ def collaboratively_filtered(
     ]
     high = STEP * (ROWS - 1) + SIDE + 2 * RADIUS
 
-    def filtered(top: int) -> np.ndarray:
-        found = np.zeros((min(ROWS, down - top), across, ALIKE, 2), np.int16)
+    def filtered(top: int, bottom: int) -> np.ndarray:
+        found = np.zeros((bottom - top, across, ALIKE, 2), np.int16)
         find_alike(planes[3], top, found)
         sums = np.zeros((2, len(image), high, planes[0].shape[2]), np.float32)
         filter_groups(*planes[:3], top, found, COSINES, WINDOW, np.float32(threshold), sums)
         return sums
 
     total = np.zeros((2, *planes[0].shape), np.float32)
-    tops = range(0, down, ROWS)
     bands: dict[int, np.ndarray] = {}
-    in_parallel([lambda top=top: bands.update({top: filtered(top)}) for top in tops])
-    for top in tops:
+    in_parallel([lambda span=span: bands.update({span[0]: filtered(*span)}) for span in spans(down, ROWS)])
+    for top in sorted(bands):
         rows = total[:, :, STEP * top : STEP * top + high]
         rows += bands.pop(top)[:, :, : rows.shape[2]]
     inside = total[:, :, first : first + h, first : first + w]

@@ -17,6 +17,7 @@ from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention import Attended, attend_with_statistics
 from ..matching.inputs import Inputs
+from ..matching.matches import Matches
 from .blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
@@ -35,6 +36,8 @@ class PAT(nn.Module):
     multiple = 1
     equal_resolution = False
     joins_bands: JoinsBands = "no"
+    bands: int | None = None
+    uses_matches = keeps_luminance = False
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
@@ -44,8 +47,8 @@ class PAT(nn.Module):
         self.engine = AttentionEngine(c.betas, d, c.interpolation)
         self.post = PostFusion((c.betas + 1) * d, d, c.out_channels, c.scale)
 
-    def forward(self, inputs: Inputs, state: None = None) -> FusionOutput:
-        """Fuse alpha with the betas, in the order the network was made for.
+    def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
+        """Fuse alpha with the betas, in the order the network was made for; matches are not used.
 
         Raises ValueError for another number of betas than configured, or channels that do not fit.
         """
@@ -63,9 +66,6 @@ class PAT(nn.Module):
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""
         return 1600.0 * (alpha + sum(betas))
-
-    def prepare(self, inputs: Inputs) -> None:
-        """Nothing: each part of a frame is fused by itself."""
 
     def _channels(self, image: Tensor) -> Tensor:
         wanted = self.config.in_channels

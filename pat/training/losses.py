@@ -9,9 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
-from pat.networks.bandwise import BandwisePAT
-from pat.networks.guided import BetaEstimate, GuidedPAT
-from pat.networks.protocol import FusionOutput
+from pat.networks.guided import BetaEstimate
+from pat.networks.protocol import Explaining, FusionNetwork, FusionOutput, fused_at_once, matched_for
 from pat.networks.weights import Network
 
 from .samples import Sample
@@ -57,11 +56,11 @@ class Objective(nn.Module):
         return loss + match_loss(seen, given) if seen else loss
 
 
-def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
+def explained(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
     """The network's output, and its match in each beta if it reports it."""
-    if isinstance(network, (GuidedPAT, BandwisePAT)):
-        return network.explain(given.inputs, given.state)
-    return network(given.inputs), []
+    if not isinstance(network, Explaining):
+        return network(given.inputs), []
+    return network.explain(given.inputs, given.matches or matched_for(network, given.inputs))
 
 
 def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
@@ -76,11 +75,11 @@ def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
 
 
 @torch.no_grad()
-def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
+def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float]:
     """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth)."""
     psnr, near = [], []
     for given in samples:
-        fused = network(given.inputs)
+        fused = fused_at_once(network, given.inputs)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
         for where, visible in list(zip(given.position, given.visible))[:1]:

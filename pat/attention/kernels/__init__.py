@@ -21,9 +21,11 @@ from .channels import scatter
 from .emit import LANES, compiled, separate_cache
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
+from .local import ROWS, attend_rows
 
 __all__ = [
     "LANES",
+    "ROWS",
     "SOURCES",
     "Call",
     "Geometry",
@@ -32,6 +34,7 @@ __all__ = [
     "Saved",
     "Share",
     "TapList",
+    "attend_rows",
     "backward",
     "block_scratch",
     "compiled",
@@ -43,6 +46,6 @@ __all__ = [
 
 SOURCES = [*Path(__file__).parent.glob("*.py")]
 
-for _entry in (forward, backward, scatter):
+for _entry in (forward, backward, scatter, attend_rows):
     renew_with(_entry, SOURCES)
     separate_cache(_entry)
