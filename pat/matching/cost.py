@@ -19,12 +19,13 @@ from arraygeom.compiled import compiled, separate_cache
 class CensusSettings:
     """The numbers of this cost, whose unit is a bit of the census."""
 
-    brightness: float = 30.0  # tuned on synthetic scenes and Middlebury: a difference of 1 in (normalised) brightness
-    truncated: float = 20.0  # tuned with it: brightness counts up to this
-    unseen: int = (
-        24  # physics: about a mismatch, half of the bits; of a label beyond beta's edge, where the point may be
-    )
-    nowhere: int = 80  # physics: more than any other cost, 48 + `truncated`; of a label that is not on beta
+    # tuned on Middlebury (tune): what a difference of 1 in (normalised) brightness costs, and at most
+    brightness: float = 30.0
+    truncated: float = 20.0
+    # physics: about a mismatch, half of the bits; of a label beyond beta's edge, where the point may well be
+    unseen: int = 24
+    # physics: more than any other cost, 48 + `truncated`; of a label that is not on beta
+    nowhere: int = 80
 
 
 SETTINGS = CensusSettings()

@@ -14,13 +14,12 @@ from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom.chunks import Box, assembled
 
-from .colour_transfer import diffused_from, matched_colours
+from .colour_transfer import coarse_mix, colours_of_bands, diffused_from, matched_colours
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Comparison, Matches, combined_bands
 from .multiview import agreed, can_agree, priors
 from .pieces import matching_pieces
 from .semi_global import FINE, matched_at_half_size
-from .spectral_mix import coarse_mix, colours_of_bands
 from .subpixel import matched_at_full_size, precise
 
 LOG = logging.getLogger(__name__)

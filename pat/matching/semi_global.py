@@ -33,6 +33,7 @@ from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
 from . import semi_global_numba as kernels
 from .cost import planes_of
+from .normalisation import Normalisation, Normalisations, blurred, equalising_blurs  # noqa: F401
 
 FINE = 2
 """Matching is done on images this many times smaller."""
@@ -42,26 +43,27 @@ FINE = 2
 class SemiGlobalSettings:
     """The numbers of a run of semi-global matching."""
 
-    step: float = 12.0  # tuned on Middlebury (tune): the penalty of neighbours whose labels differ by one, in `cost`'s
-    jump: float = 100.0  # tuned with it: of neighbours whose labels differ by more, where alpha shows no edge
-    margin: int = 64  # size: pixels that are matched around a block
-    block: int = 320  # size: sides of what is processed at a time, pixels
-    long_block: int = 640  # size: the longer side of the blocks of large images, along the segments
-    most_costs: int = 2**25  # size: up to it a block is as high as the image, and needs no margins above and below
-    pixel_bytes: int = 128  # size: what a block takes for each pixel
-    label_bytes: int = 3  # size: and for each label of each pixel: cost, and sum of costs
-    consistent: float = 0.2  # tuned on Middlebury (tune): matching back ends less than this (times 8 pixels) away
-    fill: tuple[float, float] = (
-        50.0,
-        4.0,
-    )  # tuned with it: strength, and 8-bit difference that counts as an edge, of
-    # the smoothing that fills (Min et al. 2014)
+    # tuned on Middlebury (tune): penalties of neighbours whose labels differ by one, and by more where alpha
+    # shows no edge; of the unit of `cost`
+    step: float = 12.0
+    jump: float = 100.0
+    # size: what is matched around a block; its sides, pixels; the longer side of those of large images, which lies
+    # along the segments; the costs up to which a block is as high as the image, which saves margins
+    margin: int = 64
+    block: int = 320
+    long_block: int = 640
+    most_costs: int = 2**25
+    # size: what a block takes for each pixel, and for each label of each pixel: cost, and sum of costs
+    pixel_bytes: int = 128
+    label_bytes: int = 3
+    # tuned on Middlebury (tune): a match is consistent if matching back from beta ends less than this (times 8
+    # pixels) from it; strength, and 8-bit difference that is an edge, of the smoothing that fills (Min et al. 2014)
+    consistent: float = 0.2
+    fill: tuple[float, float] = (50.0, 4.0)
 
 
 HALF_SIZE = SemiGlobalSettings()
 CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
-BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-"""Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other."""
 
 
 class SemiGlobalMatches(NamedTuple):
@@ -104,49 +106,6 @@ class HalfSizeMatches(NamedTuple):
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = (n // FINE for n in box)
         return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
-
-
-class Normalisation(NamedTuple):
-    """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
-
-    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
-    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
-    """
-
-    level: Tensor
-    blurs: tuple[list[float], list[float]]
-
-    @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
-        """What makes the means and standard deviations the same, and then the sharpness."""
-        (deviation, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
-        level = torch.stack([mean, (wanted / deviation.clamp(min=1e-3)).clamp(max=4), middle])
-        return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
-
-    def normalised(self, beta: Tensor) -> Tensor:
-        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
-        return _normalised(beta, self.level)
-
-    def softened(self, alpha: Tensor) -> Tensor:
-        """Alpha (or a part of it), no sharper than beta."""
-        return blurred(alpha, self.blurs[0])
-
-    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
-        """Both (or parts of them), the sharper one blurred."""
-        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
-        return own, other
-
-
-class Normalisations(NamedTuple):
-    """Those of images, and of the same at half the size."""
-
-    whole: Normalisation
-    half: Normalisation
-
-    @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
-        """Of alpha and beta's brightness; all sides are even."""
-        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
 
 
 class Windows(NamedTuple):
@@ -333,43 +292,6 @@ def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSett
     image.claims.append(claims)
     for plane, part in zip(image.found, parts):
         plane[inner] = part
-
-
-def _normalised(image: Tensor, level: Tensor) -> Tensor:
-    mean, factor, middle = level.to(image)
-    return (image - mean) * factor + middle
-
-
-def equalising_blurs(
-    image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
-) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be
-    matched.
-
-    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the
-    other.
-    """
-    own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
-    return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
-
-
-def _least_blur(image: Tensor, contrast: float) -> float:
-    """The least of `BLURS` after which there is no more contrast than that."""
-    enough = (b for b in (0.0, *BLURS) if float(_contrast(blurred(image[None], [b])[0])) <= 1.05 * contrast)
-    return next(enough, BLURS[-1])
-
-
-def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    """Each blurred with its standard deviation in pixels; 0: as it is."""
-
-    def one(image: Tensor, blur: float) -> Tensor:
-        return torch.from_numpy(cv2.GaussianBlur(numpy_of(image), (0, 0), blur)).to(image) if blur else image
-
-    return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
-
-
-def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
-    return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
 
 
 def matches(

@@ -50,23 +50,24 @@ FULL_SIZE = SemiGlobalSettings(
 class SubpixelSettings:
     """The numbers of matching at full size, and to a fraction of a pixel."""
 
-    run: int = 5  # size: labels in a run, of which each pixel has two
-    neighbourhood: int = 5  # size: side of the neighbourhood at half the size, pixels
-    same: float = 0.7  # tuned on Middlebury (tune): nearer matches at both sizes are of one surface, pixels
-    step_radius: int = 3  # size: window of the step to a fraction of a pixel
-    step_floor: float = 2e-5  # tuned with `flat`: its regulariser, a variance of brightness
-    most_step: float = 0.25  # physics: a step is from the nearest half of a pixel; the most pixels of it
-    flat: float = (
-        3e-6  # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match
-    )
-    # weighs half in the smoothing of surfaces
-    least_weight: float = 0.01  # tuned with it: what any consistent match weighs
-    surface: tuple[float, float] = (
-        30.0,
-        4.0,
-    )  # tuned on Middlebury (tune): strength of that smoothing, and the 8-bit
-    # difference that counts as an edge
-    pixel: float = 8.0  # tuned with it: how many such levels a pixel of disparity counts
+    # size: labels in a run, of which each pixel has two; side of the neighbourhood at half the size, pixels
+    run: int = 5
+    neighbourhood: int = 5
+    # tuned on Middlebury (tune): nearer matches at both sizes are of one surface, pixels
+    same: float = 0.7
+    # size: window of the step to a fraction of a pixel
+    step_radius: int = 3
+    # tuned on Middlebury (tune): regulariser (variance of brightness) of that step, and its most pixels
+    step_floor: float = 2e-5
+    most_step: float = 0.25
+    # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match weighs half in
+    # the smoothing of surfaces, and what any consistent match weighs
+    flat: float = 3e-6
+    least_weight: float = 0.01
+    # tuned on Middlebury (tune): strength of that smoothing, and the 8-bit difference that counts as an edge; how
+    # many such levels a pixel of disparity counts
+    surface: tuple[float, float] = (30.0, 4.0)
+    pixel: float = 8.0
 
 
 SETTINGS = SubpixelSettings()
