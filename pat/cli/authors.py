@@ -369,7 +369,7 @@ class Train:
 class Settings:
     """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
 
-    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was chosen on images.
+    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was chosen.
     Example: pat settings --kind tuned
     """
 
