@@ -117,7 +117,7 @@ def _attend(
     nearest = interpolation == "nearest"
 
     def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> Attended:
-        form = _form(given, q, samples)
+        form = sample_positions(given, q, samples)
         return _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
 
     if not callable(locations):
@@ -153,7 +153,7 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"backend must be 'auto', 'reference', 'cpu' or 'triton', got {backend!r}")
 
 
-def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
+def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
         points, mask, straight = torch.stack([locations.start, locations.end], -2), locations.valid[..., None], True
@@ -198,7 +198,7 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 
 
 def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
-    chosen = _choose(backend, inputs.query.device.type)
+    chosen = chosen_backend(backend, inputs.query.device.type)
     missing = "" if chosen == "reference" else _missing(inputs)
     if missing and backend != "auto":
         raise NotImplementedError(f"backend '{backend}' has no {missing}: ask for backend=\"reference\"")
@@ -218,7 +218,7 @@ def _missing(inputs: AttentionInputs) -> str:
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 
 
-def _choose(backend: Backend, device: str) -> str:
+def chosen_backend(backend: Backend, device: str) -> str:
     """The backend that serves; raises if the one asked for cannot."""
     triton = importlib.util.find_spec("triton") is not None
     if backend == "auto":

@@ -16,6 +16,7 @@ from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention import Attended, attend_with_statistics
+from ..attention.scores import Compared
 from ..matching.inputs import Inputs
 from .blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
@@ -49,16 +50,21 @@ class PAT(nn.Module):
 
         Raises ValueError for another number of betas than configured, or channels that do not fit.
         """
+        return self.explain(inputs)[0]
+
+    def explain(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
+        """The fused image, and what attention compares in each beta, for a loss on its weights. Raises as `forward`."""
         if len(inputs.betas) != self.config.betas:
             raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}")
         own = self.features(self._channels(inputs.alpha))
         others = [self.features(self._channels(beta.image)) for beta in inputs.betas]
-        attended = self.engine(own, others, [beta.field for beta in inputs.betas])
+        compared = self.engine.compare(own, others, [beta.field for beta in inputs.betas])
+        attended = self.engine(compared, others)
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
             image = image + self._enlarged(inputs.alpha)
-        _, position, deviation, confidence = (list(part) for part in zip(*attended))
-        return FusionOutput(image, position, deviation, confidence)
+        position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
+        return FusionOutput(image, position, deviation, confidence), compared
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""
@@ -105,20 +111,31 @@ class AttentionEngine(nn.Module):
         self.query = nn.Conv2d(dim, dim, 1)
         self.key = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
         self.value = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
+        for key in self.key:
+            # Equal features score high from the first step on: drawn apart, keys and queries have to find each other.
+            key.load_state_dict(self.query.state_dict())
 
-    def forward(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Attended]:
-        """For each beta, its values seen from alpha, and where they were."""
+    def compare(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Compared]:
+        """The query and each beta's key, and where they are compared."""
         query = self.query(self.before(own))
         return [
-            attend_with_statistics(
+            Compared(
                 query,
                 key(self.before(f)),
-                value(f),
                 field.at if field.pixels is None else _segments(field.pixels, query),
-                samples=field.samples,
-                interpolation=self.interpolation,
+                field.samples,
+                self.interpolation,
             )
-            for f, key, value, field in zip(others, self.key, self.value, fields)
+            for f, key, field in zip(others, self.key, fields)
+        ]
+
+    def forward(self, compared: Sequence[Compared], others: Sequence[Tensor]) -> list[Attended]:
+        """For each beta, its values seen from alpha, and where they were."""
+        return [
+            attend_with_statistics(
+                c.query, c.key, value(f), c.locations, samples=c.samples, interpolation=c.interpolation
+            )
+            for c, f, value in zip(compared, others, self.value)
         ]
 
 
