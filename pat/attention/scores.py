@@ -19,20 +19,29 @@ from arraygeom.segments import Segments
 
 from . import reference, torch_op
 from .attend import Interpolation, Locations, attend, attend_with_statistics, chosen_backend, sample_positions
-from .reference import AttentionInputs
+from .reference import Attended, AttentionInputs
 
 SHARPENED = 1e4
 """Queries times this give nearly all weight to the largest score."""
 
 
 class Compared(NamedTuple):
-    """A query (B, D, Ha, Wa) and a key (B, D, Hb, Wb) that attention compares, at `locations` as `attend` takes them."""
+    """A query (B, D, Ha, Wa), and a key and a value (B, D, Hb, Wb), at `locations`, all as `attend` takes them."""
 
     query: Tensor
     key: Tensor
+    value: Tensor
     locations: Segments | Callable[[Tensor], Locations]
     samples: int
     interpolation: Interpolation
+
+    def attended(self) -> Attended:
+        """C3 attention, with its statistics."""
+        return attend_with_statistics(
+            *(self.query, self.key, self.value, self.locations),
+            samples=self.samples,
+            interpolation=self.interpolation,
+        )
 
     @property
     def segments(self) -> Segments:
@@ -61,7 +70,7 @@ def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
 
 def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
     """The mean of the scores of a pixel's samples that count; 0 where none does."""
-    query, key, locations, samples, interpolation = compared
+    query, key, _, locations, samples, interpolation = compared
     nothing = torch.zeros_like(query), torch.zeros_like(key)
     even = attend(*nothing, key, locations, samples=samples, interpolation=interpolation)
     return (query * even).sum(1)
@@ -70,7 +79,7 @@ def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
 @torch.no_grad()
 def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
     """Where the largest weight is, (x, y) in beta's pixels; 0 where no sample counts. Of equal ones their mean."""
-    query, key, locations, samples, interpolation = compared
+    query, key, _, locations, samples, interpolation = compared
     sharp = query.float() * SHARPENED
     found = attend_with_statistics(
         sharp, key.float(), key[:, :1].float(), locations, samples=samples, interpolation=interpolation

@@ -12,8 +12,8 @@ from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, ms
 from pat.attention.scores import peak_position
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.guided import BetaEstimate, GuidedPAT
-from pat.networks.protocol import FusionOutput
 from pat.networks.paper import PAT
+from pat.networks.protocol import FusionOutput
 from pat.networks.weights import Network
 
 from .attention_loss import attention_loss

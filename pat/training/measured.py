@@ -94,7 +94,9 @@ def disparity_files(pair: PairFiles) -> tuple[Path, Path]:
         files = [pair.left.with_name(name) for name in (layout.ground_truth, COUNTERPART.get(layout.ground_truth, "-"))]
         if pair.left.name == layout.left and all(file.is_file() for file in files):
             return files[0], files[1]
-    raise ValueError(f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png")
+    raise ValueError(
+        f"{pair.left.parent}: wanted the true disparity of both images beside them, disp1.png and disp5.png"
+    )
 
 
 def depth_of(disparity: Float[Tensor, "b h w"], width: int) -> Float[Tensor, "b h w"]:

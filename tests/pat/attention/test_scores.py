@@ -21,7 +21,7 @@ def compared(interpolation="bilinear", *, seed=0, dtype=torch.float64, batch=2) 
     start, end = (torch.rand(2, batch, 4, 6, 2, generator=g, dtype=dtype) * 9 - 1).unbind(0)
     valid = torch.ones(batch, 4, 6, dtype=torch.bool)
     valid[0, 0, 0] = False
-    return Compared(query, key, Segments(start, end, valid), SAMPLES, interpolation)
+    return Compared(query, key, key, Segments(start, end, valid), SAMPLES, interpolation)
 
 
 def gathered(one: Compared) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:

@@ -12,7 +12,6 @@ from pat.matching.inputs import Inputs
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
 from pat.networks.weights import save_weights
-
 from tests.pat.matching.test_spectral_mix import texture
 
 HW = (32, 48)

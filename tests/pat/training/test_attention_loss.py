@@ -19,7 +19,7 @@ def rows(batch=1, dtype=torch.float64) -> Segments:
 
 
 def compared(query, key, batch=1) -> Compared:
-    return Compared(query, key, rows(batch, query.dtype), SAMPLES, "bilinear")
+    return Compared(query, key, key, rows(batch, query.dtype), SAMPLES, "bilinear")
 
 
 def random(seed=0):
@@ -77,6 +77,6 @@ def test_the_samples_around_a_position_on_a_slanted_segment():
 def test_a_segment_of_one_sample_has_a_target():
     query, key, _, _ = random()
     start = rows().start
-    one = Compared(query, key, Segments(start, start, rows().valid), 1, "bilinear")
+    one = Compared(query, key, key, Segments(start, start, rows().valid), 1, "bilinear")
     loss = attention_loss([one], [start], [torch.ones(1, *HW, dtype=torch.bool)], stride=1)
     torch.testing.assert_close(loss, torch.zeros_like(loss))
