@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 
-from ..attention.scores import Compared
+from ..attention.scores import Compared, peak_position
 from ..matching.inputs import Inputs
 from .authors import read_authors
 from .blocks import ResidualASPP, ResidualBlock
@@ -76,6 +76,11 @@ class PAT(nn.Module):
             image = image + self._enlarged(inputs.alpha)
         position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
+
+    def with_peaks(self, inputs: Inputs) -> tuple[FusionOutput, list[Tensor]]:
+        """The fused image, and for each beta where the largest weight is (B, 2, H, W), beta's pixels."""
+        fused, compared = self.explain(inputs)
+        return fused, [peak_position(c) for c in compared]
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""
