@@ -205,8 +205,7 @@ def _refined(pair: RefinedPair, images: Images, network: Network) -> tuple[Refin
 
 
 def _for_bands(network: Network, bands: int) -> Network:
-    wanted = getattr(network.config, "bands", None)
-    return network if wanted in (None, bands) else load_weights("mono-colour" if bands == 3 else "mono-spectral")
+    return network if network.bands in (None, bands) else load_weights("mono-colour" if bands == 3 else "mono-spectral")
 
 
 def _relative_scale(first: Frame, other: Frame) -> float:

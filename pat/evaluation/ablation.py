@@ -49,7 +49,6 @@ from ..fusion.fuse import fuse
 from ..fusion.steps import resolution_ratio
 from ..media.colour import luminance, srgb_image
 from ..media.figures import save_panels
-from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from ..sensors import Clip, Noise, Quantise, record
 from ..synthesis.layered import LayeredScenes
@@ -281,8 +280,8 @@ def unsupported(network: FusionNetwork, field: ReceptiveField, rig: Rig) -> str:
         needed = math.prod(pair.alpha.hw) / 4 * math.prod(pair.beta.hw) * 8
         if needed > DENSE_LIMIT:
             return f"does not fit: {needed / 2**30:.0f} GiB of positions"
-    if isinstance(network, GuidedPAT) and isinstance(field(pair, torch.zeros(1, 2)), Positions):
-        return "explicit positions: GuidedPAT samples along segments"
+    if network.uses_matches and isinstance(field(pair, torch.zeros(1, 2)), Positions):
+        return "explicit positions: this network samples along segments"
     return ""
 
 

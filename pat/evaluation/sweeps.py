@@ -10,12 +10,11 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float
-from torch import Generator, Tensor
+from torch import Tensor
 
 from arraygeom import (
     Camera,
@@ -48,7 +47,6 @@ from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rig_distribution import RigDistribution
 from ..synthesis.rigs import RigBatch
-from ..training.samples import transfer
 from .ablation import sample_photographs
 from .metrics import score
 
@@ -241,12 +239,22 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> Scene:
     near, far = (torch.full((1,), float(d), dtype=torch.float64) for d in pair.depth_range)
     cameras = [Camera(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None]), hw=c.hw) for c in pair.cameras]
     batch = LayeredScenes(bank, RigDistribution(), hw=pair.alpha.hw, seed=seed).render(RigBatch(cameras, near, far), g)
-    batched = Pair(cameras[0], cameras[1], (near, far))
-    position, visible = transfer(batched, batch.depth[0].double(), batch.depth[1].double())
+    position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}
     recorded = {name: record(image, steps, g).image[0] for name, image in images.items()}
-    return Scene(recorded, batch.images[0][0], position[0], visible[0])
+    return Scene(recorded, batch.images[0][0], position, visible)
+
+
+def seen_at(
+    pair: Pair, depth: Float[Tensor, "h w"], beta_depth: Float[Tensor, "hb wb"]
+) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
+    """Where alpha's pixels are in beta, and whether beta sees the same surface there, to 2 % of its depth."""
+    alpha, beta = pair.cameras
+    found = beta.project(alpha.unproject(pixel_grid(alpha.hw, dtype=torch.float64), depth))
+    there = sample(beta_depth[None, None], found.x[None], interpolation="nearest")
+    same = (there.values[0, 0] / found.depth - 1).abs() < 0.02
+    return found.x, found.valid & there.valid[0] & same
 
 
 SWEEPS: dict[str, tuple[str, tuple[float, ...]]] = {

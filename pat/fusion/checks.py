@@ -8,8 +8,6 @@ from contextlib import contextmanager
 
 import torch
 
-from ..networks.bandwise import BandwisePAT
-from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from .inputs import FrameInputs
 from .results import Frame
@@ -35,7 +33,7 @@ def warn_of_confidence(network: FusionNetwork, frame: Frame, inputs: FrameInputs
 
     Below `UNFIT_CONFIDENCE` by a `LowConfidenceWarning`. Only for networks whose confidence is a trained probability.
     """
-    if not isinstance(network, GuidedPAT | BandwisePAT):
+    if not network.uses_matches:
         return
     mean = overlap_confidence(frame, inputs)
     if not mean < LOW_CONFIDENCE:

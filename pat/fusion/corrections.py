@@ -1,7 +1,7 @@
 """What cameras and rig are off by, found once a frame from a fusion of reduced images.
 
-A pre-pass fuses the images at half the size or less. Where its matches are of high confidence, alpha's response is
-fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
+A pre-pass matches the images at half the size or less, without a network. Where its matches are reliable, alpha's
+response is fitted (`pat.matching.radiometry`), and how far beta lies across its search segments
 (`pat.matching.epipolar_offset`). Both are put right before the frame is fused.
 """
 
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
@@ -22,14 +22,14 @@ from arraygeom import Segments
 from arraygeom.epipolar import Track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
-from arraygeom.sampling import on_image, sample
+from arraygeom.sampling import sample
 
 from ..matching.epipolar_offset import Misalignment, fit_misalignment, normals
 from ..matching.inputs import Beta, Inputs
+from ..matching.match import located
+from ..matching.matches import BetaMatches, combined_bands
 from ..matching.radiometry import Given, Response, fit, stated_response
-from ..matching.semi_global import Normalisation, blurred, reduced
-from ..networks.bandwise import BandwisePAT
-from ..networks.guided import GuidedPAT, brightness
+from ..matching.semi_global import CONSISTENT, Normalisation, blurred, enlarged, reduced
 from ..networks.protocol import FusionNetwork
 from .inputs import FrameInputs, padded
 from .results import Frame
@@ -40,8 +40,8 @@ PIXELS = 400_000
 """Alpha's pixels in the pre-pass, at most."""
 SMALL = 50_000
 """Alpha's pixels below which the pre-pass is at full size."""
-CONFIDENT = 0.6
-"""Confidence from which a match counts."""
+MARGIN = 0.1
+"""By how much a match must be better than others to count, as of `BetaMatches.facts`."""
 BLUR = 1.0
 """Standard deviation of the blur of what is compared, pixels of the pre-pass."""
 PASSES = 3
@@ -82,16 +82,22 @@ class Corrections:
         return frame if self.response.is_rec601 else frame._replace(image=self.response.undone(frame.image))
 
 
+def corrections_for(network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
+    """What is to be put right for a network: for one without matches nothing is looked for. Raises as
+    `find_corrections`."""
+    if network.uses_matches:
+        return find_corrections(frame, response, align=align)
+    return Corrections(_given(response, frame.inputs))
+
+
 @torch.no_grad()
-def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
+def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Corrections:
     """Alpha's response if it is to be fitted, and the betas' misalignments if these are asked for.
 
-    Only for networks whose confidence is a trained probability; a response is fitted for RGB betas. Raises
-    ValueError for a stated response that is not three weights, none negative, or where there is no RGB beta.
+    A response is fitted for RGB betas. Raises ValueError for a stated response that is not three weights, none
+    negative, or where there is no RGB beta.
     """
     found = Corrections(_given(response, frame.inputs))
-    if not isinstance(network, GuidedPAT | BandwisePAT):
-        return found
     fits = response == "fit" and any(map(_is_rgb, frame.inputs.betas))
     align = align and all(beta.field.pixels is not None for beta in frame.inputs.betas)
     if not fits and not align:
@@ -100,7 +106,7 @@ def find_corrections(network: FusionNetwork, frame: FrameInputs, response: Given
     found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))
     for i in range(PASSES):
         LOG.info("pre-pass %d of at most %d", i + 1, PASSES)
-        matches = _matches(network, small, found)
+        matches = _matches(small, found)
         response_now = _fitted(small, matches) if fits else found.response
         steps = [_misaligned(m) for m in matches] if align else [Misalignment()] * len(matches)
         moves = tuple(before + step for before, step in zip(found.misalignments, steps))
@@ -187,22 +193,22 @@ class _Matches(NamedTuple):
         return (self.position + 0.5) / self.position.new_tensor([self.luma.shape[1], self.luma.shape[0]]) - 0.5
 
 
-def _matches(network: GuidedPAT | BandwisePAT, frame: FrameInputs, found: Corrections) -> list[_Matches]:
+def _matches(frame: FrameInputs, found: Corrections) -> list[_Matches]:
     """Matches of each beta with what has been found put right."""
     inputs = found.applied(frame.inputs, frame.hw)
-    output = network.matched(inputs)
-    parts = zip(frame.inputs.betas, inputs.betas, output.position, output.confidence)
+    parts = zip(frame.inputs.betas, inputs.betas, located(inputs).betas)
     return [_of_beta(inputs.alpha, *part, frame.hw) for part in parts]
 
 
-def _of_beta(alpha: Tensor, before: Beta, beta: Beta, position: Tensor, confidence: Tensor, hw: HW) -> _Matches:
+def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW) -> _Matches:
     h, w = hw
-    where = position[0, :, :h, :w].movedim(0, -1)
-    flat, size = where.reshape(1, -1, 2), (beta.image.shape[-2], beta.image.shape[-1])
-    luma = brightness(beta.image)
-    seen = sample(torch.cat([before.image, luma], 1), flat.to(luma), interpolation="bilinear").values
+    size = (beta.image.shape[-2], beta.image.shape[-1])
+    positions, valid = found.positions(beta.field.straight, size)
+    where = positions[0, :h, :w]
+    luma = combined_bands(beta.image)
+    seen = sample(torch.cat([before.image, luma], 1), where.reshape(1, -1, 2).to(luma)).values
     values = seen.reshape(seen.shape[1], h, w)
-    weight = ((confidence[0, :h, :w] > CONFIDENT) & on_image(where, size)).to(alpha)
+    weight = (_reliable(found)[0, 0, :h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.of(alpha, luma)
     own = whole.softened(alpha)[:, :, :h, :w]
     mean, deviation = _moments(values[-1:][None], weight)
@@ -211,6 +217,12 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, position: Tensor, confiden
     soft = blurred(values[:-1][:, None], [BLUR] * (len(values) - 1))[:, 0]
     normal = normals(Segments(*(t[0, :h, :w] for t in _parts(beta.field.straight))))
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
+
+
+def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
+    """Where a match is consistent and clearly better than others."""
+    unlike, margin, _ = found.facts.split(1, 1)
+    return enlarged(((unlike < CONSISTENT) & (margin > MARGIN)).to(margin)) > 0
 
 
 def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:

@@ -11,13 +11,14 @@ import torch
 
 from arraygeom import ReceptiveField, Rig
 
+from ..matching.match import Matcher, match
 from ..matching.pieces import Tile
 from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes
 from .checks import warn_of_confidence
-from .corrections import Corrections, expected_work, find_corrections
+from .corrections import Corrections, corrections_for, expected_work
 from .depth import background_filled
 from .inputs import check_bands, prepared
 from .low_light import Noise, denoised_views
@@ -54,6 +55,7 @@ def fuse(
     announce: Callable[[Plan], None] | None = None,
     store: Path | None = None,
     differentiable: bool = False,
+    matcher: Matcher = match,
 ) -> Frame:
     """Fuse one frame at the view of camera `alpha`.
 
@@ -94,6 +96,7 @@ def fuse(
             segment, is a constant: gradients go through the segments and attention around that position. So are
             `align` and `response`: without `align=False` a rig that is off is put right, and has hardly a gradient.
             Else the frame is detached, whatever requires gradients.
+        matcher: what finds the matches of a network that uses some: `pat.matching.match.match`, or your own.
         announce: called with the plan before the work begins; the time of a large frame is estimated by fusing a piece.
 
     Raises:
@@ -126,25 +129,25 @@ def fuse(
     )
     if announce:
         announce(plan)
-    found = corrections or find_corrections(network, inputs, response, align=align)
+    found = corrections or corrections_for(network, inputs, response, align=align)
     if explain:
         for line in found.described(betas, inputs.hw):
             explain(line)
     fused = replace(found.applied(inputs.inputs, inputs.hw), luminance=SHARES[luminance])
     inputs = inputs._replace(inputs=fused)
     with limited(limit):
-        state = network.prepare(inputs.inputs)
-        LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
         with torch.set_grad_enabled(differentiable):
-            wrapped = low_light.wrapped(network)
-            frame = fused_in_tiles(wrapped, inputs, state, plan.tiles, progress=progress, store=store)
-            frame, matched = low_light.split(frame, len(inputs.inputs.betas))
+            matches = matcher(inputs.inputs) if network.uses_matches else None
+            LOG.info("fusing %d tile%s", len(plan.tiles), "s" * (len(plan.tiles) > 1))
+            noisy = bool(low_light.noisy)
+            done = fused_in_tiles(network, inputs, matches, plan.tiles, found=noisy, progress=progress, store=store)
+        frame = done.frame
         warn_of_confidence(network, frame, inputs)
         frame = frame._replace(depth=background_filled(frame.depth, frame.confidence, inputs.inputs))
         if luminance != "alpha":
             frame = with_alpha_detail(frame, inputs.inputs.alpha[0, :, : inputs.hw[0], : inputs.hw[1]])
-        del inputs, fused, state  # the segments and matches of a large frame: what follows needs memory, too
-        frame = low_light.corrected(found.undone(frame), matched, steps, keep_alpha=keep_alpha)
+        del inputs, fused, matches  # the segments and matches of a large frame: what follows needs memory, too
+        frame = low_light.corrected(found.undone(frame), done.found, steps, keep_alpha=keep_alpha)
         LOG.info("back to the pixels of %s", alpha)
         for back in undo:
             frame = back(frame)
@@ -171,4 +174,4 @@ def corrections_of(
     views, _ = denoised_views(Views.of(rig, images, alpha=alpha, depth=depth, field=field), noise)
     check_bands(network, views)
     inputs, _ = prepared(network, views, steps_for(network, normalise=match_levels))
-    return find_corrections(network, inputs, response, align=align)
+    return corrections_for(network, inputs, response, align=align)

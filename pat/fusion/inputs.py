@@ -19,7 +19,6 @@ from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Beta, Inputs
-from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo
 from .views import Views
@@ -67,7 +66,7 @@ def check_bands(network: FusionNetwork, views: Views) -> None:
 
 
 def _refuse_bands(network: FusionNetwork, views: Views) -> None:
-    wanted = network.config.bands if isinstance(network, GuidedPAT) else None
+    wanted = network.bands
     bands = {name: len(views.images[name]) for name in views.betas}
     total = sum(bands.values())
     if wanted is None or total == wanted or wanted in bands.values():
@@ -120,7 +119,7 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
             raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")
         placements.append(place)
-    return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo), placements, hw)
+    return FrameInputs(Inputs(alpha, tuple(betas), m, network.beta_halo, bands=network.bands), placements, hw)
 
 
 def padded(image: Tensor, multiple: int) -> Tensor:

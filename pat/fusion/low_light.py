@@ -22,8 +22,6 @@ from ..matching.pieces import tiles_of
 from ..media.colour import luminance
 from ..networks.collaborative import luma_refined, without_noise
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
-from ..networks.positions import Found, WithPositions, split
-from ..networks.protocol import FusionNetwork
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
 from .averaging import averaged_with_alike
@@ -82,24 +80,14 @@ class LowLight:
         found = math.prod(hw) * betas * FOUND_BYTES
         return found + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
 
-    def wrapped(self, network: FusionNetwork) -> FusionNetwork:
-        """The network that fuses: if a view is noisy, it also says where alpha's pixels are in each beta."""
-        return WithPositions(network) if self.noisy else network
-
-    def split(self, frame: Frame, betas: int) -> tuple[Frame, list[Found]]:
-        """The frame that a `wrapped` network made of so many betas, and what its further bands say of each of them."""
-        if not self.noisy:
-            return frame, []
-        image, found = split(frame.image, betas)
-        return frame._replace(image=image), found
-
     def corrected(
-        self, frame: Frame, found: Sequence[Found], steps: Sequence[FusionStep], *, keep_alpha: bool = False
+        self, frame: Frame, found: Float[Tensor, "n 3 h w"], steps: Sequence[FusionStep], *, keep_alpha: bool = False
     ) -> Frame:
         """A frame fused from the denoised views, corrected by what all of them recorded.
 
-        `steps` were taken before it was fused and are not undone yet. With `keep_alpha`, or if alpha has no noise, the
-        luma is alpha's as recorded. Betas that are not all RGB are denoised one by one alone.
+        `found` is where its pixels are in each beta, x and y, and the confidence of that. `steps` were taken before it
+        was fused and are not undone yet. With `keep_alpha`, or if alpha has no noise, the luma is alpha's as recorded.
+        Betas that are not all RGB are denoised one by one alone.
         """
         if not self.noisy:
             return frame
@@ -198,7 +186,7 @@ def denoised(image: Float[Tensor, "b c h w"], deviation: Float[Tensor, "b c h w"
 
 @torch.no_grad()
 def jointly_denoised(
-    image: Float[Tensor, "3 h w"], alpha: NoisyView, betas: Sequence[NoisyView], found: Sequence[Found]
+    image: Float[Tensor, "3 h w"], alpha: NoisyView, betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]
 ) -> Float[Tensor, "3 h w"]:
     """The image fused from denoised views, corrected by alpha and the RGB betas as they were recorded."""
     beta, confidence = warped(betas, found)
@@ -218,10 +206,10 @@ def jointly_denoised(
     return _in_pieces(averaged, fused, beta.recorded, confidence, alpha.recorded, alpha.deviation)[0]
 
 
-def warped(betas: Sequence[NoisyView], found: Sequence[Found]) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
+def warped(betas: Sequence[NoisyView], found: Float[Tensor, "n 3 h w"]) -> tuple[NoisyView, Float[Tensor, "1 1 h w"]]:
     """All betas at alpha's pixels, mixed by their confidences; and the confidence of the mixture."""
-    images = [torch.cat([sample(part, at.position[None]).values for part in beta]) for beta, at in zip(betas, found)]
-    confidence = torch.stack([at.confidence for at in found])
+    positions, confidence = found[:, :2].movedim(1, -1), found[:, 2]
+    images = [torch.cat([sample(part, x[None]).values for part in beta]) for beta, x in zip(betas, positions)]
     weight = (confidence + 1e-6) / (confidence + 1e-6).sum(0)
     mixed = torch.stack([w * image for w, image in zip(weight, images)]).sum(0)
     return NoisyView(*mixed.split(1)), confidence.amax(0)[None, None]

@@ -15,7 +15,6 @@ from torch import Tensor
 from ..matching.colour_transfer import MOST_DETAIL, local_slope
 from ..matching.semi_global import Normalisation
 from ..media.colour import luminance
-from ..networks.guided import GuidedPAT
 from ..networks.protocol import FusionNetwork
 from .results import Frame
 
@@ -30,7 +29,7 @@ def check_luminance(network: FusionNetwork, kept: Luminance, *, noisy: bool) -> 
         raise ValueError(f"luminance is one of {', '.join(SHARES)}; got {kept!r}")
     if kept == "alpha":
         return
-    if not (isinstance(network, GuidedPAT) and network.config.keep_luminance):
+    if not network.keeps_luminance:
         raise ValueError(f"luminance={kept!r} needs weights for RGB betas, such as mono-colour: leave it at 'alpha'")
     if noisy:
         raise ValueError(

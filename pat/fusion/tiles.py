@@ -19,8 +19,9 @@ from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Inputs
+from ..matching.matches import Matches
 from ..matching.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
-from ..networks.protocol import FusionNetwork, State
+from ..networks.protocol import FusionNetwork, FusionOutput, matched_for
 from ..support.tensor_files import write_tensors
 from .depth import depth_and_confidence
 from .inputs import FrameInputs
@@ -89,8 +90,8 @@ def plan_frame(
     large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
     slow = math.prod(frame.hw) > ESTIMATED
     probe = Probe.of(network, frame) if (large and limit) or (slow and estimate) else None
-    held = kept + held_memory(frame, probe.state if probe else 0.0, whole_frame=not stored)
-    matching = 0.0 if probe and not probe.state else MATCHING_BYTES * max(area(tile.outer) for tile in pieces)
+    held = kept + held_memory(frame, probe.matches if probe else 0.0, whole_frame=not stored)
+    matching = MATCHING_BYTES * max(area(tile.outer) for tile in pieces) if network.uses_matches else 0.0
     tiles = tiles_within(network, frame, limit, held, matching)
     work = max(matching, *(working_memory(network, frame.inputs, tile) for tile in tiles))
     seconds = (1 + before) * probe.seconds(pieces, tiles) + after if probe else None
@@ -131,42 +132,42 @@ def working_memory(network: FusionNetwork, inputs: Inputs, tile: Tile) -> float:
     return network.working_bytes(area(tile.outer), betas)
 
 
-def held_memory(frame: FrameInputs, state: float, *, whole_frame: bool) -> float:
-    """Bytes of the process that do not depend on the tiles: libraries, images, fields, the network's state (`state`
-    for each pixel), and the fused frame if it is kept in memory."""
+def held_memory(frame: FrameInputs, matches: float, *, whole_frame: bool) -> float:
+    """Bytes of the process that do not depend on the tiles: libraries, images, fields, `matches` for each pixel, and
+    the fused frame if it is kept in memory."""
     pixels = math.prod(frame.hw)
-    return LIBRARIES + frame.inputs.nbytes + pixels * (state + (FRAME_BYTES if whole_frame else 0.0))
+    return LIBRARIES + frame.inputs.nbytes + pixels * (matches + (FRAME_BYTES if whole_frame else 0.0))
 
 
 class Probe(NamedTuple):
-    """What a piece from the middle of alpha took, for each of its pixels: bytes of the network's state, seconds of
-    preparing it and of fusing."""
+    """What a piece from the middle of alpha took, for each of its pixels: bytes of its matches, seconds of matching and
+    of fusing."""
 
-    state: float
-    preparing: float
+    matches: float
+    matching: float
     fusing: float
 
     @classmethod
     @torch.no_grad()
     def of(cls, network: FusionNetwork, frame: FrameInputs) -> Probe:
-        """Prepare and fuse a small piece, as loops may have to be compiled, and then one to measure."""
+        """Match and fuse a small piece, as loops may have to be compiled, and then one to measure."""
         side = min(max(math.sqrt(math.prod(frame.hw) * PROBED), PROBE[0]), PROBE[1])
         for n in (PROBE[0], int(side)):
             tile = _middle(frame.hw, n, network.multiple)
             inputs = frame.inputs.cut(_to_multiple(tile.outer, network.multiple))
             begin = time.perf_counter()
-            state = network.prepare(inputs)
+            matches = matched_for(network, inputs)
             middle = time.perf_counter()
-            _fused(network, inputs, state, frame, tile)
+            _fused(network, inputs, matches, frame, tile)
             end = time.perf_counter()
         pixels = area(tile.outer)
-        nbytes = 0 if state is None else state.nbytes
+        nbytes = matches.nbytes if matches else 0
         return cls(nbytes / pixels, (middle - begin) / pixels, (end - middle) / pixels)
 
     def seconds(self, pieces: list[Tile], tiles: list[Tile]) -> float:
         """About how long a frame will take here, if the machine stays as busy as it was."""
-        preparing, fusing = (sum(area(tile.outer) for tile in some) for some in (pieces, tiles))
-        return self.preparing * preparing + self.fusing * fusing
+        matching, fusing = (sum(area(tile.outer) for tile in some) for some in (pieces, tiles))
+        return self.matching * matching + self.fusing * fusing
 
 
 def _middle(hw: HW, side: int, multiple: int) -> Tile:
@@ -181,23 +182,47 @@ def _to_multiple(box: Box, multiple: int) -> Box:
     return top, bottom + (top - bottom) % multiple, left, right + (left - right) % multiple
 
 
-def fuse_tile(network: FusionNetwork, frame: FrameInputs, state: State | None, tile: Tile) -> Frame:
+class FusedTile(NamedTuple):
+    """The inner part of a tile: image (C, h, w), depth and confidence (h, w) as of `Frame`, and where its pixels were
+    found in each whole beta, (betas, 3, h, w): x, y and the confidence of that."""
+
+    image: Tensor
+    depth: Tensor
+    confidence: Tensor
+    found: Tensor
+
+    @property
+    def frame(self) -> Frame:
+        """The same of a whole frame, as its result."""
+        return Frame(self.image, self.depth, self.confidence)
+
+
+def fuse_tile(network: FusionNetwork, frame: FrameInputs, matches: Matches | None, tile: Tile) -> FusedTile:
     """The inner part of a tile."""
     box = _to_multiple(tile.outer, network.multiple)
-    return _fused(network, frame.inputs.cut(box), state and state.cut(box), frame, tile)
+    return _fused(network, frame.inputs.cut(box), matches and matches.cut(box), frame, tile)
 
 
-def _fused(network: FusionNetwork, inputs: Inputs, state: State | None, frame: FrameInputs, tile: Tile) -> Frame:
+def _fused(
+    network: FusionNetwork, inputs: Inputs, matches: Matches | None, frame: FrameInputs, tile: Tile
+) -> FusedTile:
     top, bottom, left, right = tile.inner
     box = (top - tile.outer[0], bottom - tile.outer[0], left - tile.outer[2], right - tile.outer[2])
-    output = network(inputs, state).cut(box)
+    output = network(inputs, matches).cut(box)
     part = replace(inputs, betas=tuple(replace(beta, field=beta.field.cut(box)) for beta in inputs.betas))
     hw = bottom - top, right - left
     depth, confidence = depth_and_confidence(output, part, frame.placements, hw, (left, top))
-    return Frame(output.image[0], depth, confidence)
+    return FusedTile(output.image[0], depth, confidence, _found(output, part))
 
 
-def assembled(hw: HW, parts: Iterable[tuple[Tile, Frame]]) -> Frame:
+def _found(output: FusionOutput, part: Inputs) -> Tensor:
+    """Positions in whole betas, and their confidences, (betas, 3, h, w)."""
+    corners = [p.new_tensor(beta.offset)[:, None, None] for beta, p in zip(part.betas, output.position)]
+    parts = zip(output.position, corners, output.confidence)
+    return torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in parts]).to(output.image)
+
+
+def assembled(hw: HW, parts: Iterable[tuple[Tile, FusedTile]]) -> FusedTile:
     """The frame from its tiles; a single one as it is, with its gradients."""
     frame: list[Tensor] = []
     for tile, found in parts:
@@ -207,22 +232,25 @@ def assembled(hw: HW, parts: Iterable[tuple[Tile, Frame]]) -> Frame:
         top, bottom, left, right = tile.inner
         for target, part in zip(frame, found):
             target[..., top:bottom, left:right] = part
-    return Frame(*frame)
+    return FusedTile(*frame)
 
 
 def fused_in_tiles(
     network: FusionNetwork,
     frame: FrameInputs,
-    state: State | None,
+    matches: Matches | None,
     tiles: list[Tile],
     *,
+    found: bool = True,
     progress: Callable[[Iterable[Tile], int], Iterable[Tile]] | None = None,
     store: Path | None = None,
-) -> Frame:
-    """The frame put together from its tiles, or from a folder where finished tiles are."""
+) -> FusedTile:
+    """The frame put together from its tiles, or from a folder where finished tiles are; without what was `found` in the
+    betas (it takes 12 bytes a pixel and beta) if that is not asked for."""
 
-    def make(tile: Tile) -> Frame:
-        return fuse_tile(network, frame, state, tile)
+    def make(tile: Tile) -> FusedTile:
+        made = fuse_tile(network, frame, matches, tile)
+        return made if found else made._replace(found=made.found[:0])
 
     shown = progress(tiles, len(tiles)) if progress else tiles
     if not store or len(tiles) == 1:
@@ -249,16 +277,16 @@ class TileStore(NamedTuple):
             digest.update(tensor.detach().cpu().contiguous().numpy())
         return cls(folder, digest.hexdigest()[:16])
 
-    def write(self, tile: Tile, make: Callable[[Tile], Frame]) -> None:
+    def write(self, tile: Tile, make: Callable[[Tile], FusedTile]) -> None:
         """Make a tile, unless it is there."""
         file = self._file(tile)
         if file.exists():
             return
         write_tensors(file, make(tile)._asdict())
 
-    def read(self, tile: Tile) -> Frame:
+    def read(self, tile: Tile) -> FusedTile:
         """A tile that was made."""
-        return Frame(**load_file(self._file(tile)))
+        return FusedTile(**load_file(self._file(tile)))
 
     def _file(self, tile: Tile) -> Path:
         return self.folder / f"{self.digest}_{'_'.join(map(str, (*tile.inner, *tile.outer)))}.safetensors"

@@ -34,7 +34,9 @@ class Inputs:
     """Alpha's image (B, C, H, W) and the betas, which may be of any sizes.
 
     Parts of betas are cut at whole multiples of `multiple` pixels, `beta_halo` pixels around the segments. `luminance`
-    is alpha's share of the result's, for networks that keep it; the rest is beta's.
+    is alpha's share of the result's, for networks that keep it; the rest is beta's. `bands` are those of the result: so
+    many, whose luminance (the mean, if they are not three) is what alpha sees, or None: those of all betas, of which
+    alpha may see any combination.
     """
 
     alpha: Float[Tensor, "b c h w"]
@@ -42,6 +44,7 @@ class Inputs:
     multiple: int = 1
     beta_halo: int = 0
     luminance: float = 1.0
+    bands: int | None = None
 
     @classmethod
     def of(cls, alpha: Tensor, images: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> Inputs:
@@ -57,6 +60,10 @@ class Inputs:
     def nbytes(self) -> int:
         """Memory of images and fields."""
         return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
+
+    def shows_all_bands(self, beta: Beta) -> bool:
+        """Whether the beta is one of several of which some show all bands of the result, and shows them."""
+        return len(self.betas) > 1 and beta.image.shape[1] == self.bands
 
     def of_beta(self, i: int) -> Inputs:
         """The same with one beta alone."""

@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -26,21 +26,17 @@ from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
 
 from ..media.colour import to_bytes
-from .colour_transfer import diffused_from
 from .inputs import Beta, Inputs
-from .pieces import Prepared, from_pieces, prepared, whole
+from .matches import BetaMatches, Matches
+from .pieces import from_pieces
 from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
     FINE,
     Extent,
-    HalfSizeMatches,
-    Normalisations,
-    SemiGlobalMatches,
     enlarged,
     filled,
 )
-from .subpixel import matched
 
 SUPPORT = 1.5
 """A beta supports an inverse depth that is less than this many of its pixels from its own match."""
@@ -93,7 +89,7 @@ class MatchedBeta:
 
     @classmethod
     def of(
-        cls, beta: Beta, found: SemiGlobalMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
+        cls, beta: Beta, found: BetaMatches, rows: tuple[int, int], ambiguity: Ambiguity = NO_AMBIGUITY
     ) -> MatchedBeta:
         """Of a beta with a track and its own matches, at some of alpha's rows: from an even one to an even one."""
         top, bottom = rows
@@ -163,71 +159,7 @@ class MatchedBeta:
         return torch.where(inside, row * columns + column, rows * columns)
 
 
-@torch.no_grad()
-def matched_together(
-    inputs: Inputs,
-    common: Callable[[Inputs], Any],
-    comparison: Callable[[Any], tuple[Callable[[Tensor], Tensor], Normalisations]],
-    colours: Callable[[Tensor, Beta, SemiGlobalMatches, Any], tuple[Tensor, Tensor]],
-    full: Sequence[bool] = (),
-) -> Prepared:
-    """The matches of all betas, with the depth on which they agree if they can, coloured.
-
-    `common` and `comparison` are those of `pat.matching.pieces.prepared`; `colours` gives bands minus alpha at a beta's
-    matches, and their weight. Of betas that agree, those that have all bands (`full`, of each) share the colour that is
-    diffused; any other has its own.
-    """
-    agree = can_agree(inputs)
-
-    def match(piece: Inputs, known: Any, half: HalfSizeMatches | None) -> SemiGlobalMatches:
-        alpha, (beta,), (of, normalisations) = piece.alpha, piece.betas, comparison(known)
-        blocks = None if half else beta.field.of_blocks(FINE)
-        where = matched(alpha, of(beta.image), beta.field.straight, blocks, normalisations, half)
-        found = SemiGlobalMatches(*where, alpha[:, :0], alpha[:, None, :0])
-        if agree:
-            return found
-        colour, weight = colours(alpha, beta, found, known)
-        return found._replace(matched=colour, colour=diffused_from(colour, alpha, weight))
-
-    found = prepared(inputs, common, comparison, match)
-    return _coloured_together(inputs, found, colours, full or [False] * len(inputs.betas)) if agree else found
-
-
-def _coloured_together(
-    inputs: Inputs,
-    found: Prepared,
-    colours: Callable[[Tensor, Beta, SemiGlobalMatches, Any], tuple[Tensor, Tensor]],
-    full: Sequence[bool],
-) -> Prepared:
-    matches, prior = agreed(inputs, found.matches), _priors(inputs) if any(full) else ()
-
-    def of(box: Box) -> list[Tensor]:
-        """What is diffused, and each beta's colours, of a piece."""
-        large = box != whole(inputs.hw).outer
-        ones = [inputs.of_beta(i).cut(box) if large else inputs.of_beta(i) for i in range(len(full))]
-        alpha = ones[0].alpha
-        alone = [colours(alpha, o.betas[0], m.cut(box), n) for o, m, n in zip(ones, matches, found.common)]
-        shared = []
-        if any(full):
-            counting = [(c, w * math.exp(p)) for (c, w), p, counts in zip(alone, prior, full) if counts]
-            total = torch.stack([weight for _, weight in counting]).sum(0)
-            mixed = sum(weight * colour for colour, weight in counting) / total
-            shared = [diffused_from(mixed, alpha, torch.stack([w for (_, w), c in zip(alone, full) if c]).amax(0))]
-        fills = (diffused_from(c, alpha, w) for (c, w), counts in zip(alone, full) if not counts)
-        parts = [*shared, *fills, *(colour for colour, _ in alone)]
-        return [part.half() for part in parts] if large else parts
-
-    parts = from_pieces(inputs.hw, inputs.multiple, of)
-    matched_colours, diffused = parts[-len(full) :], iter(parts[: -len(full)])
-    shared = [next(diffused)] if any(full) else []
-    coloured = (
-        one._replace(matched=colour, colour=shared[0] if counts else next(diffused))
-        for one, colour, counts in zip(matches, matched_colours, full)
-    )
-    return replace(found, prior=prior, matches=tuple(coloured))
-
-
-def _priors(inputs: Inputs) -> tuple[float, ...]:
+def priors(inputs: Inputs) -> tuple[float, ...]:
     """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
     straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
     lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
@@ -273,9 +205,9 @@ class Agreement(NamedTuple):
         return cls(inverse_depth[None].to(like), taken.any(0)[None], facts.to(like))
 
 
-def agreed(inputs: Inputs, found: Sequence[SemiGlobalMatches]) -> list[SemiGlobalMatches]:
+def agreed(inputs: Inputs, matches: Matches) -> Matches:
     """The matches of each beta, with `disparity` and `facts` from the inverse depths on which all agree."""
-
+    found = matches.betas
     between = ambiguities(inputs, found)
 
     def at(i: int, rows: tuple[int, int]) -> MatchedBeta:
@@ -285,10 +217,10 @@ def agreed(inputs: Inputs, found: Sequence[SemiGlobalMatches]) -> list[SemiGloba
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
-    return [_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas]
+    return Matches(tuple(_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas))
 
 
-def ambiguities(inputs: Inputs, found: Sequence[SemiGlobalMatches]) -> list[Ambiguity]:
+def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]:
     """Of each beta against the one whose matches tell most: none, unless clearly more pixels agree with one."""
     step = max(inputs.hw[0] // SAMPLED_ROWS // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
@@ -310,7 +242,7 @@ class _Sampled(NamedTuple):
     pixels_per_w: Tensor
 
     @classmethod
-    def of(cls, beta: Beta, found: SemiGlobalMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
+    def of(cls, beta: Beta, found: BetaMatches, rows: Sequence[tuple[int, int]]) -> _Sampled:
         parts = []
         for pair in rows:
             view = MatchedBeta.of(beta, found, pair)
@@ -383,8 +315,8 @@ def _of_beta(
     at: Callable[[tuple[int, int]], MatchedBeta],
     agreement: Agreement,
     strips: list[tuple[int, int]],
-    own: SemiGlobalMatches,
-) -> SemiGlobalMatches:
+    own: BetaMatches,
+) -> BetaMatches:
     """The matches of the beta that is `at` some rows."""
     buffer = at(strips[0]).depth_buffer()
     for top, bottom in strips:
@@ -398,7 +330,7 @@ def _of_beta(
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
-    return own._replace(disparity=disparity, facts=facts)
+    return replace(own, disparity=disparity, facts=facts)
 
 
 def _supported(views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:

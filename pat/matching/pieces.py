@@ -1,23 +1,15 @@
-"""Cutting frames into pieces with halos, and matching large frames piece by piece."""
+"""Cutting frames into pieces with halos, among them those in which large frames are matched."""
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
 from arraygeom.fields.grid import Box
 from arraygeom.pixels import HW
-
-from .inputs import Inputs
-from .semi_global import FINE, HalfSizeMatches, Normalisations, SemiGlobalMatches, matched_at_half_size
-
-LOG = logging.getLogger(__name__)
 
 MATCHING_HALO = 128
 """The halo of the pieces in which large frames are matched at full size, pixels."""
@@ -31,10 +23,6 @@ class Tile(NamedTuple):
 
     inner: Box
     outer: Box
-
-
-Match = Callable[[Inputs, HalfSizeMatches | None], SemiGlobalMatches]
-"""Matches inputs with one beta, given what is known of them at half the size."""
 
 
 def area(box: Box) -> int:
@@ -82,22 +70,6 @@ def matching_pieces(hw: HW, multiple: int) -> list[Tile]:
     return list(tiles_of(hw, sides_by_work(hw, MATCHING_HALO, multiple, MATCHED_AT_ONCE)[0], MATCHING_HALO))
 
 
-def matched_in_pieces(
-    inputs: Inputs, brightness: Callable[[Tensor], Tensor], normalisations: Normalisations, match: Match
-) -> SemiGlobalMatches:
-    """The matches of a frame with one beta; of a large one, from the inner parts of pieces that begin with matches of
-    the whole frame at half the size. Colours of those are stored as float16.
-
-    `brightness` makes of beta's bands what alpha is compared with; `normalisations` are those of whole images.
-    """
-    if len(matching_pieces(inputs.hw, inputs.multiple)) == 1:
-        return match(inputs, None)
-    (beta,) = inputs.betas
-    half = matched_at_half_size(inputs.alpha, brightness(beta.image), beta.field.of_blocks(FINE), normalisations.half)
-    parts = from_pieces(inputs.hw, inputs.multiple, lambda box: match(inputs.cut(box), half.cut(box)).stored())
-    return SemiGlobalMatches(*parts)
-
-
 def from_pieces(hw: HW, multiple: int, make: Callable[[Box], Iterable[Tensor]]) -> list[Tensor]:
     """Planes put together from the inner parts of the pieces in which a frame is matched. `make` gives those of a box;
     they may be smaller than it by whole factors."""
@@ -114,47 +86,3 @@ def from_pieces(hw: HW, multiple: int, make: Callable[[Box], Iterable[Tensor]]) 
             target[..., top:bottom, left:right] = part[..., y : y + bottom - top, x : x + right - left]
         del parts, part
     return found
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """The matches of each beta, and what else holds for a whole beta: `common`, one for each, and `prior`, the logits
-    by which colours of some count more than those of others."""
-
-    matches: tuple[SemiGlobalMatches, ...]
-    common: tuple[Any, ...]
-    prior: tuple[float, ...] = ()
-
-    @property
-    def nbytes(self) -> int:
-        """Memory held, of a large frame: as `stored`."""
-        colours = {id(part): part.numel() for found in self.matches for part in (found.matched, found.colour)}
-        return 2 * sum(colours.values()) + sum(found.disparity.nbytes + found.facts.nbytes for found in self.matches)
-
-    def cut(self, box: Box) -> Prepared:
-        """Of a part of alpha. Colour that several share, they share there too."""
-        parts, shared = [found.cut(box) for found in self.matches], dict[int, Tensor]()
-        for found, part in zip(self.matches, parts):
-            shared.setdefault(id(found.colour), part.colour)
-        matches = (part._replace(colour=shared[id(found.colour)]) for found, part in zip(self.matches, parts))
-        return replace(self, matches=tuple(matches))
-
-
-@torch.no_grad()
-def prepared(
-    inputs: Inputs,
-    common: Callable[[Inputs], Any],
-    comparison: Callable[[Any], tuple[Callable[[Tensor], Tensor], Normalisations]],
-    match: Callable[[Inputs, Any, HalfSizeMatches | None], SemiGlobalMatches],
-) -> Prepared:
-    """`common` of each beta, and by that its matches. Each beta for itself.
-
-    `comparison` gives by that the `brightness` and `normalisations` of `matched_in_pieces`.
-    """
-    betas = [inputs.of_beta(i) for i in range(len(inputs.betas))]
-    facts = tuple(common(one) for one in betas)
-    found = []
-    for i, (one, known) in enumerate(zip(betas, facts), 1):
-        LOG.info("matching beta %d of %d", i, len(betas))
-        found.append(matched_in_pieces(one, *comparison(known), lambda piece, half, f=known: match(piece, f, half)))
-    return Prepared(tuple(found), facts)

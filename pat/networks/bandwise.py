@@ -14,18 +14,11 @@ from dataclasses import asdict
 import torch
 from torch import Tensor, nn
 
-from ..matching.colour_transfer import matched_colours
-from ..matching.inputs import Beta, Inputs
-from ..matching.multiview import matched_together
-from ..matching.pieces import Prepared
-from ..matching.semi_global import FINE, Normalisations, SemiGlobalMatches
-from ..matching.spectral_mix import SpectralMix, coarse_mix, colours_of_bands
+from ..matching.inputs import Inputs
+from ..matching.matches import BetaMatches, Matches
 from .configs import BandwisePATConfig, GuidedPATConfig
 from .guided import BetaEstimate, Encoded, GuidedPAT, output_of
-from .protocol import FusionOutput, JoinsBands
-
-COARSELY = 400_000
-"""Pixels of alpha at most on which the bands' combination is found."""
+from .protocol import FusionOutput, JoinsBands, required
 
 
 class BandwisePAT(nn.Module):
@@ -34,6 +27,8 @@ class BandwisePAT(nn.Module):
     multiple = GuidedPAT.multiple
     equal_resolution = GuidedPAT.equal_resolution
     joins_bands: JoinsBands = "all"
+    bands: int | None = None
+    uses_matches, keeps_luminance = True, False
     halo = GuidedPAT.halo
     beta_halo = GuidedPAT.beta_halo
 
@@ -48,66 +43,30 @@ class BandwisePAT(nn.Module):
         """As of the network inside."""
         return self.single.working_bytes(alpha, betas)
 
-    def prepare(self, inputs: Inputs) -> Prepared:
-        """For each beta how its bands are combined and normalised, and by that its semi-global matches; the depth is
-        that on which all agree."""
-        return matched_together(inputs, self._combination, lambda found: (found[0].of, found[1]), _colours)
+    def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
+        """Fuse alpha with each band of each beta. Position, deviation and confidence are one for each beta.
 
-    def _combination(self, inputs: Inputs) -> tuple[SpectralMix, Normalisations]:
-        """The combination of the one beta's bands that is most like alpha, and how that is normalised."""
-        alpha, (beta,) = inputs.alpha, inputs.betas
-        factor = 2
-        while factor < self.multiple // 2 and alpha.shape[-2] * alpha.shape[-1] > COARSELY * factor**2:
-            factor *= 2
-        segments, blocks = (beta.field.of_blocks(side) for side in (factor, FINE * factor))
-        mix = coarse_mix(alpha, beta.image, segments, blocks, factor)
-        return mix, Normalisations.of(alpha, mix.of(beta.image))
+        Raises ValueError without matches.
+        """
+        return self.explain(inputs, required(matches, inputs))[0]
 
-    def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
-        """Fuse alpha with each band of each beta. Position, deviation and confidence are one for each beta."""
-        return self.explain(inputs, state)[0]
-
-    def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
+    def explain(self, inputs: Inputs, matches: Matches) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
-        state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
-        own, estimates = self._estimates(inputs, state)
-        parts = [
-            self._of_beta(own, inputs.alpha, estimate, found, mix)
-            for estimate, found, (mix, _) in zip(estimates, state.matches, state.common)
-        ]
+        alpha, own = inputs.alpha, self.single.encoder(inputs.alpha)
+        estimates = [self.single.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
+        parts = [self._of_beta(own, alpha, *one) for one in zip(estimates, matches.betas)]
         return output_of(torch.cat(parts, 1), estimates), estimates
 
-    def matched(self, inputs: Inputs) -> FusionOutput:
-        """Positions and their confidences alone: the image is alpha."""
-        return output_of(inputs.alpha, self._estimates(inputs, self.prepare(inputs))[1])
-
-    def _estimates(self, inputs: Inputs, state: Prepared) -> tuple[Encoded, list[BetaEstimate]]:
-        """Alpha's features, and the estimate of each beta."""
-        own, parts = self.single.encoder(inputs.alpha), zip(inputs.betas, state.matches, state.common)
-        estimates = [self.single.estimate(own, inputs.alpha, b, found, guide=mix.of) for b, found, (mix, _) in parts]
-        return own, estimates
-
-    def _of_beta(
-        self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, found: SemiGlobalMatches, mix: SpectralMix
-    ) -> Tensor:
+    def _of_beta(self, own: Encoded, alpha: Tensor, estimate: BetaEstimate, found: BetaMatches) -> Tensor:
         """One beta's bands at alpha's view.
 
         The network's result for each is counted from its local regression on alpha: where a band is unlike alpha,
         its difference from alpha differs even between similar pixels.
         """
-        base = found.colour[:, 0].to(alpha)
+        base, mix = found.colours[1][:, 0].to(alpha), found.comparison.mix
         bands = [
             regressed + self.single.blended(own, regressed, [estimate.beyond(base, i)])
             for i, regressed in enumerate((alpha + base).split(1, 1))
         ]
-        return mix.reconciled(torch.cat(bands, 1), alpha)
-
-
-def _colours(
-    alpha: Tensor, beta: Beta, found: SemiGlobalMatches, common: tuple[SpectralMix, Normalisations]
-) -> tuple[Tensor, Tensor]:
-    """The bands minus alpha at a beta's matches, and their weight."""
-    (mix, normalisations), where = common, (beta.field.straight, found.disparity, found.facts)
-    if beta.image.shape[1] == 1:
-        return matched_colours(alpha, beta.image, beta.image, *where, normalisations.whole)
-    return colours_of_bands(alpha, beta.image, *where, mix, normalisations.whole)
+        image = torch.cat(bands, 1)
+        return image if mix is None else mix.reconciled(image, alpha)

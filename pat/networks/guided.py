@@ -1,14 +1,14 @@
 """GuidedPAT: C3 attention from coarse to fine, colour guided by alpha.
 
-Our own network, for one alpha whose detail is to be preserved and betas that have colour. Semi-global matching
-(`pat.matching.semi_global`) finds each pixel's position along its segment; attention samples a short window around it
-at full size. The network estimates the confidence that the match is the point that alpha sees, propagates colour from
-pixels of high confidence to the others, and adds it to alpha.
+Our own network, for one alpha whose detail is to be preserved and betas that have colour. Matching (`pat.matching`)
+has found each pixel's position along its segment; attention samples a short window around it at full size. The network
+estimates the confidence that the match is the point that alpha sees, propagates colour from pixels of high confidence
+to the others, and adds it to alpha.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
@@ -19,21 +19,18 @@ from torch.nn.functional import avg_pool2d, conv2d, pixel_shuffle, pixel_unshuff
 from arraygeom import Local, Pair, Segments, View, lazily
 
 from ..attention import attend, attend_with_statistics
-from ..matching.colour_transfer import FILLS, likeness, matched_colours
+from ..matching.colour_transfer import FILLS, likeness
 from ..matching.inputs import Beta, Inputs
-from ..matching.multiview import matched_together
-from ..matching.pieces import Prepared
+from ..matching.matches import BetaMatches, Matches
 from ..matching.semi_global import (
     FINE,
     Extent,
-    Normalisations,
-    SemiGlobalMatches,
     matches,
 )
 from ..media.colour import luminance
 from .blocks import ResidualBlock, channels_last, conv, enlarge, plain, stacked
 from .configs import GuidedPATConfig
-from .protocol import FusionOutput, JoinsBands
+from .protocol import FusionOutput, JoinsBands, required
 from .windows import attend_to_windows
 
 COARSE = 4
@@ -115,6 +112,7 @@ class GuidedPAT(nn.Module):
     multiple = 16
     equal_resolution = True
     joins_bands: JoinsBands = "neighbours"
+    uses_matches = True
     halo = 640
     """Encoder 85, judge 176, confidence 8, propagation 148, context 180 and head 16: the sum, rounded up."""
     beta_halo = 96
@@ -122,6 +120,8 @@ class GuidedPAT(nn.Module):
     def __init__(self, config: GuidedPATConfig = GuidedPATConfig()) -> None:
         super().__init__()
         self.config = c = config
+        self.bands: int | None = c.bands
+        self.keeps_luminance = c.keep_luminance
         w2, w4, _, _ = c.widths
         self.encoder = Encoder(c.widths)
         self.fine_key = nn.Conv2d(w2, 4 * c.fine_dim, 1)
@@ -137,52 +137,31 @@ class GuidedPAT(nn.Module):
         most = max(betas, default=0)
         return max(350.0 * alpha, 145.0 * alpha + 100.0 * most) + 130.0 * alpha * max(len(betas) - 1, 0)
 
-    def prepare(self, inputs: Inputs) -> Prepared:
-        """Semi-global matches of each beta, and how its whole image is normalised.
-
-        Of several betas the depth is that on which all agree.
-        """
-        parts = self._in_parts(inputs)
-        full = [not parts and beta.image.shape[1] == self.config.bands for beta in inputs.betas]
-        return matched_together(inputs, _normalisations, lambda found: (brightness, found), _colours, full)
-
     def _in_parts(self, inputs: Inputs) -> bool:
         """Whether each beta has some of the bands, in order; else those with all of them show the same colours."""
         return all(beta.image.shape[1] != self.config.bands for beta in inputs.betas) or len(inputs.betas) == 1
 
-    def forward(self, inputs: Inputs, state: Prepared | None = None) -> FusionOutput:
+    def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha (B, 1, H, W) with the betas. The image has the betas' bands.
 
-        Raises ValueError if those do not add up to the configured number.
+        Raises ValueError if those do not add up to the configured number, and without matches.
         """
-        return self.explain(inputs, state)[0]
+        return self.explain(inputs, required(matches, inputs))[0]
 
-    def explain(self, inputs: Inputs, state: Prepared | None = None) -> tuple[FusionOutput, list[BetaEstimate]]:
+    def explain(self, inputs: Inputs, matches: Matches) -> tuple[FusionOutput, list[BetaEstimate]]:
         """The same, with the estimate of each beta, which training supervises."""
         parts = self._in_parts(inputs)
         bands = sum(beta.image.shape[1] for beta in inputs.betas)
         if parts and bands != self.config.bands:
             raise ValueError(f"the betas have {bands} bands in all, this network makes {self.config.bands}")
-        alpha = inputs.alpha
-        own, estimates = self._estimates(inputs, state)
+        alpha, own = inputs.alpha, self.encoder(inputs.alpha)
+        estimates = [self.estimate(own, alpha, *one) for one in zip(inputs.betas, matches.betas)]
         used = estimates if parts else [combined([e for e in estimates if e.colour.shape[1] == self.config.bands])]
         residual = self.blended(own, alpha, used)
         if self.config.keep_luminance:
             residual = residual - inputs.luminance * luminance(residual)
         output = output_of(alpha + residual, estimates)
         return (output if parts else output._replace(overall=used[0].confidence)), estimates
-
-    def matched(self, inputs: Inputs) -> FusionOutput:
-        """Positions and their confidences alone: the image is alpha."""
-        return output_of(inputs.alpha, self._estimates(inputs, None)[1])
-
-    def _estimates(self, inputs: Inputs, state: Prepared | None) -> tuple[Encoded, list[BetaEstimate]]:
-        """Alpha's features, and the estimate of each beta."""
-        state = state or self.prepare(inputs).cut((0, inputs.hw[0], 0, inputs.hw[1]))
-        alpha, own = inputs.alpha, self.encoder(inputs.alpha)
-        known = zip(inputs.betas, state.matches, state.common)
-        found = [self.estimate(own, alpha, b, _with_gradient(alpha, b, found, n)) for b, found, n in known]
-        return own, [e._replace(prior=prior) for e, prior in zip(found, state.prior)] if state.prior else found
 
     def blended(
         self, own: Encoded, alpha: Float[Tensor, "b 1 h w"], estimates: Sequence[BetaEstimate]
@@ -208,17 +187,10 @@ class GuidedPAT(nn.Module):
         choices = enlarge(colour, COARSE), *estimate.diffused.to(colour).unbind(1)
         return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
-    def estimate(
-        self,
-        own: Encoded,
-        alpha: Tensor,
-        beta: Beta,
-        found: SemiGlobalMatches,
-        *,
-        guide: Callable[[Tensor], Tensor] | None = None,
-    ) -> BetaEstimate:
-        """The estimate of one beta of any bands; `guide` is what of these is compared with alpha."""
-        of, exactly = guide or brightness, alpha.dtype if self.training else torch.float64
+    def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:
+        """The estimate of one beta of any bands."""
+        of, exactly = found.comparison.combined, alpha.dtype if self.training else torch.float64
+        bands, diffused = found.colours
         segments = _in_type(beta.field.straight, exactly)
         extent = Extent.of(segments)
         position = matches(segments, found.disparity, beyond_edge=True, extent=extent).movedim(-1, 1)
@@ -233,11 +205,11 @@ class GuidedPAT(nn.Module):
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
         logit = torch.where(peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, found.matched.to(value), (exact + EXACT_OFFSET).sigmoid())
+        colour = torch.lerp(value - alpha, bands.to(value), (exact + EXACT_OFFSET).sigmoid())
         alike = likeness(facts[0], LIKENESS)
-        return BetaEstimate(attended, deviation, peak, colour, found.colour, logit, choice, position, alike)
+        return BetaEstimate(attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior)
 
-    def _judged(self, own: Encoded, found: SemiGlobalMatches, facts: Tensor, valid: Tensor) -> Tensor:
+    def _judged(self, own: Encoded, found: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
         matched = torch.cat([avg_pool2d(found.disparity, FINE) / 64, found.facts], 1)
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
@@ -296,11 +268,6 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
     )
 
 
-def brightness(beta: Tensor) -> Tensor:
-    """What alpha is compared with."""
-    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
-
-
 class ConfidenceHead(nn.Sequential):
     """The logits of confidence, choices and the better match at full size, computed at half of it."""
 
@@ -350,31 +317,9 @@ def window_around(
     return Segments(middle + step, middle - step, segments.valid.expand(middle.shape[:-1]))
 
 
-def _with_gradient(
-    alpha: Tensor, beta: Beta, found: SemiGlobalMatches, normalisations: Normalisations
-) -> SemiGlobalMatches:
-    """The same matches; if the segments or images have a gradient, with colours that have it too."""
-    if not (torch.is_grad_enabled() and any(x.requires_grad for x in (beta.field.straight.end, beta.image, alpha))):
-        return found
-    return found._replace(matched=_colours(alpha, beta, found, normalisations)[0])
-
-
-def _colours(
-    alpha: Tensor, beta: Beta, found: SemiGlobalMatches, normalisations: Normalisations
-) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
-    """A beta's bands minus alpha at its matches, and their weight."""
-    where = beta.field.straight, found.disparity, found.facts
-    return matched_colours(alpha, brightness(beta.image), beta.image, *where, normalisations.whole)
-
-
 def _in_type(segments: Segments, kind: torch.dtype) -> Segments:
     """Segments as numbers of another type."""
     return Segments(segments.start.to(kind), segments.end.to(kind), segments.valid)
-
-
-def _normalisations(inputs: Inputs) -> Normalisations:
-    """How the one beta's brightness is brought to alpha's, of whole images."""
-    return Normalisations.of(inputs.alpha, brightness(inputs.betas[0].image))
 
 
 class Encoder(nn.Module):

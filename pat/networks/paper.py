@@ -18,6 +18,7 @@ from arraygeom.fields.grid import FieldOnGrid
 
 from ..attention.scores import Compared, peak_position
 from ..matching.inputs import Inputs
+from ..matching.matches import Matches
 from .authors import read_authors
 from .blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
@@ -40,6 +41,8 @@ class PAT(nn.Module):
     multiple = 1
     equal_resolution = False
     joins_bands: JoinsBands = "no"
+    bands: int | None = None
+    uses_matches = keeps_luminance = False
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
@@ -56,15 +59,15 @@ class PAT(nn.Module):
         network.load_state_dict(read.state)
         return network.eval().requires_grad_(False)
 
-    def forward(self, inputs: Inputs, state: None = None) -> FusionOutput:
-        """Fuse alpha with the betas, in the order the network was made for.
+    def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
+        """Fuse alpha with the betas, in the order the network was made for; matches are not used.
 
         Raises ValueError for another number of betas than configured, or channels that do not fit.
         """
-        return self.explain(inputs)[0]
+        return self.compare(inputs)[0]
 
-    def explain(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
-        """The fused image, and what attention compares in each beta, for a loss on its weights. Raises as `forward`."""
+    def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
+        """The fused image, and what attention compares in each beta. Raises as `forward`."""
         if len(inputs.betas) != self.config.betas:
             raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}")
         own = self.features(self._channels(inputs.alpha))
@@ -79,15 +82,12 @@ class PAT(nn.Module):
 
     def with_peaks(self, inputs: Inputs) -> tuple[FusionOutput, list[Tensor]]:
         """The fused image, and for each beta where the largest weight is (B, 2, H, W), beta's pixels."""
-        fused, compared = self.explain(inputs)
+        fused, compared = self.compare(inputs)
         return fused, [peak_position(c) for c in compared]
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""
         return 1600.0 * (alpha + sum(betas))
-
-    def prepare(self, inputs: Inputs) -> None:
-        """Nothing: each part of a frame is fused by itself."""
 
     def _channels(self, image: Tensor) -> Tensor:
         wanted = self.config.in_channels

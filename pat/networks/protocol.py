@@ -1,29 +1,19 @@
-"""What the fusion hands to a network, and what it gets back."""
+"""What a network is given and gives back."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
 from torch import Tensor
 
 from arraygeom.fields.grid import Box
 
+from ..attention.scores import Compared
 from ..matching.inputs import Inputs
-
-
-@runtime_checkable
-class State(Protocol):
-    """What a network has found out about whole images before parts of them are fused; opaque to the fusion."""
-
-    @property
-    def nbytes(self) -> int:
-        """Memory held."""
-        ...
-
-    def cut(self, box: Box) -> State:
-        """What belongs to a part of alpha."""
-        ...
+from ..matching.match import match
+from ..matching.matches import Matches
 
 
 class FusionOutput(NamedTuple):
@@ -56,8 +46,17 @@ JoinsBands = Literal["no", "neighbours", "all"]
 
 @runtime_checkable
 class FusionNetwork(Protocol):
-    """What `fuse` asks of a network."""
+    """What `fuse` asks of a network: what bands it makes, whether it uses matches, and to be called.
 
+    The rest says in what form the images are to come.
+    """
+
+    bands: int | None
+    """The bands of its image; None: whatever the betas have."""
+    uses_matches: bool
+    """Whether it is called with matches; then its confidence is a trained probability."""
+    keeps_luminance: bool
+    """Whether the luminance of its image is alpha's."""
     halo: int
     """How far around a pixel alpha's image, and the fields of its pixels, can matter, pixels."""
     beta_halo: int
@@ -74,10 +73,42 @@ class FusionNetwork(Protocol):
         """Memory that fusing so many pixels of alpha with so many of each beta takes, beside the inputs, measured."""
         ...
 
-    def prepare(self, inputs: Inputs) -> State | None:
-        """What must be known of whole images (of whole multiples) before parts of them are fused, if anything."""
+    def __call__(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
+        """Fuse. Raises ValueError without matches if it uses them."""
         ...
 
-    def __call__(self, inputs: Inputs, state: Any = None) -> FusionOutput:
-        """Fuse; without a state, one is prepared from these inputs."""
+
+@runtime_checkable
+class Explaining(Protocol):
+    """A network that says of each beta what it took it for, which training supervises."""
+
+    def explain(self, inputs: Inputs, matches: Any) -> tuple[FusionOutput, list[Any]]:
+        """Fuse, and the estimate of each beta."""
         ...
+
+
+@runtime_checkable
+class Comparing(Protocol):
+    """A network with C3 attention over the segments of its inputs, which training can supervise by geometry."""
+
+    def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
+        """Fuse, and what attention compares in each beta."""
+        ...
+
+
+def matched_for(network: FusionNetwork, inputs: Inputs) -> Matches | None:
+    """The matches that a network wants of these inputs, if any."""
+    return match(replace(inputs, bands=network.bands)) if network.uses_matches else None
+
+
+def fused_at_once(network: FusionNetwork, inputs: Inputs) -> FusionOutput:
+    """Whole inputs matched, if the network wants that, and fused."""
+    return network(inputs, matched_for(network, inputs))
+
+
+def required(matches: Matches | None, inputs: Inputs) -> Matches:
+    """The matches, if they are of these inputs. Raises ValueError if there are none, or others."""
+    if matches is None:
+        raise ValueError("this network fuses by matches: call it as network(inputs, match(inputs))")
+    matches.check(inputs.hw, len(inputs.betas))
+    return matches

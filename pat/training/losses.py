@@ -9,11 +9,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
-from pat.attention.scores import peak_position
-from pat.networks.bandwise import BandwisePAT
-from pat.networks.guided import BetaEstimate, GuidedPAT
-from pat.networks.paper import PAT
-from pat.networks.protocol import FusionOutput
+from pat.attention.scores import Compared, peak_position
+from pat.networks.guided import BetaEstimate
+from pat.networks.protocol import Comparing, Explaining, FusionNetwork, FusionOutput, fused_at_once, matched_for
 from pat.networks.weights import Network
 
 from .attention_loss import attention_loss
@@ -50,14 +48,16 @@ class Objective(nn.Module):
 
     def __init__(self, network: Network, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
+        if attention and not isinstance(network, Comparing):
+            raise ValueError(f"attention: {type(network).__name__} has no attention to supervise: leave it at 0")
         self.network = network
         self.image_loss = IMAGE_LOSSES[loss]
         self.attention = attention
 
     def forward(self, given: Sample) -> Tensor:
         """The loss of a group of samples."""
-        if isinstance(self.network, PAT) and self.attention:
-            fused, compared = self.network.explain(given.inputs)
+        if self.attention and isinstance(self.network, Comparing):
+            fused, compared = self.network.compare(given.inputs)
             where = attention_loss(compared, given.position, given.visible)
             return self.image_loss(fused.image, given.ground_truth) + self.attention * where
         fused, seen = explained(self.network, given)
@@ -65,11 +65,11 @@ class Objective(nn.Module):
         return loss + match_loss(seen, given) if seen else loss
 
 
-def explained(network: nn.Module, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
+def explained(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list[BetaEstimate]]:
     """The network's output, and its match in each beta if it reports it."""
-    if isinstance(network, (GuidedPAT, BandwisePAT)):
-        return network.explain(given.inputs, given.state)
-    return network(given.inputs), []
+    if not isinstance(network, Explaining):
+        return network(given.inputs), []
+    return network.explain(given.inputs, given.matches or matched_for(network, given.inputs))
 
 
 def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
@@ -84,14 +84,15 @@ def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
 
 
 @torch.no_grad()
-def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
+def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float]:
     """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth).
 
-    Of a PAT also `peaks`, the share of them where the largest weight is within a pixel of the true position.
+    Of networks that are `Comparing` also `peaks`, the share of them where the largest weight is within a pixel of the
+    true position.
     """
     psnr, near, peaks = [], [], []
     for given in samples:
-        fused, compared = network.explain(given.inputs) if isinstance(network, PAT) else (network(given.inputs), [])
+        fused, compared = _compared(network, given)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
         for where, visible in list(zip(given.position, given.visible))[:1]:
@@ -103,3 +104,9 @@ def validation(network: nn.Module, samples: list[Sample]) -> dict[str, float]:
     matched = float(torch.stack(near).nanmean()) if near else math.nan
     found = {"peaks": float(torch.stack(peaks).nanmean())} if peaks else {}
     return {"psnr": float(torch.stack(psnr).mean()), "matched": matched} | found
+
+
+def _compared(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list[Compared]]:
+    if isinstance(network, Comparing) and given.fields[0].pixels is not None:
+        return network.compare(given.inputs)
+    return fused_at_once(network, given.inputs), []

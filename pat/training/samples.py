@@ -27,8 +27,9 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 from arraygeom.sampling import Sampled
 from pat.matching.inputs import Inputs
+from pat.matching.matches import Matches
 from pat.media.colour import luminance
-from pat.networks.protocol import FusionNetwork
+from pat.networks.protocol import FusionNetwork, matched_for
 from pat.sensors import Clip, GaussianBlur, Jitter, Noise, Quantise, Step, augment, paper_cases, record
 from pat.synthesis.layered import ArrayBatch, LayeredScenes
 from pat.synthesis.photos import PhotoBank
@@ -58,8 +59,8 @@ class Sample(NamedTuple):
     ground_truth: Tensor
     position: list[Tensor]
     visible: list[Tensor]
-    state: Any = None
-    """What the network finds out before it computes anything with its weights (`FusionNetwork.prepare`), if known."""
+    matches: Matches | None = None
+    """Those of the betas, if they are known and the network uses some."""
 
     @property
     def inputs(self) -> Inputs:
@@ -160,13 +161,13 @@ class SampleSource:
 
 
 def made_ahead(samples: Iterator[list[Sample]], network: FusionNetwork) -> Iterator[list[Sample]]:
-    """The samples, with their state: those of the next step are made, and matched, while a step is computed.
+    """The samples, with their matches: those of the next step are made, and matched, while a step is computed.
 
     They do not depend on the network's weights, so that results are the same.
     """
 
     def following() -> list[Sample]:
-        return [part._replace(state=network.prepare(part.inputs)) for part in next(samples)]
+        return [part._replace(matches=matched_for(network, part.inputs)) for part in next(samples)]
 
     with ThreadPoolExecutor(1) as beside:
         coming = beside.submit(following)

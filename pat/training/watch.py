@@ -11,11 +11,12 @@ import torch
 from jaxtyping import Float
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.atomic import write_text
 from pat.media.images import write_image
+from pat.networks.protocol import FusionNetwork
 
 from .config import TrainConfig
 from .losses import explained
@@ -71,7 +72,7 @@ class Watch:
             for name in ("psnr", "matched"):
                 self.board.add_scalar(f"validation/{name}", facts[name], int(facts["step"]))
 
-    def show(self, network: nn.Module, samples: list[Sample], step: int) -> None:
+    def show(self, network: FusionNetwork, samples: list[Sample], step: int) -> None:
         """Images of the validation: beta, alpha, fused, ground truth, confidence, side by side."""
         sheet = contact_sheet(network, samples[:SHOWN])
         write_image(self.out / "images" / f"step-{step:06d}.png", sheet)
@@ -91,12 +92,12 @@ class Watch:
 
 
 @torch.no_grad()
-def contact_sheet(network: nn.Module, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
+def contact_sheet(network: FusionNetwork, samples: list[Sample]) -> Float[Tensor, "3 _ _"]:
     """One row for the first scene of each group: beta (three bands, or one), alpha, fused, ground truth, confidence."""
     return torch.cat([_row(network, given) for given in samples], -2).cpu()
 
 
-def _row(network: nn.Module, given: Sample) -> Tensor:
+def _row(network: FusionNetwork, given: Sample) -> Tensor:
     fused, _ = explained(network, given)
     beta = torch.cat([b[:1] for b in given.betas], 1)
     confidence = torch.stack([c[:1] for c in fused.confidence], 1).amin(1, keepdim=True)

@@ -33,6 +33,7 @@ from pat.fusion.tiles import fuse_tile
 from pat.fusion.views import Views
 from pat.matching.pieces import Tile
 from pat.media.images import read_image
+from pat.networks.protocol import matched_for
 from pat.networks.weights import load_weights
 from pat.systems import load_system, run_system
 
@@ -78,18 +79,18 @@ def measure(scale: float) -> dict[str, str]:
     small = rig(0.1)
     fuse(network, small, {n: image(i.shape[0], small[n].hw, 2) for n, i in images.items()}, alpha="narrow")
     begin = time.perf_counter()
-    state = network.prepare(frame.inputs)
+    matches = matched_for(network, frame.inputs)
     matching = time.perf_counter() - begin
     whole = Tile((0, hw[0], 0, hw[1]), (0, hw[0], 0, hw[1]))
     begin = time.perf_counter()
-    fuse_tile(network, frame, state, whole)
+    fuse_tile(network, frame, matches, whole)
     fusing = time.perf_counter() - begin
     with profile(activities=[ProfilerActivity.CPU]) as profiled:
-        fuse_tile(network, frame, state, whole)
+        fuse_tile(network, frame, matches, whole)
     own_times = {event.key: event.self_cpu_time_total / 1e6 for event in profiled.key_averages()}
     convolving = sum(t for name, t in own_times.items() if "conv" in name)
     with FlopCounterMode(display=False) as counter:
-        fuse_tile(network, frame, state, whole)
+        fuse_tile(network, frame, matches, whole)
     flops = sum(n for operation, n in counter.get_flop_counts()["Global"].items() if "conv" in str(operation))
     rate = matmul_rate()
     return {

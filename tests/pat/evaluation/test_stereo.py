@@ -114,6 +114,7 @@ class Matcher:
     """A network that finds every pixel `disparity` to the left, and gives the mean of beta's bands as confidence."""
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
+    bands, uses_matches, keeps_luminance = None, False, False
 
     def __init__(self, disparity):
         self.disparity, self.betas = disparity, []
@@ -121,10 +122,7 @@ class Matcher:
     def working_bytes(self, alpha, betas):
         return 0.0
 
-    def prepare(self, inputs):
-        return None
-
-    def __call__(self, inputs, state=None):
+    def __call__(self, inputs, matches=None):
         alpha, betas = inputs.alpha, inputs.betas
         self.betas.append([(b.image.shape[1], float(b.image.mean())) for b in betas])
         self.field = betas[0].field
@@ -213,14 +211,12 @@ class Onlooker:
     """A network that notes where it is told to look, and gives alpha back."""
 
     halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 1, True, "no"
+    bands, uses_matches, keeps_luminance = None, False, False
 
     def working_bytes(self, alpha, betas):
         return 0.0
 
-    def prepare(self, inputs):
-        return None
-
-    def __call__(self, inputs, state=None):
+    def __call__(self, inputs, matches=None):
         alpha, (beta,) = inputs.alpha, inputs.betas
         found = beta.field.at(torch.tensor([[20.0, 7.0]]))
         self.start, self.end = found.start[0].tolist(), found.end[0].tolist()

@@ -14,13 +14,14 @@ from arraygeom.fields.grid import FieldOnGrid
 from pat.evaluation.baseline import classical, non_local_means
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
+from pat.fusion.inputs import FrameInputs, Placement
 from pat.fusion.low_light import denoised, denoised_views, warped
+from pat.fusion.tiles import Tile, fuse_tile
 from pat.fusion.views import Views
 from pat.matching.inputs import Beta, Inputs
 from pat.media.colour import luminance
 from pat.networks import denoiser
 from pat.networks.denoiser import NoisyView
-from pat.networks.positions import Found, WithPositions
 from pat.networks.protocol import FusionOutput
 from pat.networks.weights import load_weights
 from pat.sensors import NoiseLevel, generator_for
@@ -196,7 +197,8 @@ def test_betas_are_mixed_by_confidence():
     where = torch.stack(torch.meshgrid(torch.arange(5.0), torch.arange(4.0), indexing="xy"), -1)
     seen = torch.zeros(4, 5)
     seen[:, 2:] = 0.9
-    mixed, confidence = warped([one, other], [Found(where, seen), Found(where, 0.9 - seen)])
+    found = torch.stack([torch.cat([where.movedim(-1, 0), c[None]]) for c in (seen, 0.9 - seen)])
+    mixed, confidence = warped([one, other], found)
     torch.testing.assert_close(mixed.recorded[0, 0, :, 2:], torch.full((4, 3), 0.2), atol=1e-4, rtol=0)
     torch.testing.assert_close(mixed.recorded[0, 0, :, :2], torch.full((4, 2), 0.8), atol=1e-4, rtol=0)
     assert float(confidence.min()) == pytest.approx(0.9)
@@ -205,11 +207,18 @@ def test_betas_are_mixed_by_confidence():
 def test_positions_of_parts_are_in_the_whole_betas(network, monkeypatch):
     ones = torch.ones(1, 2, 4, 5)
     output = FusionOutput(torch.zeros(1, 3, 4, 5), [ones], [ones[:, 0]], [0.5 * ones[:, 0]])
-    monkeypatch.setattr(network, "forward", lambda inputs, state=None: output)
+    monkeypatch.setattr(network, "forward", lambda inputs, matches=None: output)
     field = FieldOnGrid.of(Rectified(3.0), Pair(View(hw=(4, 5)), View(hw=(4, 5))))
     part = Beta(torch.zeros(1, 3, 4, 5), field, offset=(7, 2))
-    found = WithPositions(network)(Inputs(torch.zeros(1, 1, 4, 5), (part,)))
-    assert found.image[0, 3:, 1, 1].tolist() == [8.0, 3.0, 0.5]
+    frame = FrameInputs(
+        Inputs(torch.zeros(1, 1, 4, 5), (part,)),
+        [Placement(Pair(View(hw=(4, 5)), View(hw=(4, 5))), lambda x: x)],
+        (4, 5),
+    )
+    whole = (0, 4, 0, 5)
+    monkeypatch.setattr(Inputs, "cut", lambda self, box: self)
+    found = fuse_tile(network, frame, None, Tile(whole, whole)).found
+    assert found[0, :, 1, 1].tolist() == [8.0, 3.0, 0.5]
 
 
 def test_positions_are_those_of_the_matched_colours(network):

@@ -5,7 +5,8 @@ import torch
 
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
 from pat.matching.colour_transfer import diffused_from, matched_colours
-from pat.matching.semi_global import Normalisations, SemiGlobalMatches
+from pat.matching.matches import BetaMatches, Comparison
+from pat.matching.semi_global import Normalisations
 from pat.matching.subpixel import matched
 
 
@@ -42,9 +43,10 @@ def semi_global_matching(
     segments: Segments,
     blocks: Segments | None,
     normalisations: Normalisations | None = None,
-) -> SemiGlobalMatches:
-    """Matches of one beta, whose brightness is `guide`, and its colours by them, as `prepare` of the networks has."""
+) -> BetaMatches:
+    """Matches of one beta, whose brightness is `guide`, and its colours by them, as `match` has."""
     normalisations = normalisations or Normalisations.of(alpha, guide)
     disparity, facts = matched(alpha, guide, segments, blocks, normalisations)
     colours, weight = matched_colours(alpha, guide, beta, segments, disparity, facts, normalisations.whole)
-    return SemiGlobalMatches(disparity, facts, colours, diffused_from(colours, alpha, weight))
+    diffused = diffused_from(colours, alpha, weight)
+    return BetaMatches(disparity, facts, Comparison(None, normalisations), colours, diffused)

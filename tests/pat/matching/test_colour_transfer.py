@@ -25,7 +25,7 @@ def chroma_errors(
     alpha: torch.Tensor, beta: torch.Tensor, ground_truth: torch.Tensor, segments: list[Segments]
 ) -> list[torch.Tensor]:
     """How far colour differences are from the true ones: those at the matches, and beta's where it is."""
-    matched = semi_global_matching(alpha, luminance(beta), beta, *segments).matched
+    matched = semi_global_matching(alpha, luminance(beta), beta, *segments).bands
     found, given, true = (image - luminance(image) for image in (matched, beta, ground_truth))
     return [found - true, given - true]
 
@@ -100,7 +100,7 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
     tint = torch.tensor([1.0, 0.6, 0.3]).view(1, 3, 1, 1)
     alpha, beta, segments = beside(scene, 48)
     found = semi_global_matching(alpha, beta, beta * tint, *segments)
-    assert (found.matched + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
+    assert (found.bands + alpha - alpha * tint)[..., 80:].abs().mean() < 0.009
 
 
 def test_a_match_of_other_brightness_has_less_weight():
@@ -119,7 +119,7 @@ def test_a_match_of_one_band_has_alphas_detail_even_if_the_band_is_inverted():
     ground_truth = 0.8 - 0.6 * alpha
     beta = blurred(ground_truth, 1.5)
     here = in_place((96, 128))
-    found = semi_global_matching(alpha, beta, beta, *here).matched + alpha
+    found = semi_global_matching(alpha, beta, beta, *here).bands + alpha
     left, lost = ((p - ground_truth)[..., 6:-6, 6:-6].abs().mean() for p in (found, beta))
     assert left < 0.7 * lost
 
@@ -150,7 +150,7 @@ def test_an_alpha_in_the_infrared_gives_no_detail():
     beta = scene * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
     infrared = faint(9, contrast=0.12, blur=1.5)[..., :128]
     found = semi_global_matching(infrared, luminance(beta), beta, *in_place((64, 128)))
-    chroma = [image - luminance(image) for image in (found.matched, beta)]
+    chroma = [image - luminance(image) for image in (found.bands, beta)]
     assert (chroma[0] - chroma[1]).abs().mean() < 0.3 * (chroma[1] - chroma[1].mean((2, 3), keepdim=True)).abs().mean()
 
 

@@ -14,6 +14,7 @@ from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
 from pat.matching import multiview as several
 from pat.matching import pieces
+from pat.matching.match import located, match
 from pat.matching.multiview import SUPPORT, MatchedBeta, can_agree
 from pat.matching.pieces import tiles_of
 from pat.media.colour import luminance
@@ -78,7 +79,7 @@ def test_two_colour_cameras_on_opposite_sides_see_more_than_either(network, scen
 def test_of_betas_of_equal_confidence_that_as_bright_as_alpha_counts_more(network, scene, monkeypatch):
     rig, images, _ = scene
     inputs = frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
-    one, other = network.explain(inputs)[1]
+    one, other = network.explain(inputs, match(inputs))[1]
     bright, dark = (
         e._replace(
             colour=torch.full_like(e.colour, v), logit=torch.ones_like(e.logit), likeness=torch.full_like(e.likeness, v)
@@ -94,7 +95,7 @@ def test_of_betas_alike_that_with_less_parallax_counts_more(network, scene):
     rig, images, _ = scene
     wider = Rig({**rig.cameras, "far": camera(-0.5)}, depth=(NEAR, FAR))
     views = Views.of(wider, images | {"far": seen_from(-0.5)}, alpha="mono")
-    left, right, distant = network.prepare(frame_inputs(network, views).inputs).prior
+    left, right, distant = (found.prior for found in match(frame_inputs(network, views).inputs).betas)
     assert left == pytest.approx(right, abs=0.05)
     assert max(left, right) == 0
     assert distant - left == pytest.approx(-2 * math.log(2), abs=0.25)
@@ -153,12 +154,12 @@ def test_a_part_of_the_inputs_has_the_tracks_of_the_whole(network, scene):
 
 def test_shared_colour_counts_once(network, scene):
     rig, images, _ = scene
-    state = network.prepare(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs)
-    one, other = state.matches
-    assert one.colour is other.colour
-    assert state.nbytes == H * W * (2 * (4 + 3) + 2 * 2 * 3 + 2 * 6)
-    one, other = state.cut((0, 32, 0, 64)).matches
-    assert one.colour is other.colour
+    matches = match(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs)
+    one, other = matches.betas
+    assert one.diffused is other.diffused
+    assert matches.nbytes == H * W * (2 * (4 + 3) + 2 * 2 * 3 + 2 * 6)
+    one, other = matches.cut((0, 32, 0, 64)).betas
+    assert one.diffused is other.diffused
 
 
 def test_a_band_camera_beside_a_colour_camera_gives_better_depth(network, scene):
@@ -238,17 +239,17 @@ def test_betas_whose_lengths_do_not_fit_agree_all_the_same(network, scene):
     )
     assert score(found, ground_truth).psnr > score(true, ground_truth).psnr - 0.5
     inputs = frame_inputs(network, Views.of(Rig(wrong, depth=(NEAR, 2 * FAR)), images, alpha="mono")).inputs
-    alone = prepared_alone(network, inputs)
+    alone = located_alone(inputs)
     scales = sorted(a.scale for a in several.ambiguities(inputs, alone))
     assert 1.0 in scales
     assert scales[1] / scales[0] == pytest.approx(1.6, rel=0.05)
     inputs = frame_inputs(network, Views.of(Rig(cameras, depth=(NEAR, FAR)), images, alpha="mono")).inputs
-    assert several.ambiguities(inputs, prepared_alone(network, inputs)) == [several.NO_AMBIGUITY] * 2
+    assert several.ambiguities(inputs, located_alone(inputs)) == [several.NO_AMBIGUITY] * 2
 
 
-def prepared_alone(network, inputs):
+def located_alone(inputs):
     """Each beta's own matches."""
-    return [network.prepare(inputs.of_beta(i)).matches[0] for i in range(len(inputs.betas))]
+    return [located(inputs.of_beta(i)).betas[0] for i in range(len(inputs.betas))]
 
 
 def test_a_plane_is_no_ambiguity():

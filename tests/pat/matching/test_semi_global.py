@@ -20,9 +20,9 @@ from arraygeom import (
     rotation_from_vector,
 )
 from pat.matching import semi_global_numba as kernels
+from pat.matching.matches import BetaMatches
 from pat.matching.semi_global import (
     Normalisation,
-    SemiGlobalMatches,
     equalising_blurs,
     length_of,
     matched_at_half_size,
@@ -32,6 +32,8 @@ from pat.support.memory import limited
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
 HW = (64, 96)
+
+PARTS = ("disparity", "facts", "bands", "diffused")
 
 
 def slow_aggregate(cost: np.ndarray, guide: np.ndarray) -> np.ndarray:
@@ -142,7 +144,7 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
     assert off.median() < 0.5
     assert (off < 1.5).float().mean() > 0.95
     wanted = alpha[0] * torch.tensor([1.0, 0.6, 0.3]).view(3, 1, 1).double() - alpha[0]
-    for colour in (found.matched[0], *found.colour[0]):
+    for colour in (found.bands[0], *found.diffused[0]):
         assert (colour - wanted)[:, seen].abs().mean() < 0.03
 
 
@@ -157,7 +159,7 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
         again = semi_global_matching(*call)
     finally:
         torch.set_num_threads(threads)
-    assert all(torch.equal(a, b) for a, b in zip(whole, again))
+    assert all(torch.equal(getattr(whole, part), getattr(again, part)) for part in PARTS)
     monkeypatch.setattr(pat.matching.semi_global, "BLOCK", 16)
     monkeypatch.setattr(pat.matching.semi_global, "MOST_COSTS", 0)
     pieces = semi_global_matching(*call)
@@ -214,8 +216,8 @@ def test_a_batch_is_its_images_one_by_one():
     one = semi_global_matching(alpha, beta, beta, fine, coarse)
     other = semi_global_matching(alpha.flip(-1), beta.flip(-1), beta.flip(-1), fine, coarse)
     both = semi_global_matching(*(torch.cat([p, p.flip(-1)]) for p in (alpha, beta, beta)), fine, coarse)
-    for a, b, c in zip(one, other, both):
-        assert torch.equal(torch.cat([a, b]), c)
+    for part in PARTS:
+        assert torch.equal(torch.cat([getattr(one, part), getattr(other, part)]), getattr(both, part))
 
 
 def test_no_segment_is_nothing_found():
@@ -223,16 +225,16 @@ def test_no_segment_is_nothing_found():
     nowhere = [Segments(v, v, torch.zeros(v.shape[:-1], dtype=torch.bool)) for v in (x, x[:, ::2, ::2])]
     found = semi_global_matching(torch.rand(1, 1, 32, 48), torch.rand(1, 1, 32, 48), torch.rand(1, 3, 32, 48), *nowhere)
     assert found.disparity.abs().max() == 0
-    assert found.colour.isfinite().all()
+    assert found.diffused.isfinite().all()
 
 
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
-    cut = SemiGlobalMatches(whole - 1, half, whole + 1, whole).cut((4, 10, 2, 16))
+    cut = BetaMatches(whole - 1, half, None, whole + 1, whole).cut((4, 10, 2, 16))
     assert torch.equal(cut.disparity, whole[..., 4:10, 2:16] - 1)
     assert torch.equal(cut.facts, half[..., 2:5, 1:8])
-    assert torch.equal(cut.colour, whole[..., 4:10, 2:16])
-    assert torch.equal(cut.matched, whole[..., 4:10, 2:16] + 1)
+    assert torch.equal(cut.diffused, whole[..., 4:10, 2:16])
+    assert torch.equal(cut.bands, whole[..., 4:10, 2:16] + 1)
 
 
 def test_the_sharper_of_two_images_is_blurred_whichever_it_is():

@@ -97,7 +97,7 @@ def test_their_outputs_image_and_attention(case):
     facts, network, image, attention = case
     alpha, betas, positions = made_inputs(facts)
     fields = [listed(p, facts["alpha"][1]) for p in positions]
-    fused, compared = network.explain(Inputs.of(alpha, betas, fields))
+    fused, compared = network.compare(Inputs.of(alpha, betas, fields))
     assert np.abs(fused.image.numpy() - image).max() < 1e-9
     for one, where, wanted in zip(compared, positions, attention, strict=True):
         x, y = where.long().unbind(-1)

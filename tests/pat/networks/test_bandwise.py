@@ -11,6 +11,7 @@ from pat.fusion.steps import co_located
 from pat.matching.inputs import Inputs
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig
+from pat.networks.protocol import fused_at_once
 from pat.networks.weights import save_weights
 from tests.pat.matching.test_spectral_mix import texture
 
@@ -37,8 +38,8 @@ def test_permuting_betas_of_one_band_permutes_the_output_bands(network):
     )
     order = [2, 0, 1, 3]
     with torch.no_grad():
-        first = network(Inputs.of(alpha, bands, fields))
-        second = network(Inputs.of(alpha, [bands[i] for i in order], [fields[i] for i in order]))
+        first = fused_at_once(network, Inputs.of(alpha, bands, fields))
+        second = fused_at_once(network, Inputs.of(alpha, [bands[i] for i in order], [fields[i] for i in order]))
     assert first.image.shape == (2, 4, *HW)
     assert torch.equal(second.image, first.image[:, order])
     assert all(torch.equal(second.confidence[k], first.confidence[i]) for k, i in enumerate(order))
@@ -52,7 +53,7 @@ def test_permuting_the_bands_of_a_beta_permutes_the_output_bands(network, count)
     alpha, beta = scene[:, :1, :, :-8] * 0.4 + scene[:, 1:2, :, :-8] * 0.6, scene[..., 8:]
     there = [FieldOnGrid.of(Rectified(16.0, alpha_is="left"), Pair(View(hw=hw), View(hw=hw)))]
     with torch.no_grad():
-        first, second = (network(Inputs.of(alpha, [b], there)) for b in (beta, beta[:, order]))
+        first, second = (fused_at_once(network, Inputs.of(alpha, [b], there)) for b in (beta, beta[:, order]))
     assert torch.equal(second.image, first.image[:, order])
     assert torch.equal(second.position[0], first.position[0])
     assert len(first.confidence) == 1

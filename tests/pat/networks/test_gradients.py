@@ -1,17 +1,15 @@
-"""The paper's network as a function of the rig: gradients through fields and attention, and a rotation found by them."""
+"""The paper's network as a function of the rig: gradients through fields and attention."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
 from functools import cache
 
 import pytest
 import torch
 
-from arraygeom import Camera, Curved, Epipolar, EpipolarLine, Pair, Pose, intrinsics, pixel_grid, rotation_from_vector
-from arraygeom.fields.grid import FieldOnGrid
+from arraygeom import Camera, Curved, Epipolar, EpipolarLine, Pair, Pose, intrinsics, rotation_from_vector
 from arraygeom.distortion import Distortion
+from arraygeom.fields.grid import FieldOnGrid
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT

@@ -10,6 +10,7 @@ from pat.media.colour import luminance
 from pat.networks import guided
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT, window_around
+from pat.networks.protocol import fused_at_once, matched_for
 
 SMALL = GuidedPATConfig(widths=(8, 8, 8, 8))
 HW = (32, 48)
@@ -29,7 +30,7 @@ def test_luminance_is_alphas():
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
     alpha, beta = torch.rand(2, 1, *HW), torch.rand(2, 3, 32, 64)
-    fused = network(Inputs.of(alpha, [beta], [rectified((32, 64))]))
+    fused = fused_at_once(network, Inputs.of(alpha, [beta], [rectified((32, 64))]))
     assert (luminance(fused.image) - alpha).abs().max() < 1e-5
     assert (fused.image - alpha).abs().max() > 1e-2
 
@@ -39,8 +40,8 @@ def test_three_filtered_cameras_serve_as_one():
     torch.manual_seed(0)
     network = lively(GuidedPAT(SMALL))
     alpha, grey = torch.rand(1, 1, *HW), torch.rand(1, 1, *HW)
-    one = network(Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
-    three = network(Inputs.of(alpha, [grey] * 3, [rectified()] * 3))
+    one = fused_at_once(network, Inputs.of(alpha, [grey.expand(-1, 3, -1, -1)], [rectified()]))
+    three = fused_at_once(network, Inputs.of(alpha, [grey] * 3, [rectified()] * 3))
     assert (one.image - three.image).abs().max() < 1e-5
     assert len(three.confidence) == 3
 
@@ -48,7 +49,7 @@ def test_three_filtered_cameras_serve_as_one():
 def test_bands_must_add_up():
     network = GuidedPAT(SMALL)
     with pytest.raises(ValueError, match="2 bands in all, this network makes 3"):
-        network(Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()]))
+        fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 2, *HW)], [rectified()]))
 
 
 def test_the_window_stays_around_the_match():
@@ -67,10 +68,11 @@ def test_gradients_reach_the_rig():
     camera = Camera(K=intrinsics(60.0, HW), cam_from_world=Pose.identity(), hw=HW)
     beta = camera.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), translation))
     depth = tuple(torch.tensor(d, dtype=torch.float64) for d in (1.0, 8.0))
-    fused = network(
+    fused = fused_at_once(
+        network,
         Inputs.of(
             torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [FieldOnGrid.of(Epipolar(), Pair(camera, beta, depth))]
-        )
+        ),
     )
     fused.image.square().sum().backward()
     assert translation.grad is not None
@@ -83,7 +85,7 @@ def test_no_valid_segment_is_no_confidence():
     network = lively(GuidedPAT(SMALL))
     pair = Pair(View(hw=HW), View(hw=HW))
     nowhere = FieldOnGrid.of(lambda _, x: Segments(x, x, torch.zeros_like(x[..., 0], dtype=torch.bool)), pair)
-    fused = network(Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere]))
+    fused = fused_at_once(network, Inputs.of(torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)], [nowhere]))
     assert fused.confidence[0].max() == 0
     assert fused.image.isfinite().all()
 
@@ -94,7 +96,8 @@ def test_without_a_head_the_image_is_what_was_matched_and_propagated():
     assert not [name for name in network.state_dict() if name.startswith(("head", "propagate"))]
     alpha, beta = torch.rand(1, 1, *HW), torch.rand(1, 3, *HW)
     torch.nn.init.constant_(network.confidence[2].bias, 20.0)
-    fused, (seen,) = network.explain(Inputs.of(alpha, [beta], [rectified()]))
+    inputs = Inputs.of(alpha, [beta], [rectified()])
+    fused, (seen,) = network.explain(inputs, matched_for(network, inputs))
     assert seen.logit.max() > 15
     assert torch.allclose(fused.image - alpha, seen.colour, atol=1e-3)
 
@@ -105,7 +108,8 @@ def test_colour_counts_more_where_brightness_is_alike():
     network = GuidedPAT(SMALL)
     beta = torch.full((1, 3, *HW), 0.5)
     alike, unlike = (
-        network.explain(Inputs.of(torch.full((1, 1, *HW), value), [beta], [rectified()]))[1][0] for value in (0.5, 0.9)
+        network.explain(inputs, matched_for(network, inputs))[1][0]
+        for inputs in (Inputs.of(torch.full((1, 1, *HW), value), [beta], [rectified()]) for value in (0.5, 0.9))
     )
     inside = (..., slice(16, 40))
     assert (alike.likeness[inside] > 0.99).all()
@@ -124,6 +128,6 @@ def test_features_are_as_exact_as_the_image_and_positions_more(monkeypatch):
 
     monkeypatch.setattr(guided, "attend_with_statistics", noted)
     images = torch.rand(1, 1, *HW), [torch.rand(1, 3, *HW)]
-    found = lively(GuidedPAT(SMALL)).eval()(Inputs.of(*images, [rectified()]))
+    found = fused_at_once(lively(GuidedPAT(SMALL)).eval(), Inputs.of(*images, [rectified()]))
     assert asked == [{torch.float32, torch.float64}]
     assert found.position[0].dtype == torch.float64

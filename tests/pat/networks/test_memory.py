@@ -13,9 +13,10 @@ from arraygeom import Camera, Pose, Rig, intrinsics
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views
+from pat.matching.match import compared
+from pat.matching.matches import BetaMatches, Matches
 from pat.matching.multiview import agreed
-from pat.matching.pieces import Prepared, Tile
-from pat.matching.semi_global import SemiGlobalMatches
+from pat.matching.pieces import Tile
 from pat.networks.weights import load_weights
 from pat.support.memory import give_back, limited, peak_memory, resident
 
@@ -42,10 +43,17 @@ def found_in(inputs):
     """Matches as they might be found; diffused colour is shared."""
     (h, w), n = inputs.hw, len(inputs.betas)
     fills = torch.rand(1, 2, 3, h, w)
-    return [
-        SemiGlobalMatches(5 * torch.rand(1, 1, h, w), torch.rand(1, 3, h // 2, w // 2), torch.rand(1, 3, h, w), fills)
-        for _ in range(n)
+    made = [
+        BetaMatches(
+            5 * torch.rand(1, 1, h, w),
+            torch.rand(1, 3, h // 2, w // 2),
+            compared(inputs.of_beta(i)),
+            torch.rand(1, 3, h, w),
+            fills,
+        )
+        for i in range(n)
     ]
+    return Matches(tuple(made))
 
 
 def growth(work):
@@ -71,8 +79,8 @@ def bytes_to_agree(betas):
 def bytes_of_a_tile(betas):
     """Over those that are counted."""
     network, frame = frame_of(SIDE, betas)
-    tile, state = Tile(TILE, TILE), Prepared(tuple(found_in(frame.inputs)), (None,) * betas)
-    return growth(lambda: fuse_tile(network, frame, state, tile)) / working_memory(network, frame.inputs, tile)
+    tile, matches = Tile(TILE, TILE), found_in(frame.inputs)
+    return growth(lambda: fuse_tile(network, frame, matches, tile)) / working_memory(network, frame.inputs, tile)
 
 
 JOBS = {"agree": bytes_to_agree, "tile": bytes_of_a_tile}

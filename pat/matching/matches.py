@@ -1,0 +1,130 @@
+"""What matching has found: of each beta where alpha's pixels are in it, and its bands there."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from arraygeom import Segments
+from arraygeom.fields.grid import Box
+from arraygeom.pixels import HW
+from arraygeom.sampling import on_image
+
+from ..media.colour import luminance
+from .semi_global import FINE, Normalisations, matches
+from .spectral_mix import SpectralMix
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What of a beta's bands is compared with alpha, and how that is brought to alpha's level and sharpness.
+
+    mix: the combination of bands that alpha sees; None: Rec. 601 luma of three bands, the mean of others.
+    normalisations: of the combination, for whole images.
+    """
+
+    mix: SpectralMix | None
+    normalisations: Normalisations
+
+    @classmethod
+    def of(
+        cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b c hb wb"], mix: SpectralMix | None
+    ) -> Comparison:
+        """That of whole images of even sides, by this mix."""
+        return cls(mix, Normalisations.of(alpha, combined_bands(beta, mix)))
+
+    def combined(self, beta: Float[Tensor, "b c hb wb"]) -> Float[Tensor, "b 1 hb wb"]:
+        """The combination of beta's bands, or of a part of it."""
+        return combined_bands(beta, self.mix)
+
+
+def combined_bands(beta: Float[Tensor, "b c h w"], mix: SpectralMix | None = None) -> Float[Tensor, "b 1 h w"]:
+    """The bands as this mix combines them; without one Rec. 601 luma of three bands, the mean of others."""
+    if mix is not None:
+        return mix.of(beta)
+    return luminance(beta) if beta.shape[1] == 3 else beta.mean(1, keepdim=True)
+
+
+@dataclass(frozen=True)
+class BetaMatches:
+    """The matches of alpha's H x W pixels in one beta.
+
+    disparity: (B, 1, H, W), how far along its segment, from the end, the match is, pixels of beta; where no match is
+        consistent, diffused from where one is.
+    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
+        others, and its cost; each 0 to 1.
+    comparison: what of beta was compared with alpha.
+    bands: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not; None
+        before they are transferred.
+    diffused: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
+    prior: how much more, as a logit, its colours count than another beta's.
+    """
+
+    disparity: Tensor
+    facts: Tensor
+    comparison: Comparison
+    bands: Tensor | None = None
+    diffused: Tensor | None = None
+    prior: float = 0.0
+
+    @property
+    def colours(self) -> tuple[Tensor, Tensor]:
+        """`bands` and `diffused`. Raises ValueError before they are transferred."""
+        if self.bands is None or self.diffused is None:
+            raise ValueError("these matches have no colours: give them those of their images by `transferred`")
+        return self.bands, self.diffused
+
+    def positions(self, segments: Segments, hw: HW) -> tuple[Float[Tensor, "b h w 2"], Bool[Tensor, "b h w"]]:
+        """The matches in a beta of this size (x, y), by the segments of alpha's pixels; whether they are on it."""
+        where = matches(segments, self.disparity, beyond_edge=True)
+        return where, segments.valid & on_image(where, hw)
+
+    def cut(self, box: Box) -> BetaMatches:
+        """The part at alpha's (top, bottom, left, right), all even."""
+        top, bottom, left, right = box
+        half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
+        whole = (..., slice(top, bottom), slice(left, right))
+        bands, diffused = (part if part is None else part[whole] for part in (self.bands, self.diffused))
+        return replace(self, disparity=self.disparity[whole], facts=self.facts[half], bands=bands, diffused=diffused)
+
+    def stored(self) -> BetaMatches:
+        """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
+        bands, diffused = self.colours
+        return replace(self, bands=bands.half(), diffused=diffused.half())
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Those of each beta, in order."""
+
+    betas: tuple[BetaMatches, ...]
+
+    @property
+    def hw(self) -> HW:
+        """Size of the alpha that they are of."""
+        return self.betas[0].disparity.shape[-2], self.betas[0].disparity.shape[-1]
+
+    @property
+    def nbytes(self) -> int:
+        """Memory held, of a large frame: colours as float16, those that betas share counted once."""
+        colours = {id(part): part.numel() for found in self.betas for part in found.colours}
+        return 2 * sum(colours.values()) + sum(found.disparity.nbytes + found.facts.nbytes for found in self.betas)
+
+    def cut(self, box: Box) -> Matches:
+        """Of a part of alpha. Colour that several betas share, they share there too."""
+        shared: dict[int, Tensor | None] = {}
+        parts = [(id(found.diffused), found.cut(box)) for found in self.betas]
+        for key, part in parts:
+            shared.setdefault(key, part.diffused)
+        return Matches(tuple(replace(part, diffused=shared[key]) for key, part in parts))
+
+    def check(self, hw: HW, betas: int) -> None:
+        """Raises ValueError unless they are of an alpha of this size and of so many betas."""
+        if self.hw != hw or len(self.betas) != betas:
+            (h, w), (height, width) = self.hw, hw
+            raise ValueError(
+                f"these matches are of {w}x{h} pixels in {len(self.betas)} betas, the images are {width}x{height} "
+                f"with {betas}: match these images"
+            )

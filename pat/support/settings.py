@@ -1,0 +1,61 @@
+"""The numbers that an algorithm was given: each with its kind, and where it is from, in a frozen dataclass.
+
+*physics*: follows from what is measured or from the recording; *size*: how much is done at a time, changes no result
+worth speaking of; *tuned*: chosen on images, which are named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import Field, field, fields
+from typing import Any, Literal, NamedTuple
+
+Kind = Literal["physics", "size", "tuned"]
+
+
+def physics(value: Any, why: str) -> Any:
+    """A field whose value follows from what is measured; `why` says from what."""
+    return _entry("physics", value, why)
+
+
+def size(value: Any, why: str) -> Any:
+    """A field that says how much is done at a time."""
+    return _entry("size", value, why)
+
+
+def tuned(value: Any, why: str) -> Any:
+    """A field whose value was chosen; `why` says on what, and what it does."""
+    return _entry("tuned", value, why)
+
+
+def _entry(kind: Kind, value: Any, why: str) -> Any:
+    return field(default=value, metadata={"kind": kind, "why": why})
+
+
+class Setting(NamedTuple):
+    """One entry of an algorithm's settings: its name, value, kind, and why it is so."""
+
+    algorithm: str
+    name: str
+    value: Any
+    kind: Kind
+    why: str
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers the value is."""
+        return len(self.value) if isinstance(self.value, tuple) else 1
+
+
+def listed(settings: Any) -> Iterator[Setting]:
+    """The entries of an algorithm's settings, in their order. Raises ValueError for one without a kind."""
+    name = type(settings).__name__
+    for entry in fields(settings):
+        yield Setting(name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"])
+
+
+def _kind(algorithm: str, entry: Field[Any]) -> Kind:
+    kind: Kind | None = entry.metadata.get("kind")
+    if kind is None:
+        raise ValueError(f"{algorithm}.{entry.name} is not said to be physics, size or tuned")
+    return kind

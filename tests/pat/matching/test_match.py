@@ -1,0 +1,119 @@
+"""The door of the room: matches of several sources, and what is refused."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from arraygeom import Camera, Pose, Rig, intrinsics
+from pat.fusion.fuse import fuse
+from pat.fusion.inputs import frame_inputs
+from pat.fusion.views import Views
+from pat.matching.match import located, match, transferred
+from pat.matching.matches import Matches
+from pat.media.colour import luminance
+from pat.networks.protocol import FusionOutput
+from pat.networks.weights import load_weights
+
+H, W = 64, 96
+DEPTH, BASELINE = 4.0, 0.25
+
+
+@pytest.fixture(scope="module")
+def network():
+    return load_weights("mono-colour-small")
+
+
+@pytest.fixture(scope="module")
+def flat():
+    """A wall at 4 m: every disparity is 6 pixels."""
+    camera = Camera(K=intrinsics(float(W), (H, W)), cam_from_world=Pose.identity(), hw=(H, W))
+    beside = camera.replace(cam_from_world=Pose(camera.R, camera.t.new_tensor([-BASELINE, 0.0, 0.0])))
+    noise = torch.rand(1, 3, H // 2, (W + 16) // 2, generator=torch.Generator().manual_seed(0))
+    wall = torch.nn.functional.interpolate(noise, size=(H, W + 16), mode="bicubic", align_corners=False)[0].clamp(0, 1)
+    images = {"mono": luminance(wall[..., :W]), "colour": wall[..., 6 : 6 + W]}
+    return Rig({"mono": camera, "colour": beside}, depth=(2.0, 50.0)), images
+
+
+@pytest.fixture(scope="module")
+def inputs(network, flat):
+    rig, images = flat
+    return frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
+
+
+def test_positions_are_where_the_wall_is(inputs):
+    (found,) = match(inputs).betas
+    where, valid = found.positions(inputs.betas[0].field.straight, (H, W))
+    columns = torch.arange(W).to(where)
+    inside = valid[0, :, 10:]
+    assert inside.float().mean() > 0.99
+    assert (where[0, :, 10:, 0] - (columns[10:] - 6))[inside].median().abs() < 0.1
+
+
+def test_matches_are_located_first_and_coloured_then(inputs):
+    whole, (bare,) = match(inputs), located(inputs).betas
+    assert bare.bands is None
+    with pytest.raises(ValueError, match="no colours"):
+        bare.colours  # noqa: B018
+    again = transferred(inputs, Matches((bare,)))
+    assert torch.equal(again.betas[0].bands, whole.betas[0].bands)
+
+
+def test_matches_from_a_file_take_the_place_of_those_found(network, flat, tmp_path):
+    """Disparities that are known are used as they are: depth is theirs, whatever the images show."""
+    rig, images = flat
+    other = {**images, "colour": torch.rand(3, H, W, generator=torch.Generator().manual_seed(1))}
+    path = tmp_path / "disparity.pt"
+    wanted = BASELINE * W / DEPTH
+    torch.save(torch.full((1, 1, H, W), wanted - BASELINE * W / 50.0), path)
+
+    def from_file(inputs):
+        (one,) = located(inputs).betas
+        disparity = torch.load(path, weights_only=True).to(one.disparity)
+        sure = torch.tensor([0.0, 1.0, 0.0])[:, None, None].expand_as(one.facts[0])[None]
+        return transferred(inputs, Matches((replace(one, disparity=disparity, facts=sure.to(one.facts)),)))
+
+    frame = fuse(network, rig, other, alpha="mono", matcher=from_file, align=False, response="rec601")
+    assert float((frame.depth[:, 10:] - DEPTH).abs().nanmedian()) < 1e-3
+
+
+def test_matches_of_other_inputs_are_refused(network, inputs):
+    found = match(inputs)
+    with pytest.raises(ValueError, match=r"of 48x64 pixels in 1 betas, the images are 96x64 with 1"):
+        network(inputs, found.cut((0, H, 0, 48)))
+    with pytest.raises(ValueError, match="in 2 betas"):
+        network(inputs, Matches(found.betas * 2))
+    with pytest.raises(ValueError, match="in 2 betas"):
+        transferred(inputs, Matches(found.betas * 2))
+
+
+def test_a_network_that_needs_matches_says_so(network, inputs):
+    with pytest.raises(ValueError, match="fuses by matches"):
+        network(inputs)
+
+
+class Plain:
+    """A network without matches: beta's colours at the middle of each segment."""
+
+    halo, beta_halo, multiple, equal_resolution, joins_bands = 0, 2, 2, True, "no"
+    bands, uses_matches, keeps_luminance = None, False, False
+
+    def working_bytes(self, alpha, betas):
+        return 8.0 * alpha
+
+    def __call__(self, inputs, matches=None):
+        assert matches is None
+        segments = inputs.betas[0].field.straight
+        middle = ((segments.start + segments.end) / 2).movedim(-1, 1)
+        none = inputs.alpha[:, 0] * 0
+        return FusionOutput(inputs.alpha.expand(-1, 3, -1, -1), [middle], [none], [none + 0.5])
+
+
+def test_a_network_without_matches_is_not_matched_for(flat):
+    def never(inputs):
+        raise AssertionError("no matches were asked for")
+
+    rig, images = flat
+    frame = fuse(Plain(), rig, images, alpha="mono", matcher=never)
+    assert frame.image.shape == (3, H, W)
+    assert float(frame.depth.nanmedian()) == pytest.approx(2 / (1 / 2 + 1 / 50), rel=0.01)
