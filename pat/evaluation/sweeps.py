@@ -10,7 +10,7 @@ import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float
@@ -39,9 +39,10 @@ from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
 
+from ..attention.scores import peak_position
 from ..matching.inputs import Inputs
 from ..media.colour import luminance
-from ..networks.paper import PAT
+from ..networks.protocol import Comparing
 from ..sensors import Clip, Noise, Quantise, generator_for, record
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
@@ -103,10 +104,11 @@ class Row(NamedTuple):
     note: str = ""
 
 
+@runtime_checkable
 class Way(Protocol):
     """Something other than a field: it is given the network, the calibration and the images."""
 
-    def fuse(self, network: PAT, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
         """The result at alpha's view. Raises ValueError for a rig that it is not for."""
         ...
 
@@ -117,7 +119,7 @@ class Directly:
 
     field: ReceptiveField
 
-    def fuse(self, network: PAT, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
         """The network with the field of the pair."""
         return fused(network, rig.pair(ALPHA, BETA), images[ALPHA], images[BETA], self.field)
 
@@ -128,7 +130,7 @@ class Resampled:
 
     field: ReceptiveField = Epipolar()  # noqa: RUF009 - frozen
 
-    def fuse(self, network: PAT, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
         """Raises ValueError where the pair cannot be rectified, as of a camera ahead of the other."""
         pair = rig.pair(ALPHA, BETA)
         found = rectify(pair)
@@ -160,7 +162,7 @@ FIELDS: dict[str, ReceptiveField | Way] = {
 
 
 def ablate(
-    network: PAT,
+    network: Comparing,
     rigs: Mapping[str, Rig] | Iterable[Point],
     fields: Mapping[str, ReceptiveField | Way] = FIELDS,
     *,
@@ -197,7 +199,7 @@ def _numbers(rig: Rig) -> bytes:
     return b"".join(t.numpy().tobytes() for c in two(rig).pair(ALPHA, BETA).cameras for t in (c.K, c.R, c.t))
 
 
-def _row(network: PAT, point: Point, name: str, field: ReceptiveField | Way, number: int, scene: Scene) -> Row:
+def _row(network: Comparing, point: Point, name: str, field: ReceptiveField | Way, number: int, scene: Scene) -> Row:
     way = field if hasattr(field, "fuse") else Directly(field)
     began = time.perf_counter()
     try:
@@ -212,11 +214,11 @@ def _row(network: PAT, point: Point, name: str, field: ReceptiveField | Way, num
 
 
 @torch.no_grad()
-def fused(network: PAT, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
+def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
     """The network on two images (C, H, W), whole."""
     inputs = Inputs.of(alpha[None], [beta[None]], [FieldOnGrid.of(field, pair, blocks=False)])
-    output, peaks = network.with_peaks(inputs)
-    return Result(output.image[0], peaks[0][0].movedim(0, -1).double())
+    output, compared = network.compare(inputs)
+    return Result(output.image[0], peak_position(compared[0])[0].movedim(0, -1).double())
 
 
 def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: str = "bicubic") -> Tensor:

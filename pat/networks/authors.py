@@ -63,7 +63,9 @@ def config_of(given: Mapping[str, Tensor]) -> PATConfig:
     sizes = {"betas": betas, "in_channels": in_channels, "out_channels": out_channels, "dim": dim, "scale": scale}
     if min(sizes.values()) < 1 or max(sizes.values()) > 1024:
         raise ValueError(f"it has {', '.join(f'{name} {n}' for name, n in sizes.items())}")
-    return PATConfig(**sizes, block_bias=False, fusion_bias=True, values_after_block=True)
+    layout = {"block_bias": False, "fusion_bias": True, "values_after_block": True}
+    # Their loaders enlarge beta to alpha's size.
+    return PATConfig(**sizes, **layout, equal_resolution=True)
 
 
 def renamed(given: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]:

@@ -17,7 +17,7 @@ class PATConfig:
     Where the authors' code has another layout: `block_bias` of residual blocks, `fusion_bias` of the 1x1 fusion, and
     `values_after_block`, values made of the features that keys are made of. `normalised` gives the features one more
     channel of every image, its luminance with the mean and the contrast of its surroundings taken away: what a grey
-    and a colour camera see alike.
+    and a colour camera see alike. `equal_resolution` has betas resized to about alpha's angular resolution first.
     """
 
     betas: int = 1
@@ -31,6 +31,7 @@ class PATConfig:
     fusion_bias: bool = False
     values_after_block: bool = False
     normalised: bool = False
+    equal_resolution: bool = False
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 
-from ..attention.scores import Compared, peak_position
+from ..attention.scores import Compared
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
 from .authors import read_authors
@@ -39,14 +39,13 @@ class PAT(nn.Module):
     """Features reach 59 pixels and post-fusion 10; the sum, rounded up."""
     beta_halo = 64
     multiple = 1
-    equal_resolution = False
     joins_bands: JoinsBands = "no"
     bands: int | None = None
     uses_matches = keeps_luminance = False
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
-        self.config = config
+        self.config, self.equal_resolution = config, config.equal_resolution
         self.features = Features(config)
         self.engine = AttentionEngine(config)
         self.post = PostFusion(config)
@@ -79,11 +78,6 @@ class PAT(nn.Module):
             image = image + self._enlarged(inputs.alpha)
         position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
         return FusionOutput(image, position, deviation, confidence), compared
-
-    def with_peaks(self, inputs: Inputs) -> tuple[FusionOutput, list[Tensor]]:
-        """The fused image, and for each beta where the largest weight is (B, 2, H, W), beta's pixels."""
-        fused, compared = self.compare(inputs)
-        return fused, [peak_position(c) for c in compared]
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""

@@ -12,10 +12,12 @@ from pat.networks.paper import PAT
 from pat.networks.weights import load_weights
 from tests.pat.networks.test_authors import authors_state, save
 
+LAYOUT = {"block_bias": False, "fusion_bias": True, "values_after_block": True, "equal_resolution": True}
+
 
 def network() -> PAT:
     torch.manual_seed(1)
-    return PAT(PATConfig(dim=8, block_bias=False, fusion_bias=True, values_after_block=True)).eval()
+    return PAT(PATConfig(dim=8, **LAYOUT)).eval()
 
 
 def test_imported_weights_fuse_as_the_network_does(tmp_path, capsys):

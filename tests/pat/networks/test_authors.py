@@ -19,6 +19,7 @@ from pat.networks.paper import PAT
 from pat.networks.weights import load_weights, save_weights
 
 CASES = ("two", "four", "two_x2")
+LAYOUT = {"block_bias": False, "fusion_bias": True, "values_after_block": True, "equal_resolution": True}
 
 
 def made_weights(shapes: dict[str, list[int]]) -> dict[str, torch.Tensor]:
@@ -72,7 +73,7 @@ def authors_state(network: PAT) -> dict[str, torch.Tensor]:
 
 def small(**options) -> PAT:
     torch.manual_seed(3)
-    return PAT(PATConfig(dim=8, block_bias=False, fusion_bias=True, values_after_block=True, **options))
+    return PAT(PATConfig(dim=8, **LAYOUT, **options))
 
 
 @pytest.fixture(params=CASES)
