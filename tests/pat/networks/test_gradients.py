@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import cache
 
 import pytest
@@ -10,9 +11,11 @@ import torch
 from arraygeom import Camera, Curved, Epipolar, EpipolarLine, Pair, Pose, intrinsics, rotation_from_vector
 from arraygeom.distortion import Distortion
 from arraygeom.fields.grid import FieldOnGrid
+from pat import fuse, load_weights
 from pat.matching.inputs import Inputs
 from pat.networks.configs import PATConfig
 from pat.networks.paper import PAT
+from tests.pat.layered_array import load_sample
 
 HW = (7, 9)
 FIELDS = {"epipolar": Epipolar(), "line": EpipolarLine(), "curved": Curved(5, nodes=8)}
@@ -58,3 +61,22 @@ def test_the_loss_is_differentiable_in_rotation_translation_K_and_lens(name):
     gradients = torch.autograd.grad(loss(*given), given)
     assert all(gradient.abs().max() > 1e-8 for gradient in gradients)
     assert torch.autograd.gradcheck(loss, given, eps=1e-7, atol=1e-6, rtol=1e-3, fast_mode=True)
+
+
+def test_a_rotation_is_recovered_by_optimising_through_attention_alone():
+    """The shipped weights: no matching but attention's, its only way to beta the field of the rig."""
+    sample = load_sample()
+    window = (slice(None), slice(104, 296), slice(192, 448))
+    images = sample.images | {"mono": sample.images["mono"][window]}
+    rig = sample.rig.crop("mono", 104, 192, (192, 256))
+    supervised = load_weights("pat-supervised")
+    assert not supervised.uses_matches
+    angle = torch.tensor(math.radians(0.3), dtype=torch.float64, requires_grad=True)
+    optimiser = torch.optim.Rprop([angle], lr=math.radians(0.13), etas=(0.3, 1.01))
+    for _ in range(10):
+        optimiser.zero_grad()
+        turned = rig.perturbed({"colour.rotation": angle * torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64)})
+        frame = fuse(supervised, turned, images, alpha="mono", align=False, differentiable=True)
+        (frame.image - sample.ground_truth[window]).square().mean().backward()
+        optimiser.step()
+    assert abs(math.degrees(angle.item())) < 0.02
