@@ -23,8 +23,16 @@ def pixel_grid(
     >>> pixel_grid((2, 3))[1, 2].tolist()
     [2.0, 1.0]
     """
+    return torch.stack(pixel_coordinates(hw, dtype=dtype, device=device), dim=-1)
+
+
+def pixel_coordinates(
+    hw: HW, *, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
+) -> tuple[Float[Tensor, "h w"], Float[Tensor, "h w"]]:
+    """x and y of the centres of all pixels of an image: views of a row and of a column, which take no memory."""
     rows, columns = (torch.arange(n, dtype=dtype, device=device) for n in hw)
-    return torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=-1)
+    x, y = torch.meshgrid(columns, rows, indexing="xy")
+    return x, y
 
 
 def resize_matrix(old: HW, new: HW) -> Float[Tensor, "3 3"]:

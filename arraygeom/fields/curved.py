@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
+from ..chunks import spans
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
 from ..rig import Pair
@@ -22,7 +23,7 @@ from ..segments import Positions, Segments, fractions_on_image, sample_fractions
 from ..threads import in_parallel
 from ..tracing import traced
 from ..undistortion import pinhole_view
-from .protocol import ReceptiveField, compilable
+from .protocol import PIECE, ReceptiveField, compilable
 from .straight import Epipolar
 
 
@@ -182,7 +183,7 @@ class _Curve(NamedTuple):
         fractions = (torch.linspace(0, 1, nodes, dtype=torch.float64), sample_fractions(samples, like=double))
         given = (*ends, self.valid.reshape(n).contiguous().numpy(), LensNumbers.of(self.beta, wide=self.wide))
         rest = (*(t.numpy() for t in fractions), self.beta.hw, xy, mask)
-        in_parallel([partial(curved_positions, i, min(i + PIECE, n), *given, *rest) for i in range(0, n, PIECE)])
+        in_parallel([partial(curved_positions, *span, *given, *rest) for span in spans(n, PIECE)])
         axes = self.valid.shape
         return Positions(
             torch.from_numpy(xy).reshape(*axes, samples, 2), torch.from_numpy(mask).reshape(*axes, samples)
@@ -236,8 +237,6 @@ class LensNumbers(NamedTuple):
         return cls(COMPILED_LENSES[lens.model], padded, lens.squared_limit, np.ascontiguousarray(K), wide)
 
 
-PIECE = 1 << 12
-"""Pixels of alpha that a thread takes at a time."""
 TINY = 1e-24
 """Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction."""
 

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Real
 from torch import Tensor
 
+from ..chunks import chunked, spans
 from ..epipolar import epipolar_lines
 from ..homography import apply_homography
 from ..pixels import HW, floating, pixel_grid
@@ -17,7 +18,7 @@ from ..rig import Pair
 from ..segments import Positions
 from ..threads import in_parallel
 from ..tracing import traced
-from .protocol import compilable
+from .protocol import PIECE, compilable
 from .straight import require_straight
 
 
@@ -59,8 +60,11 @@ class NearestVoxels:
         xy, mask, distance = self._choose(self._candidates(line, centre, beside), line, centre, pair)
         disparity = (beside + 0.5) * line[:, :2].abs().amax(-1)
         unsure = (distance.amax(-1) > disparity - TIE).nonzero()[:, 0]
-        for some in unsure.split(64):
-            xy[some], mask[some], _ = self._choose(self._window(centre[some]), line[some], centre[some], pair)
+
+        def in_window(line: Tensor, centre: Tensor) -> tuple[Tensor, Tensor]:
+            return self._choose(self._window(centre), line, centre, pair)[:2]
+
+        xy[unsure], mask[unsure] = chunked(in_window, line[unsure], centre[unsure], rows=64, axis=0)
         return xy, mask
 
     def _compiled(self, line: Tensor, centre: Tensor, usable: Tensor, hw: HW) -> tuple[Tensor, Tensor]:
@@ -72,7 +76,7 @@ class NearestVoxels:
         mask = torch.from_numpy(np.empty((n, self.count), bool))
         numbers = [part.contiguous().numpy() for part in (line, centre, usable)]
         rest = (self.window, xy.numpy().dtype.type(TIE / (hw[0] * hw[1])), hw, xy.numpy(), mask.numpy())
-        in_parallel([partial(nearest_pixels, i, min(i + PIECE, n), *numbers, *rest) for i in range(0, n, PIECE)])
+        in_parallel([partial(nearest_pixels, *span, *numbers, *rest) for span in spans(n, PIECE)])
         return xy, mask
 
     def _choose(self, xy: Tensor, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor, Tensor]:
@@ -109,8 +113,6 @@ class NearestVoxels:
         return centre[:, None] + grid.reshape(-1, 2)
 
 
-PIECE = 1 << 14
-"""Pixels of alpha that a thread takes at a time."""
 TIE = 1e-3
 """Distances closer than this, in pixels, count as equal."""
 

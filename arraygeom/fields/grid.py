@@ -8,15 +8,14 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from ..pixels import HW, pixel_grid
+from ..chunks import Box, chunked
+from ..pixels import HW, pixel_coordinates, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
 from .protocol import ReceptiveField, SamplingLocations, lazily
 
 At = Callable[[Tensor], SamplingLocations]
 """A field as a function of alpha's pixels (n, 2)."""
-Box = tuple[int, int, int, int]
-"""(top, bottom, left, right) in pixels: rows top to bottom - 1, columns left to right - 1."""
 
 BLOCK = 2
 """Side of the blocks of alpha's pixels whose centres `FieldOnGrid.blocks` is of."""
@@ -139,7 +138,7 @@ class FieldOnGrid:
 
         pixels = self.pixels and _window(self.pixels, box)
         pixels = pixels and _shifted(_exact(pixels) if self.large else pixels, shift)
-        blocks = self.blocks and _shifted(_window(self.blocks, tuple(n // BLOCK for n in box)), shift)  # type: ignore[arg-type]
+        blocks = self.blocks and _shifted(_window(self.blocks, tuple(n // BLOCK for n in box)), shift)
         return FieldOnGrid(at, self.samples, pixels, blocks)
 
     def of_one(self, i: int) -> FieldOnGrid:
@@ -153,30 +152,18 @@ class FieldOnGrid:
         return FieldOnGrid(lambda x: one(self.at(x)), self.samples, pixels, blocks)  # type: ignore[arg-type]
 
 
-def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None, *, at_once: bool = False) -> Segments:
-    """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w).
-
-    Some rows at a time; all `at_once` where a gradient is to be kept.
-    """
+def _on_grid(at: At, hw: HW, side: int = 1, device: torch.device | None = None) -> Segments:
+    """A straight field at the centres of h x w blocks of so many pixels as (B or 1, h, w)."""
     h, w = hw
-    rows = h if at_once else max(_CHUNK // max(w, 1), 1)
-    columns = torch.arange(w, dtype=torch.float64, device=device)
-    whole: list[Tensor] = []
-    for top in range(0, h, rows):
-        y, x = torch.meshgrid(torch.arange(top, min(top + rows, h)).to(columns), columns, indexing="ij")
+
+    def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
         found = at((torch.stack([x, y], -1).reshape(-1, 2) + 0.5) * side - 0.5)
         assert isinstance(found, Segments)
-        part = [t.reshape(-1, len(y), w, *tail) for t, tail in zip(_parts(found), ((2,), (2,), ()))]
-        if rows >= h:
-            return Segments(*part)
-        if any(t.requires_grad for t in part):
-            return _on_grid(at, hw, side, device, at_once=True)
-        if h * w >= LARGE:
-            part = [*(t.float() for t in part[:2]), part[2]]
-        whole = whole or [t.new_empty(t.shape[0], h, w, *t.shape[3:]) for t in part]
-        for target, t in zip(whole, part):
-            target[:, top : top + rows] = t
-    return Segments(*whole)
+        ends = (end.reshape(-1, *y.shape[1:], 2) for end in (found.start, found.end))
+        return *(end.float() if h * w >= LARGE else end for end in ends), found.valid.reshape(-1, *y.shape[1:])
+
+    x, y = pixel_coordinates(hw, dtype=torch.float64, device=device)
+    return Segments(*chunked(segments, x[None], y[None], rows=max(_CHUNK // max(w, 1), 1), axis=1))
 
 
 def _exact(found: Segments) -> Segments:

@@ -10,11 +10,12 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..camera import Camera
+from ..chunks import chunked
 from ..compiled import can_compile
 from ..pixels import floating, pixel_grid
 from ..rig import Pair
 from ..segments import Positions, Segments
-from ..tracing import traced, transformations
+from ..tracing import followed
 
 SamplingLocations = Segments | Positions
 
@@ -58,22 +59,20 @@ def _numbers(pair: Pair) -> Tensor | None:
 
 def compilable(x: Tensor) -> bool:
     """Whether compiled loops can take a tensor: plain numbers on the CPU that nothing follows."""
-    followed = traced() or transformations() or torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack()
     plain = type(x) is Tensor and x.device.type == "cpu" and x.dtype in (torch.float32, torch.float64)
-    return plain and not followed and can_compile()
+    return plain and not followed() and can_compile()
 
 
 CHUNK = 1 << 15
 """Pixels handled at once, so that what is computed on the way stays in a core's cache."""
+PIECE = 1 << 12
+"""Pixels of alpha that a thread takes at a time."""
 
 
-def in_chunks(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
+def segments_by_rows(f: Callable[[Tensor], Segments], pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments:
     """f over pixels, some rows of the first axis after the batch's at a time; f must answer for each pixel alone."""
     axis = len(pair.batch_shape)
     if x.ndim <= axis + 1:
         return f(x)
     rows = max(1, CHUNK * x.shape[axis] * 2 // max(x.numel(), 1))
-    if rows >= x.shape[axis]:
-        return f(x)
-    parts = [f(rows_of_x) for rows_of_x in x.split(rows, axis)]
-    return Segments(*(torch.cat([getattr(p, name) for p in parts], axis) for name in ("start", "end", "valid")))
+    return Segments(*chunked(lambda part: vars(f(part)).values(), x, rows=rows, axis=axis))

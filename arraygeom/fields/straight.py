@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import torch
@@ -10,12 +11,13 @@ from jaxtyping import Float, Real
 from torch import Tensor
 
 from ..camera import Camera
+from ..chunks import chunked
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
 from ..pixels import HW, floating
 from ..rig import Depths, Pair, depth_range
 from ..segments import Segments, clip_to_image
-from .protocol import CHUNK, all_pixels, in_chunks
+from .protocol import CHUNK, all_pixels, segments_by_rows
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ class EpipolarLine:
             middle = x.new_tensor([(w - 1) / 2, (h - 1) / 2])
             return line_piece(epipolar_lines(F, x), middle, x.new_tensor(float(h + w)), (h, w))
 
-        return in_chunks(across, pair, floating(x))
+        return segments_by_rows(across, pair, floating(x))
 
 
 NEAREST = 1e-4
@@ -102,7 +104,7 @@ class HomographyDisplacement:
             piece = line_piece(epipolar_lines(F, x), centre, disparity, hw)
             return Segments(piece.start, piece.end, piece.valid & placed)
 
-        return in_chunks(around, pair, x)
+        return segments_by_rows(around, pair, x)
 
 
 def covering_displacement(pair: Pair, x: Real[Tensor, "*n 2"] | None = None) -> Float[Tensor, "*b"]:
@@ -130,8 +132,8 @@ def _widest(pair: Pair) -> Tensor:
     if "widest" not in pair.memo:
         grid = all_pixels(pair)
         with torch.no_grad():
-            parts = [_squared_reach(pair, rows) for rows in grid.split(CHUNK // grid.shape[-2] + 1, -3)]
-        disparity = torch.cat(parts, -2)
+            rows = CHUNK // grid.shape[-2] + 1
+            disparity = chunked(partial(_squared_reach, pair), grid, rows=rows, axis=len(pair.batch_shape))
         index = disparity.flatten(-2).argmax(-1)
         chosen = grid.reshape(-1, 2).index_select(0, index.reshape(-1)).reshape(*index.shape, 1, 2)
         pair.memo["widest"] = chosen.to(pair.cameras[0].K)
@@ -210,4 +212,7 @@ def line_piece(
 
 
 def _between(pair: Pair, near: Tensor, far: Tensor, x: Tensor) -> Segments:
-    return in_chunks(lambda x: segments_between(pinhole_track(pair, x), near, far, pair.beta.hw), pair, floating(x))
+    def between(x: Tensor) -> Segments:
+        return segments_between(pinhole_track(pair, x), near, far, pair.beta.hw)
+
+    return segments_by_rows(between, pair, floating(x))

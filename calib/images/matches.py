@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom import Link, Pair, apply_homography, epipolar_distance, epipolar_lines, triangulate
+from arraygeom.chunks import chunked
 from arraygeom.pixels import shift_matrix
 from arraygeom.progress import log_step
 
@@ -311,10 +312,12 @@ def _nearest(a: NDArray[np.float32], b: NDArray[np.float32]) -> Int[Tensor, " n"
     By matrix products, as they are several times faster than OpenCV's matcher; of SIFT's whole numbers they are exact.
     """
     others = torch.from_numpy(b)
-    power, found = others.square().sum(1), []
-    for rows in torch.from_numpy(a).split(MATCHED_AT_ONCE):
+    power = others.square().sum(1)
+
+    def nearest_of(rows: Tensor) -> Tensor:
         squared = power - 2 * rows @ others.T + rows.square().sum(1, keepdim=True)
         least, nearest = squared.min(1)
         second = squared.scatter_(1, nearest[:, None], torch.inf).amin(1)
-        found.append(torch.where(least.clamp(min=0) < RATIO**2 * second, nearest, -1))
-    return torch.cat(found)
+        return torch.where(least.clamp(min=0) < RATIO**2 * second, nearest, -1)
+
+    return chunked(nearest_of, torch.from_numpy(a), rows=MATCHED_AT_ONCE, axis=0)

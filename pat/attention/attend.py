@@ -16,7 +16,7 @@ import importlib.util
 import os
 from collections.abc import Callable
 from functools import partial
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import torch
 from jaxtyping import Float
@@ -24,27 +24,36 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.utils.checkpoint import checkpoint
 
+from arraygeom.camera import View
+from arraygeom.chunks import chunked
+from arraygeom.fields import Local, lazily
+from arraygeom.pixels import pixel_coordinates
+from arraygeom.rig import Pair
 from arraygeom.segments import Positions, Segments
 from arraygeom.tracing import transformations
 from pat.attention import reference, torch_op
-from pat.attention.reference import Attended, AttentionInputs, SamplePositions
+from pat.attention.reference import Attended, AttentionInputs, SamplePositions, accumulated
 
 Locations = Segments | Positions
 Interpolation = Literal["bilinear", "nearest"]
-Backend = Literal["auto", "reference", "cpu", "triton"]
+Backend = Literal["auto", "reference", "cpu", "triton", "local"]
 
 DTYPES = (torch.float64, torch.float32, torch.bfloat16, torch.float16)
 CHUNK_SAMPLES = 2**22
 """How many explicit positions a callable is asked for at a time: 32 MiB of float32 (x, y)."""
 CHUNK_PIXELS = 2**18
 """How many segments a callable is asked for at a time."""
+LOCAL_SERVES = (
+    "nearest values, without statistics, bias and derivatives, of `Local` windows of odd size and whole spacing "
+    "in float32 images of one size on the CPU"
+)
 
 
 def attend(
     query: Float[Tensor, "b d ha wa"],
     key: Float[Tensor, "b d hb wb"],
     value: Float[Tensor, "b dv hb wb"],
-    locations: Locations | Callable[[Tensor], Locations],
+    locations: Locations | Callable[[Tensor], Locations] | Local,
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
@@ -63,14 +72,16 @@ def attend(
         locations: the search segments or sampling locations in beta of each alpha pixel: Segments or Positions
             with the leading axes (Ha, Wa) or (B, Ha, Wa), or a function from (n, 2) alpha pixels (x, y) to
             either, with the leading axes (n) or (B, n), which is called on one piece of alpha at a time and
-            again in backward, so that not all explicit positions exist at once.
+            again in backward, so that not all explicit positions exist at once. Or the field `Local`: windows, of
+            views of the same field of view.
         samples: how many samples a segment has. None: one for each beta pixel of the longest valid one.
         interpolation: `bilinear` (differentiable in the geometry) or `nearest` (the paper's).
         bias: added to the scores; anything that broadcasts to (B, Ha, Wa, L).
         backend: `reference` (plain torch, differentiable any number of times and in forward mode), `cpu`,
-            `triton`, or `auto`: the compiled one of the tensors' device, with forward-mode derivatives and
-            gradients of gradients by the reference, or the reference if there is none. An explicit compiled
-            backend that cannot serve raises.
+            `triton`, `local` (windows alone, see `LOCAL_SERVES`; its output is channels-first in memory), or
+            `auto`: `local` where that serves, or the compiled one of the tensors' device, with forward-mode
+            derivatives and gradients of gradients by the reference, or the reference if there is none. An explicit
+            compiled backend that cannot serve raises.
 
     Raises:
         ValueError: shapes, devices or options that do not fit together.
@@ -78,14 +89,14 @@ def attend(
         RuntimeError: an explicit backend that cannot serve.
         NotImplementedError: derivatives that an explicit backend does not have.
     """
-    return _attend(query, key, value, locations, samples, interpolation, bias, backend, measured=False).value
+    return _attend(query, key, value, locations, samples, interpolation, bias, backend, measured=False)[0]
 
 
 def attend_with_statistics(
     query: Float[Tensor, "b d ha wa"],
     key: Float[Tensor, "b d hb wb"],
     value: Float[Tensor, "b dv hb wb"],
-    locations: Locations | Callable[[Tensor], Locations],
+    locations: Locations | Callable[[Tensor], Locations] | Local,
     *,
     samples: int | None = None,
     interpolation: Interpolation = "bilinear",
@@ -96,33 +107,42 @@ def attend_with_statistics(
 
     The statistics are float32 (float64 for float64 inputs) and differentiable, too.
     """
-    return _attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True)
+    return Attended(*_attend(query, key, value, locations, samples, interpolation, bias, backend, measured=True))
 
 
 def _attend(
     query: Tensor,
     key: Tensor,
     value: Tensor,
-    locations: Locations | Callable[[Tensor], Locations],
+    locations: Locations | Callable[[Tensor], Locations] | Local,
     samples: int | None,
     interpolation: Interpolation,
     bias: Tensor | None,
     backend: Backend,
     *,
     measured: bool,
-) -> Attended:
-    """The statistics are of no length if not `measured`, but for the reference's."""
+) -> tuple[Tensor, ...]:
+    """The values, and if `measured` the statistics."""
     query, key, value = _autocast(query, key, value)
     _check(query, key, value, interpolation, backend)
     nearest = interpolation == "nearest"
+    if isinstance(locations, Local):
+        values_alone = nearest and samples is None and bias is None and not measured
+        if backend in ("auto", "local") and values_alone and _local_serves(query, key, value, locations):
+            return _attend_local(query, key, value, locations)
+        alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
+        locations = lazily(locations, Pair(alpha, beta))
+    if backend == "local":
+        raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
-    def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> Attended:
+    def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
         form = sample_positions(given, q, samples)
-        return _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
+        found = _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
+        return found if measured else found[:1]
 
     if not callable(locations):
         return run(query, key, value, locations, bias)
-    return _attend_chunks(query, key, value, locations, bias, run, measured)
+    return _attend_by_rows(query, key, value, locations, bias, run)
 
 
 def _autocast(*tensors: Tensor) -> list[Tensor]:
@@ -149,8 +169,20 @@ def _check(query: Tensor, key: Tensor, value: Tensor, interpolation: str, backen
         raise ValueError(f"query, key and value are on {query.device}, {key.device} and {value.device}: move them")
     if interpolation not in ("bilinear", "nearest"):
         raise ValueError(f"interpolation must be 'bilinear' or 'nearest', got {interpolation!r}")
-    if backend not in ("auto", "reference", "cpu", "triton"):
-        raise ValueError(f"backend must be 'auto', 'reference', 'cpu' or 'triton', got {backend!r}")
+    if backend not in get_args(Backend):
+        raise ValueError(f"backend must be one of {', '.join(get_args(Backend))}, got {backend!r}")
+
+
+def _local_serves(query: Tensor, key: Tensor, value: Tensor, field: Local) -> bool:
+    whole = field.size > 0 and field.size % 2 == 1 and float(field.spacing).is_integer()
+    taken = query.dtype == torch.float32 and query.device.type == "cpu" and query.shape[2:] == key.shape[2:]
+    return whole and taken and torch_op.is_plain(query, key, value) and not _missing(query, key, value)
+
+
+def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> tuple[Tensor]:
+    from pat.attention import cpu
+
+    return (cpu.forward_local(query, key, value, field),)
 
 
 def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
@@ -199,7 +231,8 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 
 def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
     chosen = chosen_backend(backend, inputs.query.device.type)
-    missing = "" if chosen == "reference" else _missing(inputs)
+    tensors = inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias
+    missing = "" if chosen == "reference" else _missing(*tensors)
     if missing and backend != "auto":
         raise NotImplementedError(f"backend '{backend}' has no {missing}: ask for backend=\"reference\"")
     if missing or chosen == "reference":
@@ -207,12 +240,11 @@ def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
     return torch_op.attend(inputs, measured=measured, backend=chosen, strict=backend != "auto")
 
 
-def _missing(inputs: AttentionInputs) -> str:
+def _missing(*tensors: Tensor | None) -> str:
     """What is under way that compiled backends have not; empty if nothing."""
     if torch.compiler.is_compiling():
         return ""
     under_way = transformations()
-    tensors = (inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias)
     if "Jvp" in under_way or any(t is not None and forward_ad.unpack_dual(t).tangent is not None for t in tensors):
         return "forward mode"
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
@@ -232,67 +264,44 @@ def chosen_backend(backend: Backend, device: str) -> str:
     return backend
 
 
-def _attend_chunks(
+def _attend_by_rows(
     query: Tensor,
     key: Tensor,
     value: Tensor,
     locations: Callable[[Tensor], Locations],
     bias: Tensor | None,
-    run: Callable[..., Attended],
-    measured: bool,
-) -> Attended:
-    """Asks `locations` for a piece of alpha at a time.
+    run: Callable[..., tuple[Tensor, ...]],
+) -> tuple[Tensor, ...]:
+    """Asks `locations` for some rows of alpha at a time.
 
     Segments are small: they are gathered for the whole image. Explicit positions are used at once, and
     asked for again in backward.
     """
-    ha, wa = query.shape[2:]
-    first = locations(_pixel_rows(0, 1, wa, query))
+    x, y = pixel_coordinates((query.shape[2], query.shape[3]), dtype=accumulated(query), device=query.device)
+
+    def at(x: Tensor, y: Tensor, kind: Any = None) -> Any:
+        found = locations(torch.stack([x, y], -1).reshape(-1, 2))
+        if not isinstance(found, kind or Locations):
+            wanted = "Segments or Positions, of one kind for all pixels"
+            raise TypeError(f"locations must return {wanted}, got {type(found)}")
+        return found
+
+    def segments(x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        found, rows = at(x, y, Segments), x.shape[-2:]
+        return found.start.unflatten(-2, rows), found.end.unflatten(-2, rows), found.valid.unflatten(-1, rows)
+
+    def attended(q: Tensor, x: Tensor, y: Tensor, *part: Tensor) -> tuple[Tensor, ...]:
+        given = at(x, y, Positions)
+        given = Positions(given.xy.unflatten(-3, x.shape), given.mask.unflatten(-2, x.shape))
+        return run(q, key, value, given, part[0].transpose(1, 2) if part else None)
+
+    first = at(x[:1], y[:1])
     if isinstance(first, Segments):
-        return run(query, key, value, _all_segments(locations, query), bias)
-    if not isinstance(first, Positions):
-        raise TypeError(f"locations must return Segments or Positions, got {type(first)}")
-
-    def chunk(q: Tensor, k: Tensor, v: Tensor, part: Tensor | None, top: int) -> Attended:
-        given = locations(_pixel_rows(top, top + q.shape[2], wa, q))
-        if not isinstance(given, Positions):
-            raise TypeError(f"locations returned Positions for some pixels and {type(given)} for others")
-        given = Positions(given.xy.unflatten(-3, (-1, wa)), given.mask.unflatten(-2, (-1, wa)))
-        return run(q, k, v, given, part)
-
-    step = max(1, CHUNK_SAMPLES // (first.xy.numel() // 2))
-    again = partial(checkpoint, chunk, use_reentrant=False) if torch.is_grad_enabled() else chunk
-    chunks = [
-        again(query[:, :, top : top + step], key, value, _bias_rows(bias, top, step), top) for top in range(0, ha, step)
-    ]
-    values, positions, spreads, peaks = zip(*chunks)
-    if not measured:
-        return chunks[0]._replace(value=torch.cat(values, 2))
-    return Attended(torch.cat(values, 2), torch.cat(positions, 2), torch.cat(spreads, 1), torch.cat(peaks, 1))
-
-
-def _pixel_rows(top: int, bottom: int, width: int, like: Tensor) -> Float[Tensor, "n 2"]:
-    """The centres (x, y) of rows of alpha."""
-    count_in = torch.float64 if like.dtype == torch.float64 else torch.float32
-    y, x = torch.meshgrid(
-        torch.arange(top, bottom, dtype=count_in, device=like.device),
-        torch.arange(width, dtype=count_in, device=like.device),
-        indexing="ij",
-    )
-    return torch.stack([x.flatten(), y.flatten()], -1)
-
-
-def _all_segments(locations: Callable[[Tensor], Locations], query: Tensor) -> Segments:
-    ha, wa = query.shape[2:]
-    step = max(1, CHUNK_PIXELS // wa)
-    parts = [locations(_pixel_rows(top, min(top + step, ha), wa, query)) for top in range(0, ha, step)]
-    axes = {"start": -2, "end": -2, "valid": -1}
-    whole = {name: torch.cat([getattr(p, name) for p in parts], axis) for name, axis in axes.items()}
-    return Segments(**{name: t.unflatten(axes[name], (ha, wa)) for name, t in whole.items()})
-
-
-def _bias_rows(bias: Tensor | None, top: int, step: int) -> Tensor | None:
-    """The rows of a bias that broadcasts to (B, Ha, Wa, L)."""
-    if bias is None or bias.dim() < 3 or bias.shape[-3] == 1:
-        return bias
-    return bias.narrow(-3, top, min(step, bias.shape[-3] - top))
+        batch = (None,) * (first.valid.dim() - 1)
+        rows = max(1, CHUNK_PIXELS // x.shape[1])
+        found = chunked(segments, x[batch], y[batch], rows=rows, axis=len(batch))
+        return run(query, key, value, Segments(*found), bias)
+    bias = _bias(bias, query, first.xy.shape[-2])
+    biases = [] if bias is None else [bias.transpose(1, 2)]
+    again = partial(checkpoint, attended, use_reentrant=False) if torch.is_grad_enabled() else attended
+    return chunked(again, query, x, y, *biases, rows=max(1, CHUNK_SAMPLES // (first.xy.numel() // 2)))

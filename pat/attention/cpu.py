@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
+from arraygeom.fields import Local
 from arraygeom.segments import sample_fractions
 from arraygeom.threads import in_parallel
 from pat.attention import kernels
@@ -40,6 +41,17 @@ def forward(inputs: AttentionInputs, measured: bool) -> tuple[Tensor, Tensor, Te
     outputs = kernels.Outputs(_flat(out), _flat(statistics), _flat(logsum), measured)
     in_parallel([partial(kernels.forward, call, share, outputs) for share in _shares(0, b * ha * wa, call)])
     return out.permute(0, 3, 1, 2), statistics, logsum, torch.empty(0, dtype=torch.int32)
+
+
+def forward_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> Tensor:
+    """Values (b, dv, h, w), channels first, of windows of a whole number of pixels around the same pixel of a view of
+    the same size, the nearest look-up, float32."""
+    planes = [x.detach().contiguous().numpy() for x in (query, key, value)]
+    out, step = np.empty_like(planes[2]), round(field.spacing)
+    tops = range(0, out.shape[2], kernels.ROWS)
+    images = [*zip(*planes, out)]
+    in_parallel([partial(kernels.attend_rows, *image, field.size, step, top) for image in images for top in tops])
+    return torch.from_numpy(out)
 
 
 def backward(

@@ -19,6 +19,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from arraygeom.chunks import chunked
 from arraygeom.segments import sample_fractions
 
 BAND_BYTES = 2**27
@@ -40,10 +41,6 @@ class SamplePositions(NamedTuple):
     mask: Tensor
     samples: int
     straight: bool
-
-    def rows(self, top: int, bottom: int) -> SamplePositions:
-        """A band of rows of alpha."""
-        return self._replace(points=self.points[:, top:bottom], mask=self.mask[:, top:bottom])
 
     def positions(self) -> Tensor:
         """All samples, (p, r, w, l, 2)."""
@@ -82,33 +79,29 @@ class Attended(NamedTuple):
 
 
 def attend(inputs: AttentionInputs) -> Attended:
-    """The formula, band by band."""
+    """The formula, some rows of alpha at a time."""
     query, positions, bias = inputs.query, inputs.positions, inputs.bias
     counted = accumulated(query)
+
+    def band(query: Tensor, points: Tensor, mask: Tensor, *part: Tensor) -> Attended:
+        here = positions._replace(points=points, mask=mask)
+        biased = part[0].to(counted) if part else None
+        return _band(AttentionInputs(query.to(counted), key, value, here, biased, inputs.nearest))
+
     with torch.autocast(query.device.type, enabled=False):
         key, value = (channels_last(plane.to(counted)) for plane in (inputs.key, inputs.value))
-        bands = [
-            _band(
-                inputs._replace(
-                    query=query[:, :, top:bottom].to(counted).permute(0, 2, 3, 1),
-                    key=key,
-                    value=value,
-                    positions=positions.rows(top, bottom),
-                    bias=None if bias is None else bias[:, top:bottom].to(counted),
-                )
-            )
-            for top, bottom in _bands(query, key, value, positions.samples)
-        ]
-        out = Attended(*(torch.cat(part, 1) for part in zip(*bands)))
+        biases = [] if bias is None else [bias]
+        rows = _rows_at_once(query, key, value, positions.samples)
+        tensors = query.permute(0, 2, 3, 1), positions.points, positions.mask, *biases
+        out = Attended(*chunked(band, *tensors, rows=rows, axis=1))
     value = out.value.to(query.dtype).permute(0, 3, 1, 2)
     return Attended(value, out.position.permute(0, 3, 1, 2), out.deviation, out.peak)
 
 
-def _bands(query: Tensor, key: Tensor, value: Tensor, samples: int) -> list[tuple[int, int]]:
-    b, _, ha, wa = query.shape
-    row_bytes = 2 * b * wa * samples * (key.shape[-1] + value.shape[-1]) * key.element_size()
-    rows = max(1, BAND_BYTES // max(1, row_bytes))
-    return [(top, min(top + rows, ha)) for top in range(0, ha, rows)]
+def _rows_at_once(query: Tensor, key: Tensor, value: Tensor, samples: int) -> int:
+    """How many rows of alpha gather no more than `BAND_BYTES`."""
+    row_bytes = 2 * query.shape[0] * query.shape[3] * samples * (key.shape[-1] + value.shape[-1]) * key.element_size()
+    return max(1, BAND_BYTES // max(1, row_bytes))
 
 
 def accumulated(tensor: Tensor) -> torch.dtype:

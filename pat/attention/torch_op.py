@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import Parameter
 
-from arraygeom.tracing import transformations
+from arraygeom.tracing import followed
 from pat.attention import reference
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions
 
@@ -28,7 +28,7 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
     """As `reference.attend`, by the `cpu` or the `triton` backend; without statistics if not `measured`.
     `strict`: no second order by the reference."""
     query, key, value, positions, bias, nearest = inputs
-    if _is_plain(query, key, value, positions.points, bias):
+    if is_plain(query, key, value, positions.points, bias):
         out, statistics, *_ = compiled(backend).forward(inputs, measured)
     else:
         out, statistics, *_ = _attend(
@@ -40,15 +40,14 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
     return Attended(out, statistics[..., :2].permute(0, 3, 1, 2), statistics[..., 2], statistics[..., 3])
 
 
-def _is_plain(*given: Tensor | None) -> bool:
+def is_plain(*given: Tensor | None) -> bool:
     """Whether nothing but numbers is asked for, so that the kernels can be called without torch's dispatcher.
 
     An operator's first call imports torch's compiler, which takes a second.
     """
     tensors = [t for t in given if t is not None]
     gradient = torch.is_grad_enabled() and any(t.requires_grad for t in tensors)
-    followed = torch.compiler.is_compiling() or torch.jit.is_tracing() or torch._C._len_torch_dispatch_stack()
-    return not (gradient or followed or transformations()) and all(type(t) in (Tensor, Parameter) for t in tensors)
+    return not (gradient or followed()) and all(type(t) in (Tensor, Parameter) for t in tensors)
 
 
 def compiled(backend: str) -> ModuleType:

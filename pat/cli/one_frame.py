@@ -13,10 +13,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from arraygeom import Rig
+    from arraygeom.chunks import Tile
 
     from ..fusion.results import Frame
     from ..fusion.tiles import Plan
-    from ..matching.pieces import Tile
 
 LOG = logging.getLogger(__name__)
 

@@ -6,24 +6,41 @@ it, and then what betas recorded there.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
+
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom.chunks import spans
 from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
 from ..media.colour import from_luma_chroma, luminance
+from ..support.settings import size, tuned
 
-OWN = 0.22, 6, 2.0
-"""Colour is averaged by itself first: the scale of unlikeness over the root of the noise's standard deviation, how
-far away pixels are, and how much more luma counts than a colour difference. These and the next were chosen on
-Middlebury's pairs of the tune half."""
-RECORDED = 0.11, 16, 1.25, 0.75
-"""Colour is averaged as beta recorded it then: the same, and how much of it is taken where enough is alike."""
-ROWS = 16
-"""Rows that a thread works on at once: what it sums stays in its cache."""
+
+@dataclass(frozen=True)
+class AveragingSettings:
+    """Of means over pixels that are alike."""
+
+    own: tuple[float, int, float] = tuned(
+        (0.22, 6, 2.0),
+        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over the root of the "
+        "noise's standard deviation, how far away pixels are, and how much more luma counts than a colour difference",
+    )
+    recorded: tuple[float, int, float, float] = tuned(
+        (0.11, 16, 1.25, 0.75),
+        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, and how much of it is taken "
+        "where enough is alike",
+    )
+    rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
+
+
+SETTINGS = AveragingSettings()
+OWN, RECORDED, ROWS = SETTINGS.own, SETTINGS.recorded, SETTINGS.rows
 
 
 def averaged_with_alike(
@@ -63,10 +80,10 @@ def sums_of_alike(
     out = np.zeros((len(values) + 1, h, w), np.float32)
     sharpness = np.float32(1 / (8 * 9 * len(guide) * scale**2))
 
-    def rows(top: int) -> None:
-        add_alike(*planes, around, radius, step, sharpness, top, out[:, top : top + ROWS])
+    def rows(top: int, bottom: int) -> None:
+        add_alike(*planes, around, radius, step, sharpness, top, out[:, top:bottom])
 
-    in_parallel([lambda top=top: rows(top) for top in range(0, h, ROWS)])
+    in_parallel([partial(rows, *span) for span in spans(h, ROWS)])
     sums = torch.from_numpy(out).to(values)
     return sums[:-1], sums[-1:]
 

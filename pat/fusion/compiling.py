@@ -85,8 +85,9 @@ def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     given."""
     from numba import float32, float64, int16, int32, int64, uint8, uint64
 
+    from ..attention.kernels import attend_rows
     from ..matching import semi_global_numba, window_numba
-    from ..networks import kernels
+    from ..networks.unshuffle_numba import unshuffle
 
     plane, bits, labels = float32[:, ::1], uint64[:, ::1], int32[:, ::1]
     planes, cost, sums = float32[:, :, ::1], uint8[:, :, ::1], int16[:, :, ::1]
@@ -103,8 +104,8 @@ def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     yield window_numba.band_winners, (planes, order, labels, labels, *segments[:3], *counts, plane, plane)
     yield semi_global_numba.regression, (*(plane,) * 6, float64, plane, plane)
     yield _attention()
-    yield kernels.unshuffle, (strided, strided, strided)
-    yield kernels.attend_rows, (planes, planes, planes, planes, int64, int64, int64)
+    yield unshuffle, (strided, strided, strided)
+    yield attend_rows, (planes, planes, planes, planes, int64, int64, int64)
 
 
 def _attention() -> tuple[Any, tuple[Any, ...]]:

@@ -10,9 +10,9 @@ from pathlib import Path
 import torch
 
 from arraygeom import ReceptiveField, Rig
+from arraygeom.chunks import Tile
 
 from ..matching.match import Matcher, match
-from ..matching.pieces import Tile
 from ..matching.radiometry import Given
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-import numpy as np
+import torch
 from jaxtyping import Float
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_together
+from arraygeom.chunks import chunked
 from arraygeom.threads import in_parallel
 
 from ..media.colour import linear_from_srgb
@@ -28,8 +29,6 @@ from ..support.memory import how_many_fit
 
 MOST = 65535
 """The largest count of 16 bits."""
-ROWS = 64
-"""Rows whose depth is converted at a time."""
 
 ImageFormat = Literal["png", "tif", "exr"]
 
@@ -98,10 +97,11 @@ def write_depth(path: Path, depth: Float[Tensor, "h w"], *, near: float | None =
     """
     known = depth.isfinite() & (depth > 0)
     scale = depth_scale(near or float(depth[known].min()))
-    counts = np.zeros(depth.shape, np.uint16)
-    for top in range(0, len(counts), ROWS):
-        part, seen = slice(top, top + ROWS), known[top : top + ROWS]
-        counts[part][seen.numpy()] = np.rint(depth[part][seen].double().numpy() * scale).clip(1, MOST)
+
+    def counted(depth: Tensor, known: Tensor) -> Tensor:
+        return torch.where(known, (depth.double() * scale).round().clamp(1, MOST), 0.0).to(torch.uint16)
+
+    counts = chunked(counted, depth, known).numpy()
     said = PngInfo()
     said.add_text("Description", f"depth: {scale:g} counts a metre; 0 is unknown, {MOST} that far or farther")
     Image.fromarray(counts).save(path, format="PNG", pnginfo=said, compress_level=4)

@@ -15,12 +15,12 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
-from arraygeom.fields.grid import Box
+from arraygeom.chunks import Box, Tile, area, assembled, tiles_of, whole
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
-from ..matching.pieces import Tile, area, matching_pieces, sides_by_work, tiles_of, whole
+from ..matching.pieces import matching_pieces, sides_by_work
 from ..networks.protocol import FusionNetwork, FusionOutput, matched_for
 from ..support.tensor_files import write_tensors
 from .depth import depth_and_confidence
@@ -222,19 +222,6 @@ def _found(output: FusionOutput, part: Inputs) -> Tensor:
     return torch.stack([torch.cat([p[0] + corner, c]) for p, corner, c in parts]).to(output.image)
 
 
-def assembled(hw: HW, parts: Iterable[tuple[Tile, FusedTile]]) -> FusedTile:
-    """The frame from its tiles; a single one as it is, with its gradients."""
-    frame: list[Tensor] = []
-    for tile, found in parts:
-        if tile == whole(hw):
-            return found
-        frame = frame or [part.new_empty(*part.shape[:-2], *hw) for part in found]
-        top, bottom, left, right = tile.inner
-        for target, part in zip(frame, found):
-            target[..., top:bottom, left:right] = part
-    return FusedTile(*frame)
-
-
 def fused_in_tiles(
     network: FusionNetwork,
     frame: FrameInputs,
@@ -254,11 +241,16 @@ def fused_in_tiles(
 
     shown = progress(tiles, len(tiles)) if progress else tiles
     if not store or len(tiles) == 1:
-        return assembled(frame.hw, ((tile, make(tile)) for tile in shown))
+        return _joined(frame.hw, ((tile, make(tile)) for tile in shown))
     files = TileStore.of(store, network, frame.inputs)
     for tile in shown:
         files.write(tile, make)
-    return assembled(frame.hw, ((tile, files.read(tile)) for tile in tiles))
+    return _joined(frame.hw, ((tile, files.read(tile)) for tile in tiles))
+
+
+def _joined(hw: HW, parts: Iterable[tuple[Tile, FusedTile]]) -> FusedTile:
+    """The frame from the inner parts of its tiles; a single one as it is, with its gradients."""
+    return FusedTile(*assembled(hw, ((Tile(tile.inner, tile.inner), part) for tile, part in parts)))
 
 
 class TileStore(NamedTuple):

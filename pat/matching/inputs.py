@@ -10,8 +10,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Positions, Segments
+from arraygeom.chunks import Box
 from arraygeom.epipolar import Track
-from arraygeom.fields.grid import Box, FieldOnGrid
+from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
 
 

@@ -12,15 +12,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
-from arraygeom.fields.grid import Box
+from arraygeom.chunks import Box, assembled
 
-from .colour_transfer import diffused_from, matched_colours
+from .colour_transfer import coarse_mix, colours_of_bands, diffused_from, matched_colours
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Comparison, Matches, combined_bands
 from .multiview import agreed, can_agree, priors
-from .pieces import from_pieces, matching_pieces
+from .pieces import matching_pieces
 from .semi_global import FINE, matched_at_half_size
-from .spectral_mix import coarse_mix, colours_of_bands
 from .subpixel import matched_at_full_size, precise
 
 LOG = logging.getLogger(__name__)
@@ -142,6 +141,6 @@ def transferred_bands(alpha: Tensor, beta: Beta, found: BetaMatches) -> tuple[Te
 
 def _in_pieces(inputs: Inputs, make: Callable[[Inputs, Box], Iterable[Tensor]]) -> list[Tensor]:
     """What is made of a frame, or of each of the pieces in which a large one is matched."""
-    if len(matching_pieces(inputs.hw, inputs.multiple)) == 1:
-        return list(make(inputs, (0, inputs.hw[0], 0, inputs.hw[1])))
-    return from_pieces(inputs.hw, inputs.multiple, lambda box: make(inputs.cut(box), box))
+    pieces = matching_pieces(inputs.hw, inputs.multiple)
+    cut = inputs.cut if len(pieces) > 1 else lambda _: inputs
+    return list(assembled(inputs.hw, ((piece, make(cut(piece.outer), piece.outer)) for piece in pieces)))

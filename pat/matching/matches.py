@@ -8,13 +8,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from arraygeom import Segments
-from arraygeom.fields.grid import Box
+from arraygeom.chunks import Box
 from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 
 from ..media.colour import luminance
+from .radiometry import SpectralMix
 from .semi_global import FINE, Normalisations, matches
-from .spectral_mix import SpectralMix
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
+from arraygeom.chunks import Box
 from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
@@ -29,6 +30,7 @@ from arraygeom.threads import in_parallel
 from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
 from . import semi_global_numba as kernels
+from .normalisation import Normalisation, Normalisations, blurred, equalising_blurs  # noqa: F401
 
 FINE = 2
 """Matching is done on images this many times smaller."""
@@ -46,8 +48,6 @@ CONSISTENT = 0.2
 """A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
 DISPARITY_FILL = (50.0, 4.0)
 """Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
-BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-"""Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other."""
 
 
 class SemiGlobalMatches(NamedTuple):
@@ -66,7 +66,7 @@ class SemiGlobalMatches(NamedTuple):
     matched: Tensor
     colour: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> SemiGlobalMatches:
+    def cut(self, box: Box) -> SemiGlobalMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = box
         half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
@@ -84,53 +84,10 @@ class HalfSizeMatches(NamedTuple):
     disparity: Tensor
     facts: Tensor
 
-    def cut(self, box: tuple[int, int, int, int]) -> HalfSizeMatches:
+    def cut(self, box: Box) -> HalfSizeMatches:
         """The part at alpha's (top, bottom, left, right), all even."""
         top, bottom, left, right = (n // FINE for n in box)
         return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
-
-
-class Normalisation(NamedTuple):
-    """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
-
-    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
-    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
-    """
-
-    level: Tensor
-    blurs: tuple[list[float], list[float]]
-
-    @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
-        """What makes the means and standard deviations the same, and then the sharpness."""
-        (deviation, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
-        level = torch.stack([mean, (wanted / deviation.clamp(min=1e-3)).clamp(max=4), middle])
-        return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
-
-    def normalised(self, beta: Tensor) -> Tensor:
-        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
-        return _normalised(beta, self.level)
-
-    def softened(self, alpha: Tensor) -> Tensor:
-        """Alpha (or a part of it), no sharper than beta."""
-        return blurred(alpha, self.blurs[0])
-
-    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
-        """Both (or parts of them), the sharper one blurred."""
-        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
-        return own, other
-
-
-class Normalisations(NamedTuple):
-    """Those of images, and of the same at half the size."""
-
-    whole: Normalisation
-    half: Normalisation
-
-    @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
-        """Of alpha and beta's brightness; all sides are even."""
-        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
 
 
 class _Geometry(NamedTuple):
@@ -238,41 +195,6 @@ def _block(views: tuple, box: tuple, labels: int, claims: list[NDArray[np.int32]
     claims.append(table)
     for plane, part in zip(found, parts):
         plane[inner] = part
-
-
-def _normalised(image: Tensor, level: Tensor) -> Tensor:
-    mean, factor, middle = level.to(image)
-    return (image - mean) * factor + middle
-
-
-def equalising_blurs(
-    image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
-) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
-
-    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the other.
-    """
-    own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
-    return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
-
-
-def _least_blur(image: Tensor, contrast: float) -> float:
-    """The least of `BLURS` after which there is no more contrast than that."""
-    enough = (b for b in (0.0, *BLURS) if float(_contrast(blurred(image[None], [b])[0])) <= 1.05 * contrast)
-    return next(enough, BLURS[-1])
-
-
-def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    """Each blurred with its standard deviation in pixels; 0: as it is."""
-
-    def one(image: Tensor, blur: float) -> Tensor:
-        return torch.from_numpy(cv2.GaussianBlur(numpy_of(image), (0, 0), blur)).to(image) if blur else image
-
-    return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
-
-
-def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
-    return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
 
 
 def matches(

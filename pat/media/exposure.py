@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
+
+from arraygeom.chunks import chunked
 
 from .colour import linear_from_srgb, luminance_of, srgb_from_linear
 
@@ -29,4 +30,4 @@ def exposed(image: Float[Tensor, "c h w"], gain: float) -> Float[Tensor, "c h w"
     """The image with its linear light times a factor."""
     if gain == 1:
         return image
-    return torch.cat([srgb_from_linear(gain * linear_from_srgb(rows)) for rows in image.split(256, 1)], 1)
+    return chunked(lambda rows: srgb_from_linear(gain * linear_from_srgb(rows)), image)

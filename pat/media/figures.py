@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom.atomic import write_atomically
+from arraygeom.chunks import chunked
 from arraygeom.viz import new_figure
 
 from .colour import to_bytes
@@ -28,14 +29,15 @@ def colour_depth(depth: Float[Tensor, "h w"]) -> Float[Tensor, "3 h w"]:
     known = depth.isfinite()
     inverse = torch.where(known, 1 / torch.where(known, depth, 1.0), 0.0)
     low, high = np.percentile(inverse[known].numpy(), (1, 99)) if known.any() else (0.0, 1.0)
-    colours = torch.empty(3, *depth.shape)
     table = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
     turbo = torch.from_numpy(np.pad(table, ((0, 1), (0, 0))).T / np.float32(255))  # and black
-    for rows, found, seen in zip(colours.split(256, 1), inverse.split(256), known.split(256)):
-        scaled = (256 / max(high - low, 1e-12) * (found - low)).int().clamp_(0, 255)
-        which = torch.where(seen, scaled, 256).flatten()
-        rows.copy_(turbo.index_select(1, which).view(rows.shape))
-    return colours
+
+    def coloured(inverse: Tensor, known: Tensor) -> Tensor:
+        scaled = (256 / max(high - low, 1e-12) * (inverse - low)).int().clamp_(0, 255)
+        which = torch.where(known, scaled, 256).flatten()
+        return turbo.index_select(1, which).view(3, *known.shape)
+
+    return chunked(coloured, inverse, known)
 
 
 def reduced(image: Float[Tensor, "c h w"], longest: int) -> Float[Tensor, "c h2 w2"]:

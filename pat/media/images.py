@@ -20,15 +20,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from arraygeom.atomic import write_atomically
+from arraygeom.chunks import ROWS, spans
 
 from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
 
 FEW_BITS = (8, 10, 12)
 """Bits of cameras that may be stored in 16 bits as they are."""
-
-_ROWS = 256
-"""Rows processed at once, to limit memory."""
 
 MOST_PIXELS = 2**28
 """Images with more are read only where their size is expected: some 3 GiB in colour."""
@@ -335,9 +333,8 @@ def _quantised(colours: NDArray, bits: int) -> NDArray:
         return colours.astype(np.float32)
     if bits not in (8, 16):
         raise ValueError(f"bits must be 8, 16 or 32 (float), got {bits}")
-    kind = np.uint8 if bits == 8 else np.uint16
-    counts = np.empty(colours.shape, kind)
-    for top in range(0, len(colours), _ROWS):
-        rows = np.clip(colours[top : top + _ROWS], 0, 1).astype(np.float64)
-        counts[top : top + _ROWS] = np.rint(rows * np.iinfo(kind).max)
+    counts = np.empty(colours.shape, np.uint8 if bits == 8 else np.uint16)
+    for first, last in spans(len(colours), ROWS):
+        rows = np.clip(colours[first:last], 0, 1).astype(np.float64)
+        counts[first:last] = np.rint(rows * (2**bits - 1))
     return counts

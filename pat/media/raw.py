@@ -16,11 +16,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Rig, Sensor
+from arraygeom.chunks import chunked
 
 from .colour import linear_from_srgb, luminance, srgb_from_linear
-
-_ROWS = 256
-"""Rows processed at once, to limit memory."""
 
 
 def develop(image: Float[Tensor, "c h w"], sensor: Sensor, *, like: Sensor | None = None) -> Float[Tensor, "c2 h w"]:
@@ -70,8 +68,7 @@ def as_bright(image: Float[Tensor, "3 h w"], alpha: Float[Tensor, "1 h w"], sens
     """
     if sensor.response != LIGHT:
         return image
-    parts = zip(image.split(_ROWS, 1), alpha.split(_ROWS, 1))
-    return torch.cat([part + _missing(part, linear_from_srgb(own)) for part, own in parts], 1)
+    return chunked(lambda part, own: part + _missing(part, linear_from_srgb(own)), image, alpha)
 
 
 def _missing(image: Tensor, light: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from torch.utils._pytree import tree_map
 
 from arraygeom.fields.protocol import compilable
 
-from .kernels import unshuffle
+from .unshuffle_numba import unshuffle
 
 
 class ResidualBlock(nn.Module):

@@ -8,33 +8,50 @@ are kept if they are large (first pass), or weighted by how strong they are in a
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from arraygeom.chunks import spans
 from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
 from ..media.colour import luminance
+from ..support.settings import size, tuned
 from .denoiser import opponent, opponent_deviation, over_flips, rgb_of_opponent
 
-SIDE, STEP, ALIKE = 8, 4, 16
-"""Side of a block and steps between blocks, pixels; blocks in a group."""
+
+@dataclass(frozen=True)
+class CollaborativeSettings:
+    """Of the filter of alike blocks (Dabov et al. 2007)."""
+
+    side: int = size(8, "Side of a block, pixels")
+    step: int = size(4, "Steps between blocks, pixels")
+    alike: int = size(16, "Blocks in a group")
+    radius: int = size(16, "How far away alike blocks are looked for, pixels")
+    rows: int = size(16, "Rows of blocks that a thread works on at once")
+    threshold: float = tuned(
+        2.9,
+        "Middlebury, tune half: coefficients of so many standard deviations of the noise are kept in the first pass",
+    )
+    as_recorded: float = tuned(
+        0.5,
+        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of the noise left: "
+        "where an image is flat the noise makes blocks alike that lie apart, as is needed",
+    )
+    kept: float = tuned(
+        0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
+    )
+
+
+SETTINGS = CollaborativeSettings()
+SIDE, STEP, ALIKE, RADIUS, ROWS = SETTINGS.side, SETTINGS.step, SETTINGS.alike, SETTINGS.radius, SETTINGS.rows
+"""For the compiled loops, which read no attributes."""
+THRESHOLD, AS_RECORDED, KEPT = SETTINGS.threshold, SETTINGS.as_recorded, SETTINGS.kept
 CELLS = SIDE // STEP
-RADIUS = 16
-"""How far away alike blocks are looked for, pixels."""
-ROWS = 16
-"""Rows of blocks that a thread works on at once."""
-THRESHOLD = 2.9
-"""Coefficients of so many standard deviations of the noise are kept in the first pass."""
-AS_RECORDED = 0.5
-"""Later passes look for alike blocks in an estimate with so much of the noise left: where an image is flat the noise
-makes blocks alike that lie apart, as is needed. This, `THRESHOLD` and `KEPT` were chosen on Middlebury's pairs of the
-tune half."""
-KEPT = 0.5
-"""Share of the network's brightness that is kept: its errors are others."""
 
 
 def without_noise(
@@ -121,18 +138,17 @@ def collaboratively_filtered(
     ]
     high = STEP * (ROWS - 1) + SIDE + 2 * RADIUS
 
-    def filtered(top: int) -> np.ndarray:
-        found = np.zeros((min(ROWS, down - top), across, ALIKE, 2), np.int16)
+    def filtered(top: int, bottom: int) -> np.ndarray:
+        found = np.zeros((bottom - top, across, ALIKE, 2), np.int16)
         find_alike(planes[3], top, found)
         sums = np.zeros((2, len(image), high, planes[0].shape[2]), np.float32)
         filter_groups(*planes[:3], top, found, COSINES, WINDOW, np.float32(threshold), sums)
         return sums
 
     total = np.zeros((2, *planes[0].shape), np.float32)
-    tops = range(0, down, ROWS)
     bands: dict[int, np.ndarray] = {}
-    in_parallel([lambda top=top: bands.update({top: filtered(top)}) for top in tops])
-    for top in tops:
+    in_parallel([lambda span=span: bands.update({span[0]: filtered(*span)}) for span in spans(down, ROWS)])
+    for top in sorted(bands):
         rows = total[:, :, STEP * top : STEP * top + high]
         rows += bands.pop(top)[:, :, : rows.shape[2]]
     inside = total[:, :, first : first + h, first : first + w]

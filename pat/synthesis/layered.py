@@ -16,6 +16,7 @@ from torch import Generator, Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom.camera import Camera
+from arraygeom.chunks import chunked
 from arraygeom.homography import plane_homography
 from arraygeom.pixels import HW, pixel_grid, to_homogeneous
 from arraygeom.pose import Pose
@@ -141,11 +142,13 @@ class LayeredScenes:
         B, L = layers.present.shape
         flat = layer + L * torch.arange(B, device=self.device)[:, None]
         pixel = torch.arange(hw[0] * hw[1], device=self.device).expand_as(flat)
-        parts = zip(flat[where].split(_CHUNK), pixel[where].split(_CHUNK))
         texture = layers.texture.flatten().to(self.device)
         paint = layers.colour.float().flatten(0, 1).to(self.device)
-        done = [self._painted(H.flatten(0, 1)[i], texture[i], paint[i], p, hw[1]) for i, p in parts]
-        colour = torch.cat(done, 1) if done else H.new_zeros(3, 0)
+
+        def painted(i: Tensor, pixel: Tensor) -> Tensor:
+            return self._painted(H.flatten(0, 1)[i], texture[i], paint[i], pixel, hw[1])
+
+        colour = chunked(painted, flat[where], pixel[where], rows=_CHUNK, axis=-1)
         return colour.view(3, B, -1) if len(colour[0]) == where.numel() else colour
 
     def _painted(self, H: Tensor, texture: Tensor, paint: Tensor, pixel: Tensor, width: int) -> Tensor:
@@ -162,6 +165,7 @@ class LayeredScenes:
 
 
 _CHUNK = 1 << 16
+"""Pixels painted at once."""
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from jaxtyping import Float
 from torch import Generator, Tensor
 
 from arraygeom import Camera, Pose, Rig, stack
+from arraygeom.chunks import Box, assembled, tiles_of
 from arraygeom.pose import matvec
 from pat.evaluation.ablation import sample_photographs
 from pat.synthesis.layered import LayeredScenes
@@ -69,17 +70,14 @@ class SystemScene(LayeredScenes):
         factor = min(max(round(finest / float(camera.K[0, 0, 0])), 2), 4)
         h, w = camera.hw
         rows = max(BAND // (w * factor**2), 1)
-        if h <= rows:
-            image, depth = self._seen(layers or self.scene, camera, factor)[:2]
+
+        def rendered(band: Box) -> RenderedView:
+            top, bottom, left, right = band
+            part = camera.crop(top, left, (bottom - top, right - left))
+            image, depth = self._seen(layers or self.scene, part, factor)[:2]
             return image, depth[0]
-        image, depth = torch.empty(1, 3, h, w), torch.empty(h, w)
-        for top in range(0, h, rows):
-            bottom, first = min(top + rows, h), max(top - 1, 0)
-            part = camera.crop(first, 0, (min(bottom + 1, h) - first, w))
-            found = self._seen(layers or self.scene, part, factor)
-            inner = slice(top - first, bottom - first)
-            image[..., top:bottom, :], depth[top:bottom] = found[0][..., inner, :], found[1][0, inner]
-        return image, depth
+
+        return assembled((h, w), ((tile, rendered(tile.outer)) for tile in tiles_of((h, w), (rows, w), 1)))
 
     def painted(self, values: Sequence[float]) -> Layers:
         """The scene with a grey value, 0..1, for each layer instead of its texture."""

@@ -25,13 +25,13 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from arraygeom import Rig
 from arraygeom.atomic import write_text
+from arraygeom.chunks import Tile
 from pat.evaluation.tables import markdown_table
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.steps import steps_for
 from pat.fusion.tiles import fuse_tile
 from pat.fusion.views import Views
-from pat.matching.pieces import Tile
 from pat.media.images import read_image
 from pat.networks.protocol import matched_for
 from pat.networks.weights import load_weights

@@ -22,9 +22,11 @@ from .channels import scatter
 from .emit import LANES, compiled, separate_cache
 from .forward import forward
 from .layout import Call, Geometry, Gradients, Outputs, Saved, Share, TapList, block_scratch
+from .local import ROWS, attend_rows
 
 __all__ = [
     "LANES",
+    "ROWS",
     "Call",
     "Geometry",
     "Gradients",
@@ -32,6 +34,7 @@ __all__ = [
     "Saved",
     "Share",
     "TapList",
+    "attend_rows",
     "backward",
     "block_scratch",
     "compiled",
@@ -45,7 +48,7 @@ def _watch_all_sources() -> None:
     """numba's cache is renewed when the file of the entry point changes; here when any file of this folder does."""
     sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
     stamp = hashlib.sha256(sources).hexdigest()
-    for entry in (forward, backward, scatter):
+    for entry in (forward, backward, scatter, attend_rows):
         if (file := cache_file(entry)) is not None:
             file._source_stamp = stamp
         separate_cache(entry)

@@ -9,12 +9,12 @@ import torch
 import pat.fusion.tiles
 import pat.fusion.views
 from arraygeom import Camera, Distortion, Epipolar, Pose, Rig, Sensor, intrinsics
+from arraygeom.chunks import tiles_of
 from pat.fusion.frames import ImageFiles
 from pat.fusion.fuse import fuse
 from pat.fusion.sequence import fuse_sequence
 from pat.fusion.tiles import MAX_HALO
 from pat.fusion.views import ViewFiles, Views
-from pat.matching.pieces import tiles_of
 from pat.media.images import write_image
 from pat.networks.bandwise import BandwisePAT
 from pat.networks.configs import BandwisePATConfig, GuidedPATConfig

@@ -24,6 +24,7 @@ from arraygeom import (
     resampled,
     rotation_from_vector,
 )
+from arraygeom.chunks import Tile, tiles_of
 from calib.images.matches import match_points, seen_depths
 from pat.data.pairs import folder_pairs
 from pat.evaluation.metrics import score
@@ -33,7 +34,7 @@ from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
 from pat.matching.inputs import Inputs
-from pat.matching.pieces import Tile, matching_pieces, tiles_of
+from pat.matching.pieces import matching_pieces
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT

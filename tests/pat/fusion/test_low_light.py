@@ -1,7 +1,7 @@
 """Fusion of noisy views."""
 
 import warnings
-from functools import cache
+from functools import cache, partial
 
 import pytest
 import torch
@@ -109,7 +109,7 @@ def test_tiles_are_denoised_as_the_whole(network, fused, monkeypatch):
     view, level = images[ALPHA][None], noise[ALPHA]
     views = view, level.deviation(view)
     whole = denoised(*views)
-    monkeypatch.setattr("pat.fusion.low_light.PIECE", 320)
+    monkeypatch.setattr("pat.fusion.low_light.in_tiles", partial(pat.fusion.low_light.in_tiles, rows=320))
     pieces, ordinary = [], pat.fusion.low_light.without_noise
     monkeypatch.setattr("pat.fusion.low_light.without_noise", lambda *a: pieces.append(a) or ordinary(*a))
     tiles = denoised(*views)

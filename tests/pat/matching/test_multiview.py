@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig, Segments, intrinsics
+from arraygeom.chunks import tiles_of
 from arraygeom.fields import pinhole_track
 from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
@@ -16,7 +17,6 @@ from pat.matching import multiview as several
 from pat.matching import pieces
 from pat.matching.match import located, match
 from pat.matching.multiview import SUPPORT, MatchedBeta, can_agree
-from pat.matching.pieces import tiles_of
 from pat.media.colour import luminance
 from pat.networks.guided import BetaEstimate, combined
 from pat.networks.weights import load_weights

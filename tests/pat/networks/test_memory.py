@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from arraygeom import Camera, Pose, Rig, intrinsics
+from arraygeom.chunks import Tile
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.tiles import fuse_tile, working_memory
 from pat.fusion.views import Views
 from pat.matching.match import compared
 from pat.matching.matches import BetaMatches, Matches
 from pat.matching.multiview import agreed
-from pat.matching.pieces import Tile
 from pat.networks.weights import load_weights
 from pat.support.memory import give_back, limited, peak_memory, resident
 

@@ -1,0 +1,135 @@
+"""A large thing in parts: boxes of an image with halos, and functions that are called for one part after the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import chain, product
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from .tracing import transformations
+
+ROWS = 256
+"""Rows at a time: of an image of 12 megapixels, 12 MB of three colours in float32."""
+
+Box = tuple[int, ...]
+"""First pixel, and the one after the last, along each axis: (top, bottom, left, right) of an image."""
+
+
+class Tile(NamedTuple):
+    """A box of what is made, and the box of what is given that it needs: the same with a halo."""
+
+    inner: Box
+    outer: Box
+
+
+def area(box: Box) -> int:
+    """Pixels in a box."""
+    return math.prod(last - first for first, last in zip(box[::2], box[1::2]))
+
+
+def whole(lengths: Sequence[int]) -> Tile:
+    """All of a frame (h, w) as one tile."""
+    box = tuple(chain(*((0, n) for n in lengths)))
+    return Tile(box, box)
+
+
+def spans(length: int, step: int) -> list[tuple[int, int]]:
+    """First index, and the one after the last, of parts of `step`; the last part may be shorter."""
+    return [(first, min(first + step, length)) for first in range(0, max(length, 1), step)]
+
+
+def tiles_of(lengths: Sequence[int], side: int | Sequence[int], halo: int) -> Iterator[Tile]:
+    """Tiles of a frame (h, w), square or of a height and a width, whose halos end at its borders."""
+    sides = [side] * len(lengths) if isinstance(side, int) else side
+    for inner in product(*map(spans, lengths, sides)):
+        outer = ((max(first - halo, 0), min(last + halo, n)) for (first, last), n in zip(inner, lengths))
+        yield Tile(tuple(chain(*inner)), tuple(chain(*outer)))
+
+
+def chunked(
+    function: Callable[..., Any],
+    *tensors: Tensor,
+    rows: int | Sequence[int] = ROWS,
+    halo: int = 0,
+    axis: int | Sequence[int] = -2,
+) -> Any:
+    """`function(*tensors)`, computed for some rows at a time; with several axes, for one tile at a time.
+
+    The tensors are cut along the axis, and so is what the function gives: a tensor or several, as long as what it is
+    given or shorter by a whole factor, of which `rows` and `halo` are multiples. Each part is given `halo` more rows on
+    either side, as far as there are any; what the function gives for those is dropped. Gradients pass through.
+
+    Gives a tensor if the function does, else a tuple. If all fits into one part the function is called as it is.
+    """
+    axes = [axis] if isinstance(axis, int) else axis
+    lengths = [tensors[0].shape[a] for a in axes]
+
+    def part(box: Box) -> Any:
+        return function(*(_cut(t, box, axes) for t in tensors))
+
+    return assembled(lengths, ((tile, part(tile.outer)) for tile in tiles_of(lengths, rows, halo)), axes)
+
+
+def assembled(lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: Sequence[int] = (-2, -1)) -> Any:
+    """Tensors of a frame (h, w), put together from the inner parts of those of its tiles.
+
+    Of each tile a tensor or several are given, as large as the outer box or smaller by a whole factor. A tile that is
+    the whole frame is given back as it is.
+    """
+    planes: list[_Plane] = []
+    single = False
+    for tile, made in parts:
+        single = isinstance(made, Tensor)
+        tensors = (made,) if single else tuple(made)
+        if tile.inner == whole(lengths).inner:
+            return made if single else tensors
+        planes = planes or [_Plane(tensor, tile, lengths, axes) for tensor in tensors]
+        for plane, tensor in zip(planes, tensors):
+            plane.add(tensor, tile)
+        del made, tensors, tensor
+    joined = tuple(plane.tensor() for plane in planes)
+    return joined[0] if single else joined
+
+
+class _Plane:
+    """A tensor put together from parts: written in place, so that parts can be forgotten.
+
+    Along a single axis they are concatenated at the end where something follows them (gradients, transformations):
+    gradients through writing in place copy the whole once a part.
+    """
+
+    def __init__(self, part: Tensor, tile: Tile, lengths: Sequence[int], axes: Sequence[int]) -> None:
+        self.axes = axes
+        self.factor = (tile.outer[1] - tile.outer[0]) // part.shape[axes[0]]
+        self.parts: list[Tensor] = []
+        self.whole: Tensor | None = None
+        if len(axes) > 1 or not (part.requires_grad or transformations()):
+            shape = list(part.shape)
+            for axis, n in zip(axes, lengths):
+                shape[axis] = n // self.factor
+            order = sorted(range(part.ndim), key=part.stride, reverse=True)
+            self.whole = torch.empty_permuted(shape, order, dtype=part.dtype, device=part.device)
+
+    def add(self, part: Tensor, tile: Tile) -> None:
+        """Keep the inner part of what was made of a tile."""
+        inner, outer = (tuple(n // self.factor for n in box) for box in tile)
+        begin = [n for n in outer[::2] for _ in range(2)]
+        part = _cut(part, tuple(n - first for n, first in zip(inner, begin)), self.axes)
+        if self.whole is None:
+            self.parts.append(part)
+        else:
+            _cut(self.whole, inner, self.axes).copy_(part)
+
+    def tensor(self) -> Tensor:
+        """All of it."""
+        return torch.cat(self.parts, self.axes[0]) if self.whole is None else self.whole
+
+
+def _cut(t: Tensor, box: Box, axes: Sequence[int]) -> Tensor:
+    for axis, first, last in zip(axes, box[::2], box[1::2]):
+        t = t.narrow(axis, first, last - first)
+    return t

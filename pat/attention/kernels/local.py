@@ -1,0 +1,76 @@
+"""Attention of each pixel to a window around it, for images that lie channels first.
+
+A sample is the same step away from every pixel, so that work on one is work on a whole row of pixels side by side:
+inner products with it, and its share of the mean.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .emit import LANES, compiled
+from .layout import of, pointers
+from .softmax import exponentials
+from .vectors import add, load, maximum, splat, store, sub
+
+ROWS = 16
+"""Rows of pixels that a thread takes at a time."""
+LOWEST = np.finfo(np.float32).min
+"""What scores are compared with at least: of -inf alone all weights are 0."""
+
+
+@compiled(nogil=True, cache=True, fastmath={"contract"})
+def attend_rows(query, key, value, out, size, spacing, top):
+    """`ROWS` rows of `out`, from `top` on, of one image (channels, h, w): the mean of the values at `size` x `size`
+    pixels, `spacing` apart, by the softmax of inner products. What is outside the image does not count."""
+    channels, height, width = query.shape
+    scores = np.empty((size * size, -(-width // LANES) * LANES), np.float32)
+    total = np.empty(scores.shape[1], np.float32)
+    for y in range(top, min(top + ROWS, height)):
+        scores[:] = -np.inf
+        for t in range(size * size):
+            row, first, last, step = _sampled(t, y, size, spacing, height, width)
+            score = scores[t, first:last]
+            score[:] = 0
+            for c in range(channels):
+                own, other = query[c, y, first:last], key[c, row, first + step : last + step]
+                for x in range(last - first):
+                    score[x] += own[x] * other[x]
+        _exponentiate(pointers((scores, total)), scores.shape)
+        for c in range(len(value)):
+            mean = out[c, y]
+            mean[:] = 0
+            for t in range(size * size):
+                row, first, last, step = _sampled(t, y, size, spacing, height, width)
+                weight, other = scores[t, first:last], value[c, row, first + step : last + step]
+                inner = mean[first:last]
+                for x in range(last - first):
+                    inner[x] += weight[x] * other[x]
+            for x in range(width):
+                mean[x] /= total[x] if total[x] != 0 else np.float32(1)
+
+
+@compiled
+def _sampled(t, y, size, spacing, height, width):
+    """The row of sample t of the pixels in row y, the first of these for which it is in the image, the end of these,
+    and how far it is to the right."""
+    row, step = y + (t // size - size // 2) * spacing, (t % size - size // 2) * spacing
+    first, last = max(0, -step), min(width, width - step)
+    if row < 0 or row >= height or first >= last:
+        return 0, 0, 0, 0
+    return row, first, last, step
+
+
+@compiled
+def _exponentiate(rows, shape):
+    """From scores (samples, pixels) to exp(score - the largest of the pixel), in the same place, and their sums."""
+    scores, total = rows
+    for x in range(0, shape[1], LANES):
+        top, mass = splat(LOWEST), splat(np.float32(0))
+        for t in range(shape[0]):
+            top = maximum(load(of(scores, t), x), top)
+        for t in range(shape[0]):
+            weight = exponentials(sub(load(of(scores, t), x), top))
+            store(of(scores, t), x, weight)
+            mass = add(mass, weight)
+        store(total, x, mass)

@@ -1,0 +1,25 @@
+"""The compiled loop of `blocks`, in one thread and without Python's lock."""
+
+from __future__ import annotations
+
+from arraygeom.compiled import compiled, separate_cache
+
+COLUMNS = 32
+"""Columns whose channels are interleaved at a time: they stay in a core's first cache."""
+
+
+@compiled(nogil=True, cache=True)
+def unshuffle(upper, lower, out):
+    """The 2x2 pixels of images, of their even and odd rows (c, h, 2 w), as channels of `out` (h, w, 4 c), a few columns
+    at a time."""
+    channels, (height, width) = len(upper), out.shape[:2]
+    for y in range(height):
+        for left in range(0, width, COLUMNS):
+            for c in range(channels):
+                above, below, k = upper[c, y], lower[c, y], 4 * c
+                for x in range(left, min(left + COLUMNS, width)):
+                    out[y, x, k], out[y, x, k + 1] = above[2 * x], above[2 * x + 1]
+                    out[y, x, k + 2], out[y, x, k + 3] = below[2 * x], below[2 * x + 1]
+
+
+separate_cache(unshuffle)

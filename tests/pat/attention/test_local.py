@@ -1,0 +1,101 @@
+"""The backend for windows: equal to the reference, chosen where it serves, and refused where it does not."""
+
+import pytest
+import torch
+from torch.autograd import forward_ad
+
+from arraygeom import Local, Pair, View, lazily
+from pat.attention import attend, attend_with_statistics, cpu
+from pat.attention.kernels import ROWS
+
+
+def features(hw=(20, 30), dtype=torch.float32, batch=2):
+    g = torch.Generator().manual_seed(hw[0])
+    return [torch.randn(batch, n, *hw, generator=g).to(dtype) for n in (9, 9, 4)]
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+@pytest.mark.parametrize("field", [Local(7), Local(7, 3), Local(7, 8), Local(3, 2.0), Local(1)], ids=str)
+@pytest.mark.parametrize("hw", [(5, 9), (2 * ROWS + 3, 40)])
+def test_it_gives_what_the_others_give(hw, field, backend):
+    query, key, value = features(hw)
+    wanted = attend(query.double(), 5 * key.double(), value.double(), field, interpolation="nearest", backend=backend)
+    found = attend(query, 5 * key, value, field, interpolation="nearest", backend="local")
+    torch.testing.assert_close(found.double(), wanted, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("score", [torch.nan, torch.inf, -torch.inf])
+def test_scores_without_a_number_do_what_they_do_in_the_reference(score):
+    query, key, value = (t.abs() for t in features())
+    key[:, :, :8, :8] = score
+    local, reference = (
+        attend(query, key, value, Local(3), interpolation="nearest", backend=backend)
+        for backend in ("local", "reference")
+    )
+    torch.testing.assert_close(local, reference, equal_nan=True)
+    assert local[..., 2:5, 2:5].isnan().all() == (score != -torch.inf)
+
+
+def test_threads_change_no_bit():
+    given, before, found = features((70, 50)), torch.get_num_threads(), []
+    try:
+        for n in (1, 2, 5):
+            torch.set_num_threads(n)
+            found.append(attend(*given, Local(7, 3), interpolation="nearest", backend="local"))
+    finally:
+        torch.set_num_threads(before)
+    assert all(torch.equal(one, found[0]) for one in found)
+
+
+def with_gradient():
+    query, key, value = features()
+    return query, key.requires_grad_(), value
+
+
+UNSERVED = {
+    "bilinear": (features(), Local(3), {"interpolation": "bilinear"}),
+    "bias": (features(), Local(3), {"bias": torch.zeros(9)}),
+    "even size": (features(), Local(4), {}),
+    "half a pixel": (features(), Local(3, 1.5), {}),
+    "float64": (features(dtype=torch.float64), Local(3), {}),
+    "16 bits": (features(dtype=torch.bfloat16), Local(3), {}),
+    "gradient": (with_gradient(), Local(3), {}),
+    "two sizes": ((features()[0], *features((10, 15))[1:]), Local(3), {}),
+    "any function": (features(), lazily(Local(3), Pair(View(hw=(20, 30)), View(hw=(20, 30)))), {}),
+}
+
+
+@pytest.mark.parametrize("asked", UNSERVED)
+def test_what_it_cannot_serve_others_do(asked, monkeypatch):
+    given, field, options = UNSERVED[asked]
+    options = {"interpolation": "nearest"} | options
+    with pytest.raises(RuntimeError, match="'local' serves nearest values"):
+        attend(*given, field, backend="local", **options)
+    monkeypatch.setattr(cpu, "forward_local", pytest.fail)
+    found, wanted = (attend(*given, field, backend=backend, **options) for backend in ("auto", "reference"))
+    torch.testing.assert_close(found, wanted, rtol=1e-2 if asked == "16 bits" else 1e-4, atol=1e-4)
+
+
+def test_forward_mode_is_the_references():
+    query, key, value = features()
+    with forward_ad.dual_level():
+        given = query, forward_ad.make_dual(key, torch.ones_like(key)), value
+        with pytest.raises(RuntimeError, match="derivatives"):
+            attend(*given, Local(3), interpolation="nearest", backend="local")
+        assert forward_ad.unpack_dual(attend(*given, Local(3), interpolation="nearest")).tangent is not None
+
+
+def test_statistics_are_by_the_others():
+    given = features()
+    found = attend_with_statistics(*given, Local(3), interpolation="nearest")
+    wanted = attend_with_statistics(*given, Local(3), interpolation="nearest", backend="reference")
+    for one, other in zip(found, wanted):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+
+
+def test_it_is_chosen_where_it_serves(monkeypatch):
+    given, called = features(), []
+    monkeypatch.setattr(cpu, "forward_local", lambda *inputs: called.append(inputs) or inputs[2])
+    attend(*given, Local(3), interpolation="nearest")
+    attend(*given, Local(3), interpolation="nearest", backend="cpu")
+    assert len(called) == 1
