@@ -74,32 +74,45 @@ def _of(rows: Sequence[Row], sweep: str, field: str, value: float, measure: str)
 
 
 def save_curves(rows: Sequence[Row], path: Path) -> Path:
-    """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the mean."""
+    """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the mean.
+
+    PSNR is drawn against the first field at the first value, scene by scene: scenes differ by more than fields.
+    """
     sweeps = distinct(row.sweep for row in rows)
     figure = new_figure(figsize=(3.2 * len(sweeps), 6.0))
     axes = figure.subplots(len(MEASURES), len(sweeps), squeeze=False)
     for line, measure in zip(axes, MEASURES):
         for axis, sweep in zip(line, sweeps):
-            _draw(axis, rows, sweep, measure)
+            _draw(axis, [row for row in rows if row.sweep == sweep], measure)
+            axis.set_xlabel(SWEEPS[sweep][0].replace(", ", ",\n") if sweep in SWEEPS else sweep, fontsize=8)
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), frameon=False)
     figure.tight_layout(rect=(0, 0.05, 1, 1))
     return save_figure(figure, path)
 
 
-def _draw(axis: Axes, rows: Sequence[Row], sweep: str, measure: str) -> None:
-    values = distinct(row.value for row in rows if row.sweep == sweep)
+def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
+    """The curves of one sweep."""
+    values = distinct(row.value for row in rows)
     for field in distinct(row.field for row in rows):
-        found = {value: _of(rows, sweep, field, value, measure) for value in values}
+        found = {value: _drawn(rows, field, value, measure) for value in values}
         known = [value for value in values if found[value]]
         means = np.array([np.mean(found[value]) for value in known])
         bounds = np.array([bootstrap_interval(found[value]) for value in known]).reshape(-1, 2)
         spread = np.abs(np.nan_to_num(bounds.T - means)) if len(known) else None
         axis.errorbar(known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1)
-    axis.set_xlabel(SWEEPS[sweep][0].replace(", ", ",\n") if sweep in SWEEPS else sweep, fontsize=8)
-    axis.set_ylabel(MEASURES[measure][0], fontsize=8)
+    axis.set_ylabel(f"{'gain in ' if measure == 'psnr' else ''}{MEASURES[measure][0]}", fontsize=8)
     axis.tick_params(labelsize=8)
     axis.grid(alpha=0.3)
+
+
+def _drawn(rows: Sequence[Row], field: str, value: float, measure: str) -> list[float]:
+    """What is drawn of each scene where there is something."""
+    if measure != "psnr":
+        return _of(rows, rows[0].sweep, field, value, measure)
+    first = {r.scene: r.psnr for r in rows if (r.field, r.value) == (rows[0].field, rows[0].value)}
+    found = [r.psnr - first[r.scene] for r in rows if (r.field, r.value) == (field, value) and r.scene in first]
+    return [gain for gain in found if not math.isnan(gain)]
 
 
 def _plain(row: Row) -> dict[str, object]:
