@@ -20,6 +20,7 @@ from .tables import distinct, markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 MEASURES = {"psnr": ("PSNR, dB", "{:.2f}"), "peaks": ("peaks within a pixel, %", "{:.1f}")}
 """What is drawn, its label, and how it is printed."""
@@ -42,6 +43,11 @@ def read_rows(path: str | Path) -> list[Row]:
         return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in found]
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
+
+
+def shipped_rows() -> list[Row]:
+    """The rows of `pat ablate` with the weights that ship, computed once."""
+    return read_rows(Path(__file__).with_name("ablation.json"))
 
 
 def markdown(rows: Sequence[Row]) -> str:
@@ -74,6 +80,11 @@ def _of(rows: Sequence[Row], sweep: str, field: str, value: float, measure: str)
 
 
 def save_curves(rows: Sequence[Row], path: Path) -> Path:
+    """Write the figure of `curves`."""
+    return save_figure(curves(rows), path)
+
+
+def curves(rows: Sequence[Row]) -> Figure:
     """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the mean.
 
     PSNR is drawn against the first field at the first value, scene by scene: scenes differ by more than fields.
@@ -88,7 +99,7 @@ def save_curves(rows: Sequence[Row], path: Path) -> Path:
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), frameon=False)
     figure.tight_layout(rect=(0, 0.05, 1, 1))
-    return save_figure(figure, path)
+    return figure
 
 
 def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
@@ -116,5 +127,6 @@ def _drawn(rows: Sequence[Row], field: str, value: float, measure: str) -> list[
 
 
 def _plain(row: Row) -> dict[str, object]:
-    """NaN is no JSON."""
-    return {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in row._asdict().items()}
+    """Seven digits; NaN is no JSON."""
+    plain = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row._asdict().items()}
+    return {k: None if v != v else v for k, v in plain.items()}
