@@ -38,7 +38,7 @@ from ..networks.protocol import Comparing
 from ..synthesis.photos import PhotoBank
 from .metrics import score
 from .protocols import hw_of, mono_colour_task, rectified_rig
-from .sweeps import ALPHA, BETA, Scene, fused, made, rig_of
+from .sweeps import ALPHA, BETA, RecordedScene, fused, made, rig_of
 from .tables import distinct, markdown_table
 
 DENSE_LIMIT = 2**28
@@ -51,8 +51,8 @@ class Case(NamedTuple):
     kind: str
     name: str
     pair: Pair
-    scene: Scene
-    reach: float
+    scene: RecordedScene
+    max_displacement: float
 
 
 class FieldRow(NamedTuple):
@@ -72,15 +72,15 @@ class FieldRow(NamedTuple):
     note: str = ""
 
 
-def fields_of(reach: float) -> dict[str, ReceptiveField]:
-    """The families by name, for pairs whose points move up to `reach` pixels from H x."""
+def fields_of(max_displacement: float) -> dict[str, ReceptiveField]:
+    """The families by name, for pairs whose points move up to so many pixels from H x."""
     return {
         "epipolar": Epipolar(),
         "full line": EpipolarLine(),
-        "homography + displacement": HomographyDisplacement(reach),
+        "homography + displacement": HomographyDisplacement(max_displacement),
         "nearest voxels": NearestVoxels(),
-        "rectified": Rectified(reach, alpha_is="left"),
-        "curved": Curved(math.ceil(reach) + 1),
+        "rectified": Rectified(max_displacement, alpha_is="left"),
+        "curved": Curved(math.ceil(max_displacement) + 1),
         "local 5x5": Local(),
         "widened by 1 px": Widened(Epipolar(), across=1.0),
         "dense": Dense(),
@@ -96,7 +96,7 @@ def rectified_cases(pairs: Iterable[StereoPair], *, rate: int = 2, linked: bool 
         task = mono_colour_task(pair, rate)
         h, w = hw_of(task.alpha)
         beta = interpolate(task.beta[None], (h, w), mode="bicubic", align_corners=False)[0].clamp(0, 1)
-        scene = Scene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(pair, (h, w)))
+        scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(pair, (h, w)))
         rig = rectified_rig((h, w), {BETA: (h, w)}, PAPER_DISPARITY)
         known = row_link((h, w)) if linked else rig.pair(ALPHA, BETA)
         yield Case("F alone" if linked else "rectified pairs", pair.name, known, scene, PAPER_DISPARITY)
@@ -135,7 +135,7 @@ def evaluate_fields(
     """Every field on every case."""
     rows = []
     for case in cases:
-        for name, field in fields(case.reach).items():
+        for name, field in fields(case.max_displacement).items():
             rows.append(_row(network, case, name, field))
             each(rows[-1])
     return rows

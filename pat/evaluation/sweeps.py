@@ -70,7 +70,7 @@ class Point(NamedTuple):
     assumed: Rig
 
 
-class Scene(NamedTuple):
+class RecordedScene(NamedTuple):
     """Recorded images by name, alpha's view in colour, where its pixels are in beta (h, w, 2), which beta sees."""
 
     images: dict[str, Tensor]
@@ -199,7 +199,9 @@ def _numbers(rig: Rig) -> bytes:
     return b"".join(t.numpy().tobytes() for c in two(rig).pair(ALPHA, BETA).cameras for t in (c.K, c.R, c.t))
 
 
-def _row(network: Comparing, point: Point, name: str, field: ReceptiveField | Way, number: int, scene: Scene) -> Row:
+def _row(
+    network: Comparing, point: Point, name: str, field: ReceptiveField | Way, number: int, scene: RecordedScene
+) -> Row:
     way = field if hasattr(field, "fuse") else Directly(field)
     began = time.perf_counter()
     try:
@@ -234,7 +236,7 @@ def two(rig: Rig) -> Rig:
     return Rig(dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range))
 
 
-def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> Scene:
+def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene:
     """Scene `number`, of the same things whatever the rig, recorded with some noise."""
     g = generator_for(seed, "sweep", number)
     pair = rig.pair(ALPHA, BETA)
@@ -245,7 +247,7 @@ def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> Scene:
     steps = [Noise(8000, 3), Clip(), Quantise(8)]
     images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}
     recorded = {name: record(image, steps, g).image[0] for name, image in images.items()}
-    return Scene(recorded, batch.images[0][0], position, visible)
+    return RecordedScene(recorded, batch.images[0][0], position, visible)
 
 
 def seen_at(

@@ -77,10 +77,10 @@ def test_every_family_is_scored_or_named(network):
 def test_what_cannot_serve_is_named(network, pair):
     case = next(rectified_cases([pair], linked=True))
     fields = {"epipolar": Epipolar(), "rectified": Rectified(12.0, alpha_is="left")}
-    epipolar, rectified = evaluate_fields(network, [case], fields=lambda reach: fields)
+    epipolar, rectified = evaluate_fields(network, [case], fields=lambda max_displacement: fields)
     assert epipolar.note
     assert "| epipolar | " in fields_markdown([epipolar, rectified])
     large = case._replace(
         scene=case.scene._replace(images={ALPHA: torch.rand(1, 200, 200), BETA: torch.rand(3, 200, 200)})
     )
-    assert "left out" in evaluate_fields(network, [large], fields=lambda reach: {"dense": Dense()})[0].note
+    assert "left out" in evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})[0].note
