@@ -149,7 +149,7 @@ class Ablate:
     """Folder of scenes written by `pat render`, for --families: their first camera is alpha, their second beta."""
     scenes: int = 6
     """Number of scenes, of each rig."""
-    hw: tuple[int, int] | None = None
+    hw: Annotated[tuple[int, int] | None, optional("H W")] = None
     """Height and width of both images: 96 128, or 240 320 with --families."""
     seed: int = 0
     """Of the scenes."""
