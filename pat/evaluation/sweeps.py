@@ -15,6 +15,7 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from arraygeom import (
     Camera,
@@ -40,6 +41,7 @@ from arraygeom.fields.straight import covering_displacement
 from arraygeom.pixels import HW
 
 from ..attention.scores import peak_position
+from ..fusion.steps import resolution_ratio
 from ..matching.inputs import Inputs
 from ..media.colour import luminance
 from ..networks.protocol import Comparing
@@ -115,13 +117,22 @@ class Way(Protocol):
 
 @dataclass(frozen=True)
 class Directly:
-    """The images as they are, with a field."""
+    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a field."""
 
     field: ReceptiveField
 
     def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
-        """The network with the field of the pair."""
-        return fused(network, rig.pair(ALPHA, BETA), images[ALPHA], images[BETA], self.field)
+        """The network with the field of the pair. All of beta is searched as it is: enlarged it would not fit."""
+        pair, beta = rig.pair(ALPHA, BETA), images[BETA]
+        ratio = resolution_ratio(pair)
+        if 0.8 < ratio < 1.25 or isinstance(self.field, Dense):
+            return fused(network, pair, images[ALPHA], beta, self.field)
+        hw = [round(n / ratio) for n in pair.beta.hw]
+        larger = interpolate(beta[None], hw, mode="bicubic", align_corners=False, antialias=ratio > 1)[0].clamp(0, 1)
+        resized = Pair(pair.alpha, pair.cameras[1].resize((hw[0], hw[1])), pair.depth)
+        found = fused(network, resized, images[ALPHA], larger, self.field)
+        step = found.peak.new_tensor([pair.beta.hw[1] / hw[1], pair.beta.hw[0] / hw[0]])
+        return found._replace(peak=(found.peak + 0.5) * step - 0.5)
 
 
 @dataclass(frozen=True)
