@@ -246,7 +246,8 @@ def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) ->
     if not _has_lens(recorded):
         where, inside = found.positions(beta.field.straight, hw)
         return _Located(where[0, :h, :w], inside[0, :h, :w], consistent[0, 0])
-    assert isinstance(pinhole, LensView) and isinstance(recorded, LensView)
+    assert isinstance(pinhole, LensView)
+    assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
 
@@ -292,7 +293,8 @@ def _at_pixels(
     """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
     if not _has_lens(recorded):
         return plane
-    assert isinstance(pinhole, LensView) and isinstance(recorded, LensView)
+    assert isinstance(pinhole, LensView)
+    assert isinstance(recorded, LensView)
     return sampled_between(plane, pinhole, pixels_between(pinhole, recorded), interpolation).values[0]
 
 
@@ -366,24 +368,20 @@ def _band_names(name: str, count: int) -> tuple[str, ...]:
     return tuple(f"{name}.{band}" for band in ("red", "green", "blue") * (count == 3) or range(1, count + 1))
 
 
-def resampled_values(
-    values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling
-) -> NDArray[Any]:
+def resampled_values(values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling) -> NDArray[Any]:
     """Recorded values (C, H, W) at positions (h, w, 2), in their own type: (C, h, w). Of integers rounded.
 
     In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Beyond the edge values are 0.
     """
     kind = INTERPOLATIONS[interpolation]
+    where = torch.from_numpy(positions)
 
-    def band(image: Tensor, where: Tensor) -> Tensor:
-        return sample(image[None, None], where[None].double(), interpolation=kind).values[0, 0]
+    def band(plane: NDArray[Any]) -> NDArray[Any]:
+        image = torch.from_numpy(plane.astype(np.float64))[None, None]
+        taken = chunked(lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0)
+        return _in_type(taken.numpy(), values.dtype)
 
-    taken = []
-    for plane in values:
-        image = torch.from_numpy(plane.astype(np.float64))
-        found = chunked(lambda where: band(image, where), torch.from_numpy(positions), axis=0)
-        taken.append(_in_type(found.numpy(), values.dtype))
-    return np.stack(taken)
+    return np.stack([band(plane) for plane in values])
 
 
 def _in_type(values: NDArray[np.float64], dtype: Any) -> NDArray[Any]:
@@ -404,4 +402,3 @@ def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArra
     nearest = np.zeros(labels.max() + 1, np.int64)
     nearest[labels[valid]] = np.flatnonzero(valid)
     return values.reshape(len(values), -1)[:, nearest[labels]]
-
