@@ -8,13 +8,14 @@ pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye
 axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F takes to pixels. `RigRelatives` are degrees
 about x, y and z, R = Rx Ry Rz: camera->rig, inverted; `RigTranslations` are the cameras' centres, metres. DJI's
 `DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx and cy counted from `CalibratedOpticalCenter`.
+All are of the pixels as stored: the rig is of the images as their orientation tags say.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +40,8 @@ LONGEST_TRANSLATION = 1.0
 """Metres between cameras of one body; what is longer is in another unit."""
 BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x8833, 0x9003, 0xA431
 RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
+ORIENTATION, QUARTER_TURNS = 274, {1: 0, 3: 2, 6: 3, 8: 1}
+"""EXIF's orientations, and the quarter turns counter-clockwise that put them upright."""
 MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 """Of EXIF's units of resolution: inch, cm, mm, micrometre."""
 
@@ -61,7 +64,7 @@ def capture_of(path: Path) -> list[Path]:
     return [p for p in beside if _states_camera(image_tags(p))] if stem else [path]
 
 
-def named_by_band(paths: list[Path]) -> dict[str, Path]:
+def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
     """Images by the names of their bands; where those are not given, by what follows the last "_" of the files'."""
     bands = []
     for path in paths:
@@ -76,7 +79,7 @@ def named_by_band(paths: list[Path]) -> dict[str, Path]:
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
 
 
-def states_cameras(paths: list[Path]) -> bool:
+def states_cameras(paths: Sequence[Path]) -> bool:
     """Whether the tags of every image state its camera."""
     return bool(paths) and all(
         path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path)) for path in paths
@@ -165,9 +168,16 @@ class _Image(NamedTuple):
         self._check_centre(K)
         rotation = self.rotation
         R = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.mT
-        return Camera(
-            K=K, cam_from_world=Pose(R, -R @ self.centre), hw=self.tags.hw, distortion=lens, sensor=self.sensor()
-        )
+        pose = Pose(R, -R @ self.centre)
+        camera = Camera(K=K, cam_from_world=pose, hw=self.tags.hw, distortion=lens, sensor=self.sensor())
+        return camera.rot90(self._quarter_turns())
+
+    def _quarter_turns(self) -> int:
+        """Those by which a viewer, and `pat`, rotate the stored pixels, which the tags are of."""
+        orientation = int(self.tags.fields.get(ORIENTATION, (1,))[0])
+        if orientation not in QUARTER_TURNS:
+            raise self.source.fail("Orientation", f"is {orientation}, a mirrored image: save it as the camera did")
+        return QUARTER_TURNS[orientation]
 
     def _pix4d(self) -> tuple[Tensor, Distortion | None]:
         kind, centre = self.text("ModelType"), self.needed("PrincipalPoint", 2)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from html import escape
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -64,8 +64,8 @@ def shown_layers(aligned: Aligned) -> dict[str, Float[Tensor, "_ h w"]]:
             layers |= {band: plane[None] for band, plane in zip(view.bands[1:], bands[1:])}
     for name, waves in COLOURS.items():
         chosen = [_band_near(aligned, wave) for wave in waves]
-        if len({band for band, _ in chosen}) == len(waves):
-            layers[name] = torch.stack([_stretched(values, valid) for _, (values, valid) in chosen])
+        if all(chosen) and len({band.name for band in chosen if band}) == len(waves):
+            layers[name] = torch.stack([_stretched(band.values, band.valid) for band in chosen if band])
     if (index := ndvi(aligned)) is not None:
         layers["NDVI"] = _index_colours(index)
     if np.isfinite(aligned.depth).any():
@@ -79,36 +79,42 @@ def ndvi(aligned: Aligned) -> NDArray[np.float32] | None:
     None without bands near 840 and 660 nm. Only of values that are proportional to reflectance is it the index of the
     literature (Tucker 1979).
     """
-    (infrared, near), (red, far) = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
-    if not infrared or not red or infrared == red:
+    nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
+    if nir is None or red is None or nir.name == red.name:
         return None
-    (nir, seen), (r, sees) = near, far
-    total = nir.astype(np.float32) + r.astype(np.float32)
+    one, other = (band.values.astype(np.float32) for band in (nir, red))
+    total = one + other
     with np.errstate(all="ignore"):
-        index = (nir.astype(np.float32) - r.astype(np.float32)) / total
-    return np.where(seen & sees & (total > 0), index, np.float32(np.nan))
+        index = (one - other) / total
+    return np.where(nir.valid & red.valid & (total > 0), index, np.float32(np.nan))
 
 
-def _band_near(aligned: Aligned, wave: float) -> tuple[str, tuple[Any, Any]]:
-    """The name, values and validity of the band nearest to a wavelength; an empty name if none is near."""
-    found = [
-        (abs(centre - wave), name, (values, view.valid))
+class _ShownBand(NamedTuple):
+    """A band of an alignment, and where its camera sees the point."""
+
+    name: str
+    values: NDArray[Any]
+    valid: NDArray[np.bool_]
+
+
+def _band_near(aligned: Aligned, wave: float) -> _ShownBand | None:
+    """The band whose centre is nearest to a wavelength; None if none is near."""
+    found = {
+        abs(centre - wave): _ShownBand(name, values, view.valid)
         for view in aligned.values()
         for name, centre, values in zip(view.bands, view.wavelengths, view.values)
         if centre is not None and abs(centre - wave) <= NEAREST
-    ]
-    if not found:
-        return "", (None, None)
-    _, name, parts = min(found, key=lambda one: one[0])
-    return name, parts
+    }
+    return found[min(found)] if found else None
 
 
 def _stretched(values: NDArray[Any], valid: NDArray[np.bool_]) -> Float[Tensor, "h w"]:
-    counts = valid & np.isfinite(values)
+    light = values.astype(np.float32)
+    counts = valid & np.isfinite(light)
     if not counts.any():
         return torch.zeros(values.shape)
-    low, high = np.percentile(values[counts], STRETCH)
-    shown = np.nan_to_num((values.astype(np.float32) - low) / max(high - low, 1e-9)).clip(0, 1)
+    low, high = np.percentile(light[counts], STRETCH)
+    shown = np.nan_to_num((light - low) / max(high - low, 1e-9)).clip(0, 1)
     return torch.from_numpy(shown.astype(np.float32))
 
 
