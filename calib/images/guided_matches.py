@@ -6,6 +6,8 @@ squared, does not depend on the sign of its contrast, and the search is confined
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 import torch
@@ -59,7 +61,7 @@ def guided_matches(
 def _most_alike(
     own: NDArray[np.uint8],
     other: NDArray[np.uint8],
-    valid: NDArray[np.uint8],
+    valid: NDArray[Any],
     x: NDArray[np.float64],
     there: NDArray[np.float64],
     window: int,

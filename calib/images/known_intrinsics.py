@@ -25,9 +25,9 @@ from .refinement import refine_matches
 from .self_calibration import depth_bounds
 
 WINDOW = 0.09
-"""Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m and 60 degrees."""
+"""Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
 NEAR = 4.0
-"""Matches this many pixels from the line of a baseline are consistent with it: an orientation is known to .2 degrees."""
+"""Matches this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
 SHARE = 0.4
 """A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3 are."""
 TRIALS = 500
@@ -135,11 +135,11 @@ def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], Matches]
         weight = (off.median() / off.clamp(min=1e-3 * float(off.median()) + 1e-12)).sqrt()
     centres = {alpha: axes.new_zeros(3), **{name: axes[-1].reshape(-1, 3)[i] for name, i in index.items()}}
     ahead = sum(_points_ahead(rig, pair, matches, centres) for pair, matches in pairs.items())
-    sign = 1.0 if ahead >= 0 else -1.0
+    side = 1.0 if ahead >= 0 else -1.0
     cameras = {}
     for name, camera in rig.cameras.items():
         R = camera.R.double() @ rig[alpha].R.double().mT
-        centre = sign * rig[alpha].R.double() @ centres[name]
+        centre = side * rig[alpha].R.double() @ centres[name]
         cameras[name] = camera.replace(cam_from_world=Pose(R, -R @ centre))
     return Rig(cameras)
 

@@ -48,6 +48,8 @@ class Align:
     beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and index.html."""
     interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
     """Between recorded values; nearest keeps them."""
+    confidence: float = 0.5
+    """From which confidence on, 0 to 1, a camera counts as seeing a point: lower keeps more, with more mistakes."""
     fill: Literal["none", "propagate"] = "none"
     """Pixels that a camera does not see: none leaves them without a value, propagate takes the nearest value seen."""
     separate: bool = False
@@ -146,6 +148,7 @@ class Align:
                     network=None if self.weights is None else load_weights(self.weights),
                     field=options.field_named(self.field),
                     interpolation=self.interpolation,
+                    min_confidence=self.confidence,
                     fill=self.fill,
                     max_memory=self.max_memory,
                     match_levels=self.normalise_radiometry,

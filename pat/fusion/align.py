@@ -28,7 +28,6 @@ from ..matching.inputs import Beta
 from ..matching.match import Matcher, match
 from ..matching.matches import BetaMatches
 from ..matching.radiometry import Given
-from ..matching.semi_global import CONSISTENT, enlarged
 from ..media.images import Images
 from ..networks.protocol import FusionNetwork
 from ..support.memory import limited, parse_bytes
@@ -49,7 +48,12 @@ Fill = Literal["none", "propagate"]
 INTERPOLATIONS: dict[str, Interpolation] = {"nearest": "nearest", "bilinear": "bilinear", "cubic": "bicubic"}
 
 OUTSIDE, OCCLUDED, SEEN = 0, 1, 2
-"""Visibility of alpha's pixels in a beta: beyond its edge; hidden from it or without a consistent match; seen."""
+"""Visibility of alpha's pixels in a beta: beyond its edge; occluded, or without a match of enough confidence; seen."""
+
+LEAST_CONFIDENCE = 0.5
+"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not. On the real
+motorcycle pair 26 % of occluded pixels exceed it and 9 % of others do not; .3: 41 and 4 %; the left-right check of
+matching alone: 46 and 3 %."""
 
 SMOOTH = 1.0
 """Pixels by which a disparity between alpha's may differ from the nearest one's, at most: beyond is a depth edge, where
@@ -144,6 +148,7 @@ def align(
     depth: tuple[float, float] | None = None,
     field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
     interpolation: Resampling = "bilinear",
+    min_confidence: float = LEAST_CONFIDENCE,
     fill: Fill = "none",
     max_memory: float | str | None = None,
     match_levels: bool = False,
@@ -156,13 +161,14 @@ def align(
     """Every camera's own values at the pixels of camera `alpha`.
 
     `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `progress` and `matcher` are
-    as of `fuse`, and `correct` is its `align`; they serve to find where alpha's pixels are in each beta. An occluded
-    pixel is one from which matching back from beta ends elsewhere.
+    as of `fuse`, and `correct` is its `align`; they serve to find where alpha's pixels are in each beta. A pixel
+    counts as occluded where the confidence that beta sees its point, and there, is low.
 
     Args:
         recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default the images.
         network: the one whose confidence is taken; by default the shipped weights for bands as the betas'.
         interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers rounded.
+        min_confidence: from which confidence on a camera counts as seeing a point, 0 to 1.
         fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen value.
 
     Raises ValueError as `fuse`, and for recorded values of another size than the rig says.
@@ -202,7 +208,10 @@ def align(
             place = inputs.placements[i]
             located = _located(inputs, i, matches.betas[i], rig[alpha])
             confidence = _at_pixels(done.found[i, 2:], place.pair.alpha, rig[alpha], "bilinear")[0]
-            aligned[name] = _aligned_view(rig, name, place, located, confidence, own[name], interpolation, fill)
+            seen = confidence >= min_confidence
+            aligned[name] = _aligned_view(
+                rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
+            )
     return Aligned(alpha, aligned, depths.numpy())
 
 
@@ -228,12 +237,10 @@ def _with_pixels(rig: Rig) -> Rig:
 
 
 class _Located(NamedTuple):
-    """Positions of alpha's recorded pixels (H, W, 2) in a beta as prepared, which are on it, and which matches are
-    consistent."""
+    """Positions of alpha's recorded pixels (H, W, 2) in a beta as prepared, and which are on it."""
 
     where: Float[Tensor, "h w 2"]
     inside: Bool[Tensor, "h w"]
-    consistent: Bool[Tensor, "h w"]
 
 
 def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) -> _Located:
@@ -241,22 +248,16 @@ def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) ->
     h, w = inputs.hw
     beta = inputs.inputs.betas[i]
     hw = (beta.image.shape[-2], beta.image.shape[-1])
-    consistent = enlarged((found.facts[:, :1] < CONSISTENT).to(found.disparity))[..., :h, :w] > 0.5
-    pinhole = inputs.placements[i].pair.alpha
     if not _has_lens(recorded):
         where, inside = found.positions(beta.field.straight, hw)
-        return _Located(where[0, :h, :w], inside[0, :h, :w], consistent[0, 0])
+        return _Located(where[0, :h, :w], inside[0, :h, :w])
+    pinhole = inputs.placements[i].pair.alpha
     assert isinstance(pinhole, LensView)
     assert isinstance(recorded, LensView)
     x, seen = pixels_between(pinhole, recorded)
     disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
-
-    def located(x: Tensor, disparity: Tensor) -> tuple[Tensor, Tensor]:
-        return _at_points(beta, found, x, disparity, hw)
-
-    where, inside = chunked(located, x, disparity, axis=0)
-    back = sampled_between(consistent[0].float(), pinhole, (x, seen), "nearest").values[0, 0]
-    return _Located(where, inside & seen, back > 0.5)
+    where, inside = chunked(lambda x, disparity: _at_points(beta, found, x, disparity, hw), x, disparity, axis=0)
+    return _Located(where, inside & seen)
 
 
 def _at_points(
@@ -318,29 +319,30 @@ def recorded_pixels(
 
 
 def _aligned_view(
-    rig: Rig,
+    camera: LensView,
     name: str,
     place: Placement,
     located: _Located,
     confidence: Float[Tensor, "h w"],
+    seen: Bool[Tensor, "h w"],
     values: Any,
     interpolation: Resampling,
     fill: Fill,
 ) -> AlignedView:
-    camera, now = rig[name], place.pair.beta
-    values = _as_array(values, name, camera.hw)
+    values, now = _as_array(values, name, camera.hw), place.pair.beta
     assert isinstance(now, LensView)
     where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located.where.double(), axis=0)
     where = where.float()
     inside = located.inside & valid & on_image(where, camera.hw)
-    visibility = torch.where(inside, torch.where(located.consistent, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
-    taken = resampled_values(values, where.numpy(), interpolation)
-    taken = filled(taken, visibility == SEEN, fill)
-    positions = torch.where(inside[..., None], where, torch.nan).numpy()
-    confidence = torch.where(inside, confidence.float(), 0.0)
-    sensor = camera.sensor
+    visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
+    taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
     return AlignedView(
-        taken, positions, visibility, confidence.numpy(), _band_names(name, len(values)), sensor.response
+        taken,
+        torch.where(inside[..., None], where, torch.nan).numpy(),
+        visibility,
+        torch.where(inside, confidence.float(), 0.0).numpy(),
+        _band_names(name, len(values)),
+        camera.sensor.response,
     )
 
 
