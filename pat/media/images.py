@@ -21,6 +21,7 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
+from arraygeom.image_bytes import decodable
 
 from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
@@ -230,9 +231,9 @@ def _log_level(level: int) -> int:
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
     """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
-    level = _log_level(0)
+    level, checked = _log_level(0), decodable(content)
     try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
     except cv2.error:
         return None
     finally:
