@@ -29,7 +29,7 @@ class TiffEntry(NamedTuple):
     value: int
     place: int
     form: str
-    count: int
+    values: int
 
 
 def decodable(content: bytes) -> bytes | None:
@@ -94,4 +94,4 @@ def _is_whole(content: bytes) -> bool:
 
 def _values(content: bytes, entry: TiffEntry) -> np.ndarray:
     """As float64, in which sums of 64 bits do not wrap. Raises ValueError where the file ends before the last."""
-    return np.frombuffer(content, np.dtype(entry.form), entry.count, entry.place).astype(np.float64)
+    return np.frombuffer(content, np.dtype(entry.form), entry.values, entry.place).astype(np.float64)

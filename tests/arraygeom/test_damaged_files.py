@@ -1,6 +1,7 @@
 """Files that crash the parsers underneath (OpenCV's, scipy's): refused before these see them."""
 
 import json
+import os
 import random
 import time
 from pathlib import Path
@@ -140,3 +141,11 @@ def test_a_message_shows_a_value_in_short(camera, tmp_path):
     message = str(caught.value).replace(str(tmp_path), "")
     assert "0.3333, 0.3333" in message
     assert len(message) < 200
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")
+def test_a_pipe_is_no_rig(tmp_path):
+    """Reading one waits for ever."""
+    os.mkfifo(tmp_path / "rig.yaml")
+    with pytest.raises(RigFileError, match="neither a file nor a folder"):
+        read_rig(tmp_path / "rig.yaml", format="native")
