@@ -297,15 +297,21 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     return planes.astype(np.float32) / np.float32(white)
 
 
-def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
-    if bits != 32:
-        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+def exr_writer(path: Path) -> Any:
+    """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
     try:
         import OpenEXR
     except ImportError:
         raise ValueError(
             f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
         ) from None
+    return OpenEXR
+
+
+def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
+    if bits != 32:
+        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+    OpenEXR = exr_writer(path)
     names = {1: "Y", 3: "RGB", 4: "RGBA"}[len(planes)]
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
