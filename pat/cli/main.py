@@ -38,6 +38,7 @@ class Pat:
         "data": authors.Data,
         "render": authors.Render,
         "train": authors.Train,
+        "settings": authors.Settings,
     }
     commands: ClassVar[Mapping[str, Any]] = {**users, **authors}
 
