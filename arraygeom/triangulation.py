@@ -11,6 +11,7 @@ from torch import Tensor
 
 from .camera import Camera
 from .epipolar import Depth, beside, depth_from_track, track
+from .multiview import world_rays
 from .pixels import floating, product
 from .pose import matvec
 from .reprojection import projection_slopes
@@ -125,7 +126,7 @@ class _Sight(NamedTuple):
 
 
 class _Chart(NamedTuple):
-    """Points by p = (a, b, w): at `origin` + `scale` (a u + b v + d) / w, with `axes` (*n, 3, 3) the columns u, v, d."""
+    """Points by p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has the columns u, v, d."""
 
     origin: Tensor
     axes: Tensor
@@ -156,15 +157,9 @@ class _NormalEquations(NamedTuple):
 
 def _sighted(cameras: Sequence[Camera], x: Tensor, seen: Tensor | None) -> tuple[list[_Sight], _Chart, Tensor]:
     """What is seen of each point, the chart of its first view, and where in it the rays meet in least squares."""
-    rays, usable = (torch.stack(part) for part in zip(*(c.rays(p) for c, p in zip(cameras, x))))
+    centres, directions, usable = (torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x))))
     usable = usable if seen is None else usable & seen
-    world = [c.cam_from_world.inverse().apply(r) for c, r in zip(cameras, rays)]
-    centres = torch.stack([beside(c.centre, x.ndim - 1, 1).expand_as(r) for c, r in zip(cameras, rays)])
-    directions = torch.stack(world) - centres
-    directions = directions / directions.norm(dim=-1, keepdim=True)
-    focal = torch.stack(
-        [beside(c.K[..., :2, :2].det().abs(), x.ndim - 2).expand_as(u) for c, u in zip(cameras, usable)]
-    )
+    focal = [beside(c.K[..., :2, :2].det().abs(), x.ndim - 2).expand_as(u) for c, u in zip(cameras, usable)]
     first = usable.to(torch.uint8).argmax(0)[None, ..., None].expand(1, *x.shape[1:-1], 3)
     origin, d = (t.gather(0, first)[0] for t in (centres, directions))
     baselines = origin - centres
@@ -172,7 +167,7 @@ def _sighted(cameras: Sequence[Camera], x: Tensor, seen: Tensor | None) -> tuple
     scale = torch.where(longest > 0, torch.where(longest > 0, longest, 1.0).sqrt(), 1.0)
     a = torch.linalg.cross(d.expand_as(directions), directions)
     b = torch.linalg.cross(baselines / scale[..., None], directions)
-    weight = torch.where(usable, focal, 0.0)[..., None]
+    weight = torch.where(usable, torch.stack(focal), 0.0)[..., None]
     across = (weight * b.square()).sum((0, -1))
     w = -(weight * a * b).sum((0, -1)) / torch.where(across > 0, across, 1.0)
     axes = torch.stack([*_perpendicular(d), d], -1)
@@ -210,4 +205,4 @@ def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _No
 
 
 LEAST_DETERMINANT = 1e-18
-"""Of the normal equations, their largest diagonal entry at 1: inverse distance is known to 1e-9 of what directions are."""
+"""Of the normal equations, their largest diagonal entry at 1: inverse distance is known 1e-9 as well as directions."""

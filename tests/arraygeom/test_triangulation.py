@@ -161,12 +161,13 @@ def test_float32_at_12_megapixels_is_as_good_as_its_pixels():
     """A float32 pixel of 4000 is good to 1.2e-4 px: at 10 px of disparity to 4e-5 of the depth."""
     X, x = noisy_matches(torch.full((2000,), 10.0, dtype=torch.float64), 0.0)
     found = triangulate(wide_pair(torch.float32), x.float())
-    assert found.valid.all() and found.X.dtype == torch.float32
+    assert found.valid.all()
+    assert found.X.dtype == torch.float32
     torch.testing.assert_close(found.X.double(), X, rtol=4e-5, atol=1e-3)
 
 
 def test_noise_does_not_draw_distant_points_to_the_cameras():
-    X, x = noisy_matches(torch.full((5000,), 2.5, dtype=torch.float64), 1.0)
+    _, x = noisy_matches(torch.full((5000,), 2.5, dtype=torch.float64), 1.0)
     found = triangulate(wide_pair(torch.float32), x.float())
     assert float(found.residual[found.valid].max()) < 5
     assert float(found.X[found.valid][:, 2].min()) > 0.25 * 160
