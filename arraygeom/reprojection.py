@@ -106,8 +106,8 @@ def _stepped(
     cameras = list(rig.cameras.values())
     r = reprojection_residuals(cameras, X, x, seen=seen)
     used = r.any(-1)[..., None, None]
-    by_X = [projection_slopes(c, X, (X - c.centre).norm(dim=-1))[1] for c in cameras]
-    by_X = torch.where(used, torch.stack(by_X), 0.0)
+    slopes = [projection_slopes(c, X, (X - c.centre).norm(dim=-1))[1] for c in cameras]
+    by_X = torch.where(used, torch.stack(slopes), 0.0)
     zeros = rig.parameters(free=names)
     sizes = [zero.numel() for zero in zeros.values()]
 
