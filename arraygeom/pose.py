@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import reduce
 from typing import TYPE_CHECKING, ClassVar
 
 import torch
@@ -145,10 +147,10 @@ class Pose(Batched):
 
 
 def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """[v]x, the matrix with [v]x w = v x w."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    """[v]x, the matrix with [v]x w = v x w: kornia's."""
+    from kornia.geometry.epipolar import cross_product_matrix
+
+    return cross_product_matrix(v)
 
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
@@ -175,6 +177,16 @@ def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(R)
+
+
+def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
+    """A function of small matrices computed in float64, which neither autocast nor TF32 lowers; their own type again.
+
+    Matrices are given the same batch axes.
+    """
+    batch = torch.broadcast_shapes(*(t.shape[:-2] for t in tensors))
+    dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))
+    return function(*(t.double().expand(*batch, *t.shape[-2:]) for t in tensors)).to(dtype)
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:

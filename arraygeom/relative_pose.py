@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .epipolar import depth_from_track, track
-from .pose import Pose
+from .pose import Pose, in_float64
 
 
 def poses_from_essential(E: Float[Tensor, "*b 3 3"]) -> Pose:
@@ -46,7 +46,7 @@ def relative_pose(
     """
     from kornia.geometry.epipolar import essential_from_fundamental
 
-    poses = poses_from_essential(essential_from_fundamental(F, K_alpha, K_beta))
+    poses = poses_from_essential(in_float64(essential_from_fundamental, F, K_alpha, K_beta))
     K_alpha, K_beta = (K[..., None, :, :].expand_as(poses.R) for K in (K_alpha, K_beta))
     tracks = track(K_alpha, K_beta, poses, x[..., None, :, :])
     in_front = depth_from_track(tracks, x_beta[..., None, :, :]).valid

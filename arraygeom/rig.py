@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -196,6 +196,13 @@ class Rig(Batched):
     def __getitem__(self, name: Any) -> Any:
         """The camera of a name; or, of a batch of rigs, those at an index."""
         return self.cameras[self.require(name)] if isinstance(name, str) else super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.cameras
+
+    def __iter__(self) -> Iterator[Any]:
+        """The cameras' names in order; of a batch of rigs, the rigs."""
+        return (self[i] for i in range(len(self))) if self.batch_shape else iter(self.names)
 
     @property
     def names(self) -> tuple[str, ...]:
