@@ -121,7 +121,7 @@ def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
             alpha.t,
         ),
         "triangulation": Parity(
-            lambda x: triangulate([alpha, beta], torch.stack([x_alpha, x])).X,
+            lambda x: triangulate([alpha, beta], torch.stack([x_alpha, x]), deviation=0.01).X,
             lambda x: epipolar.triangulate_points(projection(alpha), projection(beta), x_alpha, x),
             x_beta,
             2e-6,
@@ -224,3 +224,22 @@ def test_our_tensors_go_through_kornia_and_back():
     found = epipolar.triangulate_points(projection(ALPHA), projection(BETA), X_ALPHA, X_BETA)
     torch.testing.assert_close(BETA.project(found).x, X_BETA)
     assert Camera.from_kornia(ALPHA.replace(K=K).to_kornia()).K.equal(K)
+
+
+def test_rigs_go_there_and_back():
+    for rig in (RIG, stack([RIG, RIG.perturbed({"alpha.focal": torch.tensor([1.0, 2.0], dtype=F64)})])):
+        assert Rig.from_kornia(rig.to_kornia(), depth=rig.depth) == rig
+    one = stack([RIG])
+    assert Rig.from_kornia(one.to_kornia(), batched=True, depth=one.depth) == one
+    shared = Rig({"alpha": ALPHA, "beta": stack([BETA, BETA])})
+    assert {camera.batch_size for camera in shared.to_kornia().values()} == {2}
+
+
+def test_unequal_batches_and_lenses_are_refused():
+    with pytest.raises(ValueError, match=r"batches of one length, got {'a': 2, 'b': 3}"):
+        Rig.from_kornia({"a": pinhole(2), "b": pinhole(3)})
+    bent = RIG.with_camera("beta", BETA.replace(distortion=Distortion("brown-conrady", LENS)))
+    with pytest.raises(ValueError, match="no lens model"):
+        bent.to_kornia()
+    with pytest.raises(ValueError, match="kornia has no camera without a calibration: b"):
+        Rig({"a": ALPHA, "b": LensView(hw=(4, 4), K=ALPHA.K)}).to_kornia()
