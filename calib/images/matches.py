@@ -31,6 +31,8 @@ MATCHED_AT_ONCE = 1024
 """Features whose distances from all of the other image are held at once."""
 ENOUGH = 20
 """Least number of consistent matches for any conclusion."""
+LOCALISED = 1 / 3
+"""Standard deviation of a matched point, pixels, by which its depth is known or not: the middle of the bounds below."""
 LOCALISATION_BOUNDS = (0.15, 0.2, 0.3, np.inf)
 """Bounds of the standard deviation of points, pixels, estimated from the residuals of patches around them."""
 WELL_LOCALISED = 40
@@ -265,8 +267,9 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
     """
     undistorted = Matches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(undistorted, pair.fundamental) <= 3)
-    found = triangulate([camera.to(torch.float64) for camera in pair.cameras], torch.stack(near))
-    depth = pair.cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
+    cameras = [camera.to(torch.float64) for camera in pair.cameras]
+    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=3.0)
+    depth = cameras[0].cam_from_world.apply(found.X)[found.valid, 2]
     if len(depth) < ENOUGH:
         raise ValueError(f"only {len(depth)} points seen in both images fit the calibration: does it belong to them?")
     low, high = _percentiles(depth, 0.02)

@@ -22,7 +22,7 @@ from arraygeom.pixels import map_homogeneous
 from arraygeom.text import angle
 
 from .held_out import median_off
-from .matches import ENOUGH, Images, Matches, contrast_equalised, line_distance, near_lines
+from .matches import ENOUGH, LOCALISED, Images, Matches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
 from .refinement import refine_matches
 
@@ -166,7 +166,7 @@ def depth_bounds(rig: Rig, matches: Matches) -> tuple[float, float] | None:
     pair = _pair(rig)
     near = near_lines(matches, pair.fundamental, within=NEAR_LINE)
     cameras = [camera.to(torch.float64) for camera in pair.cameras]
-    found = triangulate(cameras, torch.stack(near))
+    found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=NEAR_LINE)
     if int(found.valid.sum()) < ENOUGH:
         return None
     inverse = 1 / cameras[0].cam_from_world.apply(found.X[found.valid])[:, 2]
