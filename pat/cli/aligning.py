@@ -76,6 +76,7 @@ class Align:
 
     def run(self) -> None:
         """Align one frame or several, with the rig that is given or one that is found."""
+        image, with_rig = named_images(self.given, self.image, "align")
         from ..fusion.checks import confidence_checked
         from ..support.memory import limited, parse_bytes
 
@@ -85,7 +86,6 @@ class Align:
         options.noise_of(self.noise)
         options.compile_at_once()
         with limited(limit), confidence_checked(strict=self.strict):
-            image, with_rig = named_images(self.given, self.image, "align")
             for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
                 self._align(frame)
 
@@ -101,17 +101,17 @@ class Align:
             yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
 
     def _frames_without(self) -> Iterator[_Frame]:
+        from ..fusion.batch import find_images
+        from ..fusion.from_images import array_from_images, camera_names
         from ..fusion.views import ViewFiles
-        from .from_images import array_of, camera_names, files_of
 
         if self.depth:
             raise ValueError("--depth: needs a rig: give one with --rig RIG")
-        files = {name: files_of(path) for name, path in camera_names(self.given).items()}
+        files = {name: find_images(path) for name, path in camera_names(self.given).items()}
         options.say_when_compiling()
         with options.working("finding the rig"):
-            array = array_of(
-                {n: paths[0] for n, paths in files.items()}, alpha=self.alpha, weights=self.weights, say=say
-            )
+            of_first = {name: paths[0] for name, paths in files.items()}
+            array = array_from_images(of_first, alpha=self.alpha, weights=self.weights, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
         files = {name: files[name] for name in array.rig.names}

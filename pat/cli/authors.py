@@ -117,8 +117,8 @@ RIG_FOUND = "fusion, rig found"
 
 def with_found_rig(network: Network) -> StereoMethod:
     """The fusion of two images with the rig found from them."""
+    from ..fusion.from_images import found_rig
     from ..fusion.fuse import fuse
-    from .from_images import found_rig
 
     def fused(alpha: Tensor, beta: Tensor, max_disparity: float) -> Tensor:
         images = {"alpha": alpha, "beta": beta}

@@ -63,6 +63,8 @@ class Fuse:
     """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
     depth: Depth = None
     """Near and far bounds in metres, instead of the rig's; far may be inf."""
+    focal: Numbers = ()
+    """Without a rig: the focal length in pixels of a camera whose file does not state it."""
     out: Out = Path("out")
     """Folder for fused.png, confidence.png, depth.tif, depth_16.png (16 bits; 0 is unknown), depth.png, index.html
     (a page that shows them) and view.yaml (the rig of the fused view)."""
@@ -127,23 +129,24 @@ class Fuse:
 
     def run(self) -> None:
         """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
-        from ..media.images import exr_writer
-        from ..support.memory import limited, parse_bytes
-
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
             raise ValueError(f"--bits {self.bits} --kind {self.kind}: png holds 8 or 16 bits, exr 32, tif any")
+        if self.kind == "exr":
+            from ..media.images import exr_writer
+
+            exr_writer(self.out)
+        self.image, with_rig = named_images(self.given, self.image, "fuse")
+        from ..support.memory import limited, parse_bytes
+
         limit = None if self.max_memory is None else parse_bytes(self.max_memory)
         options.response_of(self.response)
         options.noise_of(self.noise)
         options.device_of(self.device)
-        if self.kind == "exr":
-            exr_writer(self.out)
         if self.classical and not self.report:
             raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
         options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
-            self.image, with_rig = named_images(self.given, self.image, "fuse")
             self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
@@ -151,6 +154,8 @@ class Fuse:
 
         from ..fusion.views import ViewFiles
 
+        if self.focal:
+            raise ValueError("--focal: the rig states the focal lengths: leave it out")
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
         found = self._frames(found)
@@ -169,8 +174,9 @@ class Fuse:
             self._one(views.developed, views, alpha, before_writing=compared.result)
 
     def _without_rig(self) -> None:
+        from ..fusion.batch import find_images
+        from ..fusion.from_images import camera_names, frames_of_videos
         from ..support.locks import folder_lock
-        from .from_images import camera_names, files_of, frames_of_videos
 
         with_rig = {"--depth": self.depth, "--frame-rate": self.frame_rate, "--time-offset": self.time_offset}
         if named := [option for option, value in with_rig.items() if value]:
@@ -178,6 +184,9 @@ class Fuse:
         with folder_lock(self.out):  # finding the rig takes long: what cannot be written to is refused before
             pass
         cameras = camera_names(self.given)
+        focal = options.numbers_by_name(self.focal, "--focal")
+        if unknown := focal.keys() - cameras.keys():
+            raise ValueError(f"--focal: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}")
         noise = options.noise_of(self.noise)
         if isinstance(noise, dict) and (unknown := noise.keys() - cameras.keys()):
             raise ValueError(f"--noise: no camera '{min(unknown)}'; the images' names are {', '.join(cameras)}")
@@ -186,21 +195,22 @@ class Fuse:
             others = [path for path in cameras.values() if path not in videos]
             raise ValueError(f"{videos[0]} is a video and {others[0]} is not: give images alone, or videos alone")
         if not videos:
-            return self._without_rig_from({name: files_of(path) for name, path in cameras.items()}, {})
+            return self._without_rig_from({name: find_images(path) for name, path in cameras.items()}, {})
         with TemporaryDirectory() as folder:
             self._without_rig_from(*frames_of_videos(cameras, Path(folder)))
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
         """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
+        from ..fusion.from_images import array_from_images
         from ..fusion.results import FOUND_RIG
-        from .from_images import array_of
 
         self.sequence |= bool(rates)
         files = self._frames(files)
         first = {name: paths[0] for name, paths in files.items()}
+        focal = options.numbers_by_name(self.focal, "--focal")
         options.say_when_compiling()
         with options.working("finding the rig"):
-            array = array_of(first, alpha=self.alpha, weights=self.weights, say=say)
+            array = array_from_images(first, alpha=self.alpha, weights=self.weights, focal=focal, say=say)
         self.weights = array.weights
         self.normalise_radiometry |= array.match_levels
         self.exposure = self.exposure or "auto"
@@ -460,22 +470,27 @@ def _score(image: Tensor, ground_truth: Tensor) -> Score:
 
 
 def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
-    """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig.
+    """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig. Imports no torch.
 
     Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do not go
-    together.
+    together, FileNotFoundError for files that do not exist.
     """
     if given and (image or is_rig_file(given[0])):
         named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
         if not named:
             raise ValueError(f"with the rig {given[0]}, give --image NAME=FILE for each camera")
+        options.files_by_name(named)
+        options.refuse_missing_rig(given[0])
         return named, True
     if image:
-        raise ValueError("--image NAME=FILE needs a rig: give --rig RIG, or the images alone, without names")
+        files = " ".join(text.partition("=")[2] or text for text in image)
+        raise ValueError(f"--image needs a rig: give --rig RIG, or the images alone: `pat {command} {files}`")
     if len(given) < 2:
         raise ValueError(
             f"give two images or more, as `pat {command} mono.png colour.png`; or a rig, --alpha and each --image"
         )
+    for path in given:
+        options.refuse_missing_image(path)
     return (), False
 
 

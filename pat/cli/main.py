@@ -8,13 +8,14 @@ import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import make_dataclass
 from inspect import getdoc
+from pathlib import Path
 from typing import Annotated, Any, ClassVar, NoReturn, Union
 
 import tyro
 
-from ..support.moved import CallableModule
 from . import aligning, authors, calibration, fusing, rigs, weights
-from .options import respelled, say
+from .options import refuse_missing_rig, respelled, say
+from .parsing import parsed
 
 
 class Pat:
@@ -69,7 +70,10 @@ def _run(arguments: list[str], *, debug: bool) -> None:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = _warn
-            _command(arguments).run()
+            command = _command(arguments)
+            if isinstance(rig := getattr(command, "rig", None), Path):
+                refuse_missing_rig(rig)
+            command.run()
     except KeyboardInterrupt:
         say("pat: interrupted; no file is left incomplete", style="red")
         sys.exit(130)
@@ -101,7 +105,7 @@ def _command(arguments: list[str]) -> Any:
     """The command that arguments name, its options parsed. Raises ValueError for a command that does not exist."""
     if "--tyro-print-completion" in arguments or "--tyro-write-completion" in arguments:
         return tyro.cli(_union(Pat), prog="pat", args=arguments)
-    if arguments == ["--version"]:
+    if "--version" in arguments:
         from importlib.metadata import version
 
         print(f"arraygeom-pat {version('arraygeom-pat')}")
@@ -113,14 +117,14 @@ def _command(arguments: list[str]) -> Any:
             print(_help(path, command))
             sys.exit(0)
         if word not in command.commands:
-            from ..support.schema import near
+            from ..support.naming import near
 
             raise ValueError(f"no command '{path} {word}'{near(word, command.commands)}")
         path, command, arguments = f"{path} {word}", command.commands[word], arguments[1:]
     arguments = respelled(arguments, command)
     if hasattr(command, "parse"):
         return command.parse(arguments)
-    return tyro.cli(command, prog=path, args=arguments, config=(tyro.conf.DisallowNone,))
+    return parsed(command, path, arguments)
 
 
 def _help(path: str, group: Any) -> str:
@@ -148,6 +152,3 @@ def _union(group: Any) -> Any:
             command = make_dataclass(name, [("command", inner)])
         made.append(Annotated[command, tyro.conf.subcommand(name)])
     return Union[tuple(made)]  # noqa: UP007
-
-
-sys.modules[__name__].__class__ = CallableModule  # `from pat.cli import main; main()` is of before there was a package

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from tyro.conf import Positional, UseAppendAction, arg
 
-from ..media.headers import RAW_SUFFIXES
+from ..media.suffixes import IMAGE_SUFFIXES, VIDEO_SUFFIXES
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -31,10 +31,6 @@ T = TypeVar("T")
 
 SHIPPED = Path(__file__).parents[1] / "networks" / "shipped"
 WEIGHT_NAMES = tuple(sorted(path.stem for path in SHIPPED.glob("*.safetensors")))
-
-IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", ".pnm", ".bmp", ".webp", ".heic", ".heif"}
-IMAGE_SUFFIXES |= RAW_SUFFIXES
-VIDEO_SUFFIXES = {".mp4", ".mkv", ".mov", ".avi", ".m4v", ".webm"}
 
 
 def _field_names() -> tuple[str, ...]:
@@ -145,7 +141,7 @@ def _images_first(words: Sequence[str]) -> list[str]:
         if Path(words[i]).suffix.lower() in IMAGE_SUFFIXES | VIDEO_SUFFIXES
         and not words[i].startswith("-")
         and "=" not in words[i]
-        and words[i - 1] not in ("-o", "--out", "--weights")
+        and words[i - 1] not in ("-o", "--out", "--weights", "--image")
     }
     others = [word for i, word in enumerate(words) if i >= leading and i not in files]
     return [*words[:leading], *(words[i] for i in sorted(files)), *others]
@@ -189,10 +185,27 @@ def field_named(name: str) -> ReceptiveField | None:
 
 def load_rig(path: Path, depth: tuple[float, float] | None = None) -> Rig:
     """The rig of a file, with other depth bounds if given."""
+    refuse_missing_rig(path)
     from arraygeom import Rig
 
     rig = Rig.load(path)
     return rig if depth is None else rig.replace(depth=depth)
+
+
+def refuse_missing_rig(path: Path) -> None:
+    """Raise FileNotFoundError for a rig file that does not exist, before torch is imported to read it."""
+    if not path.exists():
+        raise FileNotFoundError(f"{path}: no such rig file: check the path")
+
+
+def refuse_missing_image(path: Path) -> None:
+    """Raise FileNotFoundError for an image, folder or video that does not exist, before torch is imported."""
+    if path.exists() or any(c in path.name for c in "*?["):
+        return
+    _, _, file = str(path).partition("=")
+    named = file and Path(file).exists()
+    advice = f"give {file} alone, cameras are called as their files are" if named else "check the path"
+    raise FileNotFoundError(f"{path}: no such image: {advice}")
 
 
 def files_by_name(texts: Iterable[str], option: str = "--image") -> dict[str, Path]:
@@ -237,7 +250,8 @@ def read_frames(rig: Rig, texts: Iterable[str]) -> list[dict[str, Tensor]]:
 def _named_file(option: str, text: str) -> tuple[str, Path]:
     name, _, path = text.partition("=")
     if not (name and path):
-        raise ValueError(f"{option}: '{text}' is not NAME=FILE, such as mono=a.png")
+        file = path or text
+        raise ValueError(f"{option} {text}: which camera is it of? Give NAME=FILE, such as {Path(file).stem}={file}")
     return name, Path(path)
 
 

@@ -30,9 +30,9 @@ from arraygeom.fields import FIELDS
 from arraygeom.io.native import read_text as rig_of_text
 from arraygeom.io.native import write as rig_text
 
-from ..media.headers import RAW_SUFFIXES
 from ..media.images import read_image
 from ..media.raw import developed_rig
+from ..media.suffixes import IMAGE_SUFFIXES
 from ..media.video import write_video
 from ..networks.weights import Network, Precision, find_weights, load_weights
 from ..sensors import NoiseLevel
@@ -50,7 +50,6 @@ from .sequence import KeyColour, SequenceFusion
 from .timeline import KeyFrame
 from .views import ViewFiles
 
-IMAGE_SUFFIXES = {".png", ".tif", ".tiff", ".jpg", ".jpeg", ".pgm", ".ppm", *RAW_SUFFIXES}
 INPUTS = "inputs.json"
 SETTINGS, KEYS, PLAN = "settings.yaml", ".keys", "plan.json"
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import torch
+from torch import Tensor
 
 from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
@@ -30,16 +32,18 @@ from .views import Views
 
 LOG = logging.getLogger(__name__)
 
+ImageSources = Mapping[str, str | Path | Tensor] | Sequence[str | Path]
+"""An image file, or a tensor (C, H, W) in 0..1, of each camera by name; or files alone, which name their cameras."""
 Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
 
 def fuse(
-    network: FusionNetwork,
-    rig: Rig,
-    images: Images,
+    network: FusionNetwork | ImageSources,
+    rig: Rig | None = None,
+    images: Images | None = None,
     *,
-    alpha: str,
+    alpha: str | None = None,
     depth: tuple[float, float] | None = None,
     field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
     max_memory: float | str | None = None,
@@ -57,8 +61,10 @@ def fuse(
     differentiable: bool = False,
     matcher: Matcher = match,
 ) -> Frame:
-    """Fuse one frame at the view of camera `alpha`.
+    """Fuse one frame at the view of camera `alpha`: `fuse(network, rig, images, alpha=...)`, or `fuse(images)`.
 
+    Images alone are files, or files or tensors by camera; their rig and the weights are found as by `pat fuse`
+    (`pat.fusion.from_images.array_from_images`, which also gives them), and depths are multiples of the baseline.
     Frames too large for the memory allowed are fused in tiles of alpha, each with the part of every beta that its
     segments touch, and a halo: equal to the whole to 1e-4. Distorted images are first resampled to pinhole views
     (`pat.fusion.steps.Undistort`), rotated betas made upright, and betas resized to alpha's angular resolution; the
@@ -66,11 +72,11 @@ def fuse(
     beta the colours, the result is as bright in that sense (`pat.media.raw.as_bright`).
 
     Args:
-        network: for instance `load_weights("mono-colour")`.
+        network: for instance `load_weights("mono-colour")`; or, without rig, the images.
         rig: the cameras. Those without an image in `images` are left out.
         images: tensors by camera name, (C, H, W) in 0..1, each of the size that the rig states. A mapping that reads
             them when asked saves memory (`pat.fusion.views.ViewFiles`).
-        alpha: the camera whose view is wanted.
+        alpha: the camera whose view is wanted; without a rig by default the largest grey image.
         depth: (near, far) in metres, instead of the rig's.
         field: the receptive field, or one for each of some betas, by name; by default `arraygeom`'s `default_field`.
         max_memory: bytes, or like "4GiB": what the process may take in all, libraries and images included, if there
@@ -107,6 +113,8 @@ def fuse(
         LowConfidenceWarning: the images hardly match: the rig is probably wrong. A filter makes it an error, as
             `warnings.simplefilter("error", LowConfidenceWarning)`.
     """
+    network, rig, images, alpha, grey_world = _with_rig(network, rig, images, alpha, explain)
+    match_levels |= grey_world
     if differentiable and not (max_memory is None and store is None):
         raise ValueError("a differentiable fusion is of the whole frame: leave out max_memory and store")
     check_luminance(network, luminance, noisy=noise is not None)
@@ -152,6 +160,21 @@ def fuse(
         for back in undo:
             frame = back(frame)
         return frame if differentiable else Frame(*(part.detach() for part in frame))
+
+
+def _with_rig(
+    network: Any, rig: Rig | None, images: Images | None, alpha: str | None, explain: Callable[[str], None] | None
+) -> tuple[FusionNetwork, Rig, Images, str, bool]:
+    """Network, rig, images, alpha, and whether to match levels; all found where the first is images alone."""
+    if rig is not None and images is not None and alpha is not None:
+        return network, rig, images, alpha, False
+    if rig is not None or images is not None or not isinstance(network, Mapping | Sequence):
+        raise TypeError("fuse takes a network, a rig, images and alpha=NAME; or images alone, to find the rig")
+    from ..networks.weights import load_weights
+    from .from_images import array_from_images
+
+    array = array_from_images(network, alpha=alpha, say=explain or (lambda line: None))
+    return load_weights(array.weights), array.rig, array.images, array.alpha, array.match_levels
 
 
 def corrections_of(

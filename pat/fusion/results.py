@@ -6,6 +6,7 @@ import dataclasses
 import math
 from collections.abc import Callable
 from functools import partial
+from io import BytesIO
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -14,6 +15,7 @@ from jaxtyping import Float
 from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_together
@@ -27,6 +29,8 @@ from ..media.points import write_points
 from ..media.raw import developed
 from ..support.memory import how_many_fit
 
+SHOWN = 480
+"""Pixels of a notebook's picture of a frame, along its longer side: three of them are as wide as a page."""
 MOST = 65535
 """The largest count of 16 bits."""
 
@@ -121,6 +125,13 @@ def view_of(rig: Rig, alpha: str, *, bits: int, bands: int = 3) -> Rig:
     return Rig({alpha: rig[alpha].replace(sensor=sensor)}, depth=rig.depth, name=rig.name)
 
 
+def shrunk(image: Float[Tensor, "c h w"]) -> Float[Tensor, "c h2 w2"]:
+    """The image, detached and on the CPU, at most `SHOWN` pixels wide and high."""
+    factor = min(SHOWN / max(image.shape[-2:]), 1.0)
+    hw = [max(round(n * factor), 1) for n in image.shape[-2:]]
+    return interpolate(image.detach().cpu().float()[None], size=hw, mode="area")[0]
+
+
 class Frame(NamedTuple):
     """A fused frame at alpha's view.
 
@@ -132,3 +143,20 @@ class Frame(NamedTuple):
     image: Float[Tensor, "c h w"]
     depth: Float[Tensor, "h w"]
     confidence: Float[Tensor, "h w"]
+
+    def __repr__(self) -> str:
+        """Sizes, the range of depth and the mean confidence, in a line."""
+        bands, h, w = self.image.shape
+        known = self.depth[self.depth.isfinite()]
+        depth = f"depth {known.min():.3g} to {known.max():.3g}" if len(known) else "depth unknown"
+        return f"Frame({w}x{h}, {bands} bands, {depth}, mean confidence {self.confidence.mean():.2f})"
+
+    def _repr_png_(self) -> bytes:
+        """For notebooks: the image and, beside it, depth (red is near) and confidence, as a PNG file."""
+        colours = self.image if len(self.image) == 3 else self.image.mean(0, keepdim=True)
+        confidence = self.confidence[None].expand(3, -1, -1)
+        shown = [shrunk(part) for part in (colours.expand(3, -1, -1), colour_depth(self.depth), confidence)]
+        values = (torch.cat(shown, -1).clamp(0, 1) * 255).round().to(torch.uint8)
+        file = BytesIO()
+        Image.fromarray(values.permute(1, 2, 0).numpy()).save(file, format="PNG")
+        return file.getvalue()

@@ -10,9 +10,6 @@ from arraygeom.image_bytes import PNG, TIFF, png_chunks, tiff_entries
 
 HW = tuple[int, int]
 
-RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"}
-"""Of cameras' raw files."""
-
 _WIDTH, _HEIGHT, _BITS, _ORIENTATION = 256, 257, 258, 274
 
 

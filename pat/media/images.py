@@ -23,8 +23,9 @@ from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
 from arraygeom.image_bytes import decodable
 
-from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
+from .headers import HW, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
+from .suffixes import RAW_SUFFIXES
 
 FEW_BITS = (8, 10, 12)
 """Bits of cameras that may be stored in 16 bits as they are."""

@@ -21,7 +21,8 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from pat.support.schema import from_document, near
+from pat.support.naming import near
+from pat.support.schema import from_document
 
 from .cases import DegradationCase
 from .chain import Step

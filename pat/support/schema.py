@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from arraygeom.text import short
+from .naming import near
 
 T = TypeVar("T")
 
@@ -61,17 +60,6 @@ def parse_yaml(text: str | bytes, name: str) -> Any:
         raise ValueError(f"{name}: not valid YAML{at}: {problem}") from None
 
 
-def near(name: object, known: Iterable[object]) -> str:
-    """The end of a message about an unknown name: the nearest known one, or all of them.
-
-    >>> near("nois", ["noise", "clip"])
-    "; did you mean 'noise'?"
-    """
-    names = [str(k) for k in known]
-    close = difflib.get_close_matches(str(name), names, 1)
-    return f"; did you mean '{close[0]}'?" if close else f"; known here: {', '.join(names)}"
-
-
 def _default(field: dataclasses.Field[Any], value: Any) -> bool:
     if field.default is not dataclasses.MISSING:
         return bool(value == field.default)
@@ -84,7 +72,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
         return _read_dataclass(kind, value, entry)
     if origin is typing.Literal:
         if value not in arguments:
-            raise ValueError(f"{entry}: is {short(value)}{near(value, arguments)}")
+            raise ValueError(f"{entry}: is {_short(value)}{near(value, arguments)}")
         return value
     if origin is tuple:
         return _read_tuple(arguments, value, entry)
@@ -95,9 +83,15 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
     return _read_plain(kind, value, entry)
 
 
+def _short(value: object) -> str:
+    from arraygeom.text import short  # imports torch, which the help of a command does without
+
+    return short(value)
+
+
 def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
     if not isinstance(value, dict):
-        raise ValueError(f"{entry or kind.__name__}: is {short(value)}; wanted a mapping")
+        raise ValueError(f"{entry or kind.__name__}: is {_short(value)}; wanted a mapping")
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in fields:
@@ -118,7 +112,7 @@ def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any
     if isinstance(value, str) and arguments[1:] == (...,):
         value = [value]
     if not isinstance(value, list | tuple):
-        raise ValueError(f"{entry}: is {short(value)}; wanted a list")
+        raise ValueError(f"{entry}: is {_short(value)}; wanted a list")
     kinds = (arguments[0],) * len(value) if arguments[1:] == (...,) else arguments
     if len(kinds) != len(value):
         raise ValueError(f"{entry}: has {len(value)} entries; wanted {len(kinds)}")
@@ -127,7 +121,7 @@ def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any
 
 def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[Any, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{entry}: is {short(value)}; wanted a mapping")
+        raise ValueError(f"{entry}: is {_short(value)}; wanted a mapping")
     return {k: _read(arguments[1], v, _below(entry, k)) for k, v in value.items()}
 
 
@@ -158,7 +152,7 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
     if kind is Path and isinstance(value, str):
         return Path(value).expanduser()
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{entry}: is {short(value)}; wanted {_PLAIN.get(kind, kind.__name__)}")
+        raise ValueError(f"{entry}: is {_short(value)}; wanted {_PLAIN.get(kind, kind.__name__)}")
     return value
 
 

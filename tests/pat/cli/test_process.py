@@ -66,20 +66,68 @@ def test_help_lists_users_tools_before_authors_tools(capsys):
         main([])
     text = capsys.readouterr().out
     lines = [line.split()[0] for line in text.splitlines() if line.startswith("  ")]
-    assert lines == ["fuse", "show", "explore", "calibrate", "board", "rig", "demo", "warm-up", *Pat.authors]
+    assert lines == ["fuse", "align", "show", "explore", "calibrate", "board", "rig", "demo", "warm-up", *Pat.authors]
     assert all(len(line) <= 120 for line in text.splitlines())
 
 
-def test_the_version_is_printed(capsys):
+@pytest.mark.parametrize("words", [["--version"], ["fuse", "a.png", "--version"]])
+def test_the_version_is_printed(words, capsys):
     with pytest.raises(SystemExit):
-        main(["--version"])
+        main(words)
     assert re.fullmatch(r"arraygeom-pat \d+\.\d+\S*\n", capsys.readouterr().out)
+
+
+REFUSED = {
+    ("fuse", "--depth", "2"): "--depth: wanted FLOAT FLOAT, got '2'",
+    ("fuse", "--bits", "7"): "--bits: '7' is not one of '8', '16', '32'",
+    ("fuse", "--wieghts", "x"): "unknown here: --wieghts, x; did you mean --weights?",
+    ("fuse", "--workers", "x"): "--workers: 'x' is not a whole number",
+    ("fuse", "--alpha"): "--alpha: give a value",
+    ("evaluate", "--rates", "x"): "--rates: 'x' does not fit",
+    ("rig", "convert", "a"): "OUT is missing: File or folder to write; also: --out OUT.",
+}
+
+
+@pytest.mark.parametrize("words", REFUSED, ids=" ".join)
+def test_what_the_parser_refuses_is_one_line(words, capsys):
+    """Boxes of ten lines."""
+    path = " ".join(words[:2] if words[0] == "rig" else words[:1])
+    assert fails([*words], capsys) == f"pat: {REFUSED[words]} (`pat {path} --help` explains)"
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["fuse", "no.yaml", "--image", "a=b.png"], "no.yaml: no such rig file"),
+        (["rig", "info", "no.yaml"], "no.yaml: no such rig file"),
+        (["fuse", "no.png", "nothing.png"], "no.png: no such image"),
+        (["align", "no.png", "nothing.png"], "no.png: no such image"),
+        (["fuse", "--image", "mono.png", "--image", "c=b.png"], "the images alone: `pat fuse mono.png b.png`"),
+        (["fues"], "did you mean 'fuse'"),
+    ],
+)
+def test_mistakes_that_need_no_torch_are_said_before_it_is_imported(words, said):
+    """They took as long as torch to be said."""
+    code = f"""
+import sys
+from pat.cli.main import main
+try: main({words})
+finally: assert "torch" not in sys.modules
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_an_image_without_a_camera_is_explained(capsys):
+    said = fails(["fuse", str(ROOT / "README.md"), "--image", "mono.png"], capsys)
+    assert "--image mono.png: which camera is it of? Give NAME=FILE, such as mono=mono.png" in said
 
 
 def test_commands_that_do_not_exist(capsys):
     assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
     assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
-    assert "known here: fuse, show" in fails(["--precision"], capsys)
+    assert "known here: fuse, align" in fails(["--precision"], capsys)
 
 
 @pytest.mark.parametrize(
@@ -103,14 +151,6 @@ def test_a_closed_pipe_is_quiet():
     assert done.returncode in (0, 141)
     done = run("--help", then="| (exec 0<&-; sleep 1); exit ${PIPESTATUS[0]}")
     assert (done.stderr, done.returncode) == ("", 141)
-
-
-def test_the_module_can_be_called_as_the_function_that_it_was(capsys):
-    from pat.cli import main as called
-
-    with pytest.raises(SystemExit):
-        called(["--version"])
-    assert "arraygeom-pat" in capsys.readouterr().out
 
 
 def test_an_interruption_while_pat_is_imported_is_one_line():

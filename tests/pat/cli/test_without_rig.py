@@ -1,5 +1,7 @@
 """`pat fuse` of images alone: which is alpha, the rig, the page, and one line for what cannot be fused."""
 
+import io
+import re
 import shutil
 import sys
 
@@ -13,10 +15,10 @@ from torch.nn.functional import avg_pool2d
 from arraygeom import Camera, Pose, Rig
 from pat import fuse, load_weights
 from pat.cli.authors import with_found_rig
-from pat.cli.from_images import camera_names
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
+from pat.fusion.from_images import array_from_images, camera_names
 from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
@@ -44,7 +46,7 @@ def folder(halved, tmp_path_factory):
     for name, image in halved[1].items():
         write_image(folder / f"{name}.png", image)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("pat.cli.from_images.MATCHED", 300)  # the images are larger, as photographs are than 1600
+        patched.setattr("pat.fusion.from_images.MATCHED", 300)  # the images are larger, as photographs are than 1600
         main(["fuse", str(folder / "colour.png"), str(folder / "mono.png"), "-o", str(folder / "out")])
     return folder
 
@@ -64,6 +66,22 @@ def test_images_alone_are_fused_about_as_well_as_with_the_rig(halved, folder):
     known = fuse(load_weights("mono-colour"), rig, images, alpha="mono")
     with_rig = score(known.image.clamp(0, 1), ground_truth).psnr
     assert score(read_image(folder / "out" / "fused.png"), ground_truth).psnr > with_rig - 0.5
+
+
+def test_fuse_of_images_alone_is_that_of_the_command(folder, monkeypatch):
+    monkeypatch.setattr("pat.fusion.from_images.MATCHED", 300)
+    said = []
+    frame = fuse([folder / "colour.png", folder / "mono.png"], explain=said.append)
+    assert float((frame.image.clamp(0, 1) - read_image(folder / "out" / "fused.png")).abs().max()) < 2 / 255
+    assert any(line.startswith("alpha, whose view and detail the result has: mono") for line in said)
+    with pytest.raises(TypeError, match="or images alone"):
+        fuse(load_weights("mono-colour"), alpha="mono")
+    with pytest.raises(ValueError, match=r"focal tele=900: no camera of mono, colour"):
+        array_from_images({name: folder / f"{name}.png" for name in ("mono", "colour")}, focal={"tele": 900})
+    assert repr(frame) == str(frame)
+    assert re.fullmatch(r"Frame\(320x200, 3 bands, depth .* to .*, mean confidence 0\.\d+\)", repr(frame))
+    with Image.open(io.BytesIO(frame._repr_png_())) as picture:
+        assert picture.size == (3 * 320, 200)
 
 
 def test_the_evaluation_without_a_rig_is_that_of_the_command(halved, folder):
@@ -138,10 +156,12 @@ def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, c
     assert not (tmp_path / "out").exists()
     named = f"mono={mono}"
     assert f"give {mono} alone" in fails([named, colour, *out], capsys)
-    assert "--image NAME=FILE needs a rig" in fails(["--image", named, *out], capsys)
+    assert f"--image needs a rig: give --rig RIG, or the images alone: `pat fuse {mono}`" in fails(
+        ["--image", named, *out], capsys
+    )
     unwritable = ["-o", folder / "mono.png" / "out"]
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("pat.cli.from_images.array_of", None)  # the rig is not looked for
+        patched.setattr("pat.fusion.from_images.array_from_images", None)  # the rig is not looked for
         assert "mono.png" in fails([mono, colour, *unwritable], capsys)
     assert "--depth: needs a rig" in fails([mono, colour, "--depth", "1", "2"], capsys)
 

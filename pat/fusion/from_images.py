@@ -1,7 +1,4 @@
-"""`pat fuse` without a rig: which image is alpha, what the betas give, and the rig, all from the images.
-
-Imported when such a command runs, as it imports torch.
-"""
+"""Images without a rig: which is alpha, what the betas give, and the rig, all from the images."""
 
 from __future__ import annotations
 
@@ -25,17 +22,16 @@ from calib.images.from_images import UncalibratedRig, rig_from_images
 from calib.images.known_intrinsics import centres_found
 from calib.images.self_calibration import UNSCALED, RefinedPair, joined, refined_by_depth, self_calibrated
 
-from ..fusion.batch import find_images
-from ..fusion.fuse import fuse
-from ..fusion.inputs import equal_bands
-from ..fusion.results import Frame
-from ..fusion.steps import without_lenses
-from ..fusion.views import read_view
 from ..media.exif import focal_length
 from ..media.images import read_image, write_image
 from ..media.raw import developed_rig
 from ..media.video import read_video
 from ..networks.weights import Network, load_weights
+from .fuse import ImageSources, fuse
+from .inputs import equal_bands
+from .results import Frame
+from .steps import without_lenses
+from .views import read_view
 
 LOG = logging.getLogger(__name__)
 
@@ -70,22 +66,39 @@ class ImageArray:
     notes: tuple[str, ...]
 
 
-def array_of(
-    files: Mapping[str, Path], *, alpha: str | None = None, weights: str | None = None, say: Say = lambda line: None
+def array_from_images(
+    sources: ImageSources,
+    *,
+    alpha: str | None = None,
+    weights: str | None = None,
+    focal: Mapping[str, float] | None = None,
+    say: Say = lambda line: None,
 ) -> ImageArray:
-    """The array of one image file a camera. `say` is called with each line of what is found, as it is found.
+    """The array of one image a camera. `say` is called with each line of what is found, as it is found.
 
-    Raises ValueError, one line: fewer than two images, an image of one colour, one image twice, images that do not
-    show the same things.
+    `focal`: focal lengths in pixels by camera, instead of those in the files' tags. Raises ValueError, one line:
+    fewer than two images, an image of one colour, images that do not show the same things, a focal length of no camera.
     """
+    if not isinstance(sources, Mapping):
+        sources = camera_names([Path(path) for path in sources])
+    if len(sources) < 2:
+        raise ValueError(f"an array has two images or more, got {len(sources)}")
+    images = {name: image for name, image in sources.items() if isinstance(image, Tensor)}
+    files = {name: Path(path) for name, path in sources.items() if not isinstance(path, Tensor)}
+    for name, length in (focal or {}).items():
+        if name not in sources or not 0 < length < math.inf:
+            raise ValueError(f"focal {name}={length:g}: no camera of {', '.join(sources)}, or not positive: mend it")
     notes: list[str] = []
 
     def note(line: str) -> None:
         notes.append(line)
         say(line)
 
-    tagged = _tagged_rig(files, note)
-    images = {name: _read(name, path, note) for name, path in files.items()}
+    tagged = None if images else _tagged_rig(files, note)
+    if tagged is not None and focal:
+        raise ValueError("focal: the images' tags state the focal lengths: leave it out")
+    images = {name: images[name] if name in images else _read(name, files[name], note) for name in sources}
+    images = {name: _textured(f"{name}: {files.get(name, 'the image')}", image) for name, image in images.items()}
     alpha = _chosen_alpha(images, alpha, note)
     if tagged is not None:
         images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
@@ -94,10 +107,11 @@ def array_of(
     weights = weights or ("mono-colour" if 3 in (*bands, sum(bands)) else "mono-spectral")
     images = {name: images[name] for name in (alpha, *names)}
     if tagged is None:
-        focal = {name: length for name in images if (length := focal_length(files[name]))}
-        for name, length in focal.items():
-            note(f"{name}: focal length {length:.0f} pixels, by EXIF")
-        rig, names = found_rig(images, alpha, focal, load_weights(weights), note)
+        by_tags = {n: by_exif for n in images if n in files and (by_exif := focal_length(files[n]))}
+        lengths = {n: length for n, length in (by_tags | dict(focal or {})).items() if n in images}
+        for name, length in lengths.items():
+            note(f"{name}: focal length {length:.0f} pixels, {'as given' if name in (focal or {}) else 'by EXIF'}")
+        rig, names = found_rig(images, alpha, lengths, load_weights(weights), note)
     else:
         rig, names = _translated_rig(tagged, images, alpha, note)
     images = {name: images[name] for name in names}
@@ -117,16 +131,6 @@ def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
         if len(set(plain)) == len(plain) and all(plain):
             return dict(zip(plain, paths))
     return {f"camera{i}": path for i, path in enumerate(paths, 1)}
-
-
-def files_of(path: Path) -> list[Path]:
-    """The image files of a camera, of a file, a folder or a pattern. Raises FileNotFoundError if there are none."""
-    if not path.is_dir() and not path.exists() and not any(c in path.name for c in "*?["):
-        _, _, file = str(path).partition("=")
-        if file and Path(file).exists():
-            raise FileNotFoundError(f"{path}: no such image: give {file} alone, cameras are called as their files are")
-        raise FileNotFoundError(f"{path}: no such image: check the path")
-    return find_images(path)
 
 
 def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str, list[Path]], dict[str, float]]:
@@ -295,8 +299,13 @@ def _read(name: str, path: Path, note: Say) -> Float[Tensor, "c h w"]:
         rotated = "orientation tag" in str(warning.message)
         h, w = image.shape[-2:]
         note(f"{name}: rotated as its EXIF orientation says, to {w}x{h}" if rotated else str(warning.message))
+    return image
+
+
+def _textured(label: str, image: Float[Tensor, "c h w"]) -> Float[Tensor, "_ h w"]:
+    """The image, one band of it where all are equal. Raises ValueError for an image of one colour."""
     if float(image.flatten(1).std(-1).amax()) < EVEN:
-        raise ValueError(f"{name}: {path}: is of one colour: there is nothing to match or to fuse")
+        raise ValueError(f"{label}: is of one colour: there is nothing to match or to fuse")
     return image[:1] if len(image) == 3 and equal_bands(image) else image
 
 
