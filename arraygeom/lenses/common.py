@@ -62,7 +62,13 @@ def norm(xy: Tensor) -> Tensor:
 
 
 def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
-    """Points with those that hold a NaN or an infinity at the origin, and which did not."""
+    """Points with those that hold a NaN or an infinity at the origin, and which did not.
+
+    Huge ones are brought nearer along their direction, which alone counts of them, as their squares would be infinite.
+    """
     points = floating(points)
     finite = points.isfinite().all(-1)
-    return torch.where(finite[..., None], points, 0.0), finite
+    points = torch.where(finite[..., None], points, 0.0)
+    size = points.detach().abs().amax(-1, keepdim=True)
+    huge = torch.finfo(points.dtype).max ** 0.25
+    return torch.where(size > huge, points / torch.where(size > huge, size, huge) * huge, points), finite
