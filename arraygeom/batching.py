@@ -28,7 +28,7 @@ class Batched:
     def __init_subclass__(cls, **options: Any) -> None:
         """Every kind is a pytree, and may be read by `torch.load(weights_only=True)`."""
         super().__init_subclass__(**options)
-        register_pytree_node(cls, _flattened, _unflattened, flatten_with_keys_fn=_flattened_with_keys)
+        register_pytree_node(cls, _flattened, _unflattened, flatten_with_keys_fn=_flattened_with_keys)  # type: ignore[arg-type]
         torch.serialization.add_safe_globals([cls])
 
     @property
@@ -153,7 +153,8 @@ def _flattened_with_keys(value: Batched) -> tuple[list[tuple[GetAttrKey, Any]], 
 
 def _unflattened(held: Iterable[Any], layout: _Layout) -> Any:
     """Without the checks of a constructor: what takes a tensor's place in a tree need not be a tensor."""
-    held, made = list(held), object.__new__(layout.kind)
+    held = list(held)
+    made: Any = object.__new__(layout.kind)
     for name, v in (layout.rest | dict(zip(layout.names, held))).items():
         object.__setattr__(made, name, v)
     for f in dataclasses.fields(made):

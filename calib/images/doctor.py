@@ -18,6 +18,7 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
+from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
 from .held_out import image_parts, trimmed_square
 from .matches import Images, Matches, Pairs, match_cameras
@@ -329,15 +330,12 @@ def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tu
 
 def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
     """The residual of the distances after a robust first-order fit of F."""
-    basis = lines_basis(pair, matches)
-    weight = torch.ones_like(off)
-    residual = off
-    for _ in range(8):
-        solution = torch.linalg.lstsq(weight[:, None] * basis, (weight * off)[:, None], driver="gelsd").solution
-        residual = off - (basis @ solution)[:, 0]
-        scale = residual.abs().median().clamp(min=1e-3)
-        weight = 1 / (1 + (residual / (2 * scale)).square())
-    return residual
+    terms = lines_basis(pair, matches).T
+
+    def weigh(rest: Tensor) -> Tensor:
+        return cauchy(rest, 2 * max(float(rest.abs().median()), 1e-3)).square()
+
+    return robust_least_squares(terms, off, least_squares(terms, off, torch.ones_like(off)), weigh, steps=7).rest
 
 
 def _figures(
