@@ -64,11 +64,16 @@ def norm(xy: Tensor) -> Tensor:
 def finite_points(points: Tensor) -> tuple[Tensor, Tensor]:
     """Points with those that hold a NaN or an infinity at the origin, and which did not.
 
-    Huge ones are brought nearer along their direction, which alone counts of them, as their squares would be infinite.
+    Huge ones of float32 are brought nearer along their direction, as their squares would be infinite.
     """
     points = floating(points)
     finite = points.isfinite().all(-1)
     points = torch.where(finite[..., None], points, 0.0)
-    size = points.detach().abs().amax(-1, keepdim=True)
-    huge = torch.finfo(points.dtype).max ** 0.25
-    return torch.where(size > huge, points / torch.where(size > huge, size, huge) * huge, points), finite
+    if points.dtype == torch.float64:
+        return points, finite
+    size = points.detach().abs().amax(-1, keepdim=True).clamp(min=HUGE)
+    return points * (HUGE / size), finite
+
+
+HUGE = 1e9
+"""Of float32: its fourth power is finite, and a direction so far off axis is at 90 degrees to rounding."""
