@@ -394,3 +394,26 @@ class Train:
         from ..training.train import train
 
         say(f"written: {train(self.config)}")
+
+
+@dataclass
+class Settings:
+    """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
+
+    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was chosen.
+    Example: pat settings --kind tuned
+    """
+
+    kind: Literal["physics", "size", "tuned", "all"] = "all"
+    """Those of one kind alone."""
+
+    rooms: ClassVar[tuple[str, ...]] = ("pat.matching", "pat.fusion", "pat.networks")
+
+    def run(self) -> None:
+        """Print a line for each."""
+        from ..support.settings import all_settings
+
+        found = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
+        for entry in found:
+            print(f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}  {entry.why}")
+        print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")

@@ -6,7 +6,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -40,7 +40,8 @@ def read_rows(path: str | Path) -> list[Row]:
         found = json.loads(Path(path).read_text(encoding="utf-8"))
         if not isinstance(found, list):
             raise TypeError("wanted a list")
-        return [Row(**{k: math.nan if v is None else v for k, v in row.items()}) for row in found]
+        rows: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in row.items()} for row in found]
+        return [Row(**row) for row in rows]
     except (TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
 

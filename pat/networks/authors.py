@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import zipfile
 from collections.abc import Iterator, Mapping
+from importlib import import_module
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any, NamedTuple
@@ -63,7 +64,7 @@ def config_of(given: Mapping[str, Tensor]) -> PATConfig:
     sizes = {"betas": betas, "in_channels": in_channels, "out_channels": out_channels, "dim": dim, "scale": scale}
     if min(sizes.values()) < 1 or max(sizes.values()) > 1024:
         raise ValueError(f"it has {', '.join(f'{name} {n}' for name, n in sizes.items())}")
-    layout = {"block_bias": False, "fusion_bias": True, "values_after_block": True}
+    layout: dict[str, Any] = {"block_bias": False, "fusion_bias": True, "values_after_block": True}
     # Their loaders enlarge beta to alpha's size.
     return PATConfig(**sizes, **layout, equal_resolution=True)
 
@@ -133,7 +134,7 @@ def _loaded(path: Path) -> Any:
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file")
     # Their psnr is a number of numpy's: these two make one, and nothing else.
-    scalar = np.core.multiarray.scalar
+    scalar = import_module("numpy.core.multiarray").scalar
     number = [(scalar, f"{core}.multiarray.scalar") for core in ("numpy.core", "numpy._core")]
     try:
         with torch.serialization.safe_globals([*number, np.dtype, type(np.dtype(np.float64)), type(np.dtype("f4"))]):

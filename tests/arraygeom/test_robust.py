@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom.robust import cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
+from arraygeom.robust import Precision, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
 
 TRUE = torch.tensor([0.5, -1.0, 2.0]).double()
 
@@ -62,19 +62,20 @@ def test_wrong_values_hardly_count(weights):
 
 
 def test_a_prior_may_depend_on_the_coefficients():
-    """Relative to what is found: whatever the values' unit, a tenth of each coefficient."""
+    """A hundredth of each coefficient, about 0: as that of the coefficients that are found, wherever one starts."""
     terms, values, _ = measured()
 
-    def found(unit: float) -> torch.Tensor:
+    def prior(c: torch.Tensor) -> torch.Tensor:
+        return 1e4 * torch.diag(c**-2)
+
+    def found(start: torch.Tensor, precision: Precision) -> torch.Tensor:
         return robust_least_squares(
-            terms,
-            unit * values,
-            unit * TRUE,
-            lambda r: cauchy(r, unit) / unit**2,
-            precision=lambda c: torch.diag(c**-2) / 0.01,
+            terms, values, start, lambda r: 100 * cauchy(r, 1.0), precision=precision
         ).coefficients
 
-    torch.testing.assert_close(found(7.0), 7 * found(1.0))
+    one = found(2 * TRUE, prior)
+    assert (one - TRUE).abs().max() > 0.1
+    torch.testing.assert_close(one, found(TRUE, prior(one)), atol=0.02, rtol=0)
 
 
 def test_the_deviation_of_normal_values_by_their_median():

@@ -4,7 +4,8 @@ from dataclasses import dataclass
 
 import pytest
 
-from pat.support.settings import listed, physics, size, tuned
+from pat.cli.authors import Settings
+from pat.support.settings import all_settings, listed, physics, size, tuned
 
 
 @dataclass(frozen=True)
@@ -26,3 +27,10 @@ def test_a_number_without_a_kind_is_refused():
 
     with pytest.raises(ValueError, match=r"Unsaid\.a is not said to be"):
         list(listed(Unsaid()))
+
+
+def test_fewer_than_120_numbers_were_tuned():
+    found = [s for s in all_settings(*Settings.rooms) if s.kind == "tuned"]
+    assert len({s.algorithm for s in found}) > 5
+    assert sum(s.numbers for s in found) < 120
+    assert all(len(s.why) > 20 for s in found)
