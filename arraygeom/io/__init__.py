@@ -39,6 +39,7 @@ from . import (
     ros,
     strecha,
     syntim,
+    xmp,
 )
 from .source import RigFileError, RigFileWarning, RigSource, unit_warning
 
@@ -63,6 +64,7 @@ READERS: dict[str, Any] = {
     "strecha": strecha,
     "open3d": open3d,
     "metashape": metashape,
+    "xmp": xmp,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {

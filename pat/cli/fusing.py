@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -143,43 +143,20 @@ class Fuse:
         self._notes: list[str] = []
         options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
-            self._with_rig() if self._rig_given() else self._without_rig()
-
-    def _rig_given(self) -> bool:
-        """Whether the first argument is a rig. Raises ValueError for arguments that do not go together.
-
-        Images that follow a rig are of the cameras that their names say.
-        """
-        if self.given and (self.image or is_rig_file(self.given[0])):
-            self.image = (*self.image, *(f"{path.stem}={path}" for path in self.given[1:]))
-            if not self.image:
-                raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
-            return True
-        if self.image:
-            raise ValueError("--image NAME=FILE needs a rig: give --rig RIG, or the images alone, without names")
-        if len(self.given) < 2:
-            raise ValueError(
-                "give two images or more, as `pat fuse mono.png colour.png`; or a rig, --alpha and each --image"
-            )
-        return False
+            self.image, with_rig = named_images(self.given, self.image, "fuse")
+            self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
         from arraygeom.compiled import numba_loaded
 
-        from ..fusion.batch import find_images
         from ..fusion.views import ViewFiles
 
         rig = self._rig()
-        if self.alpha is None:
-            raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
-        files = options.files_by_name(self.image)
-        if unknown := [path for path in self.given[1:] if path.stem not in rig.names]:
-            raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
-        found = self._frames({rig.require(name): find_images(path, name=name) for name, path in files.items()})
-        refuse_equal_files({name: paths[0] for name, paths in found.items()})
-        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
+        alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
+        found = self._frames(found)
+        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
-            return self._many(rig, found, self.alpha)
+            return self._many(rig, found, alpha)
         with ThreadPoolExecutor(2) as beside:
             beside.submit(numba_loaded)
             compared = beside.submit(warn_of_wrong_rig, views)
@@ -188,8 +165,8 @@ class Fuse:
                 with options.working("comparing the rig with the images"):
                     compared.result()
             if several:
-                return self._many(rig, found, self.alpha)
-            self._one(views.developed, views, self.alpha, before_writing=compared.result)
+                return self._many(rig, found, alpha)
+            self._one(views.developed, views, alpha, before_writing=compared.result)
 
     def _without_rig(self) -> None:
         from ..support.locks import folder_lock
@@ -480,6 +457,43 @@ def _score(image: Tensor, ground_truth: Tensor) -> Score:
     from ..evaluation.metrics import score
 
     return score(image.clamp(0, 1), ground_truth)
+
+
+def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
+    """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig.
+
+    Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do not go
+    together.
+    """
+    if given and (image or is_rig_file(given[0])):
+        named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
+        if not named:
+            raise ValueError(f"with the rig {given[0]}, give --image NAME=FILE for each camera")
+        return named, True
+    if image:
+        raise ValueError("--image NAME=FILE needs a rig: give --rig RIG, or the images alone, without names")
+    if len(given) < 2:
+        raise ValueError(
+            f"give two images or more, as `pat {command} mono.png colour.png`; or a rig, --alpha and each --image"
+        )
+    return (), False
+
+
+def files_by_camera(
+    rig: Rig, alpha: str | None, given: Sequence[Path], image: Sequence[str]
+) -> tuple[str, dict[str, list[Path]]]:
+    """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names that the
+    rig lacks, and for one image given twice."""
+    from ..fusion.batch import find_images
+
+    if alpha is None:
+        raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
+    files = options.files_by_name(image)
+    if unknown := [path for path in given[1:] if path.stem not in rig.names]:
+        raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
+    found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
+    refuse_equal_files({name: paths[0] for name, paths in found.items()})
+    return rig.require(alpha), found
 
 
 def is_rig_file(path: Path) -> bool:

@@ -28,8 +28,10 @@ from ..matching.epipolar_offset import Misalignment, fit_misalignment, normals
 from ..matching.inputs import Beta, Inputs
 from ..matching.match import located
 from ..matching.matches import BetaMatches, combined_bands
+from ..matching.normalisation import SETTINGS as NORMALISATION
+from ..matching.normalisation import Normalisation, blurred, moments
 from ..matching.radiometry import Given, Response, fit, stated_response
-from ..matching.semi_global import CONSISTENT, Normalisation, blurred, enlarged, reduced
+from ..matching.semi_global import CONSISTENT, enlarged, reduced
 from ..networks.protocol import FusionNetwork
 from ..support.settings import size, tuned
 from .inputs import FrameInputs, padded
@@ -224,9 +226,8 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     weight = (_reliable(found)[0, 0, :h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.of(alpha, luma)
     own = whole.softened(alpha)[:, :, :h, :w]
-    mean, deviation = _moments(values[-1:][None], weight)
-    wanted, spread = _moments(own, weight)
-    bright = (luma - mean) * (spread / deviation.clamp(min=1e-3)).clamp(max=4) + wanted
+    seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
+    bright = seen_there.matched(luma, wanted, NORMALISATION.largest_gain)
     soft = blurred(values[:-1][:, None], [SETTINGS.blur] * (len(values) - 1))[:, 0]
     normal = normals(Segments(*(t[0, :h, :w] for t in _parts(beta.field.straight))))
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
@@ -240,13 +241,6 @@ def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
 
 def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
     return found.start, found.end, found.valid
-
-
-def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation where the weight is."""
-    share = (weight + 1e-6) / (weight + 1e-6).sum()
-    mean = (share * image).sum()
-    return mean, (share * (image - mean).square()).sum().sqrt()
 
 
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:

@@ -52,7 +52,8 @@ def matched_frames(files: Files) -> dict[str, list[Path]]:
 def warn_of_gaps(files: Files) -> None:
     """Warn of missing numbers in a camera's frames, which a sequence counts one by one at its frame rate."""
     for name, numbers in (_numbers(files) or {}).items():
-        steps = [b - a for a, b in pairwise(numbers)] if isinstance(numbers[0], float) else []
+        counted = [n for n in numbers if isinstance(n, float)]
+        steps = [b - a for a, b in pairwise(counted)] if len(counted) == len(numbers) else []
         gaps = [i for i, step in enumerate(steps) if step > 1.5 * median(steps)]
         if gaps:
             before, after = files[name][gaps[0]].name, files[name][gaps[0] + 1].name

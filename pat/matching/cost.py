@@ -14,18 +14,19 @@ from numpy.typing import NDArray
 
 from arraygeom.compiled import compiled, separate_cache
 
+from ..support.settings import physics, tuned
+
 
 @dataclass(frozen=True)
 class CensusSettings:
     """The numbers of this cost, whose unit is a bit of the census."""
 
-    # tuned on Middlebury (tune): what a difference of 1 in (normalised) brightness costs, and at most
-    brightness: float = 30.0
-    truncated: float = 20.0
-    # physics: about a mismatch, half of the bits; of a label beyond beta's edge, where the point may well be
-    unseen: int = 24
-    # physics: more than any other cost, 48 + `truncated`; of a label that is not on beta
-    nowhere: int = 80
+    brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in (normalised) brightness costs")
+    truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
+    unseen: int = physics(
+        24, "About a mismatch, half of the bits: of a label beyond beta's edge, where the point may well be"
+    )
+    nowhere: int = physics(80, "More than any other cost, 48 + `truncated`: of a label that is not on beta")
 
 
 SETTINGS = CensusSettings()

@@ -21,14 +21,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Box, assembled, spans
+from arraygeom.chunks import Box, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
 from ..support.settings import size, tuned
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches
-from .pieces import matching_pieces
 from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
@@ -180,20 +179,11 @@ class MatchedBeta:
         return torch.where(inside, row * columns + column, rows * columns)
 
 
-def priors(inputs: Inputs) -> tuple[float, ...]:
+def _priors(inputs: Inputs) -> tuple[float, ...]:
     """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
     straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
     lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
     return tuple(SETTINGS.parallax * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
-
-
-def can_agree(inputs: Inputs) -> bool:
-    """Whether there are several betas, all calibrated and with straight fields, of one frame."""
-    betas = inputs.betas
-    one = len(inputs.alpha) == 1 and all(
-        b.field.pixels is not None and b.field.pixels.valid.shape[0] == 1 for b in betas
-    )
-    return len(betas) > 1 and one and all(beta.track is not None for beta in betas)
 
 
 class Agreement(NamedTuple):
@@ -238,7 +228,8 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
-    return Matches(tuple(_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas))
+    agreeing = (_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas)
+    return Matches(tuple(replace(one, prior=prior) for one, prior in zip(agreeing, _priors(inputs))))
 
 
 def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]:
@@ -323,9 +314,7 @@ def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
         return torch.from_numpy(median)[None].to(inputs.alpha)
 
-    pieces = matching_pieces(inputs.hw, inputs.multiple)
-    inverse_depth = assembled(inputs.hw, ((piece, of(piece.outer)) for piece in pieces))
-    return agreement._replace(inverse_depth=inverse_depth)
+    return agreement._replace(inverse_depth=inputs.in_pieces(of))
 
 
 def _of_beta(

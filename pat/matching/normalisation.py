@@ -12,11 +12,13 @@ import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom.fields.protocol import compilable
 
+from ..media.colour import to_bytes
 from ..support.settings import size, tuned
 
 LEAST_WEIGHT = 1e-6
@@ -102,6 +104,14 @@ def _weighted_mean(image: Tensor, weight: Tensor) -> Float[Tensor, "*b 1 1 1"]:
     return (weight / weight.sum((-3, -2, -1), keepdim=True) * image).sum((-3, -2, -1), keepdim=True)
 
 
+class ComparedViews(NamedTuple):
+    """Alpha and what of beta is compared with it, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w)."""
+
+    alpha: Tensor
+    beta: Tensor
+    guides: NDArray[np.uint8]
+
+
 class Normalisation(NamedTuple):
     """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
 
@@ -131,6 +141,10 @@ class Normalisation(NamedTuple):
         """Both (or parts of them), the sharper one blurred."""
         own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
         return own, other
+
+    def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
+        """Alpha and beta's brightness, or parts of them, as they are compared."""
+        return ComparedViews(*self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]))
 
 
 class Normalisations(NamedTuple):

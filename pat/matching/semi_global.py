@@ -3,7 +3,7 @@
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
 semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its
 labels are positions along each pixel's own segment, so it works for any rig with straight fields, rectified
-or not. Here it is computed on images of half the size; `matching` goes on from there to the full size.
+or not: all labels of a segment at half the size, and at full size those of a window around what that found.
 Without gradients.
 """
 
@@ -29,11 +29,11 @@ from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
 
-from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
+from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
 from .cost import planes_of
-from .normalisation import Normalisation, Normalisations, blurred, equalising_blurs  # noqa: F401
+from .normalisation import ComparedViews, Normalisation
 
 FINE = 2
 """Matching is done on images this many times smaller."""
@@ -43,61 +43,34 @@ FINE = 2
 class SemiGlobalSettings:
     """The numbers of a run of semi-global matching."""
 
-    # tuned on Middlebury (tune): penalties of neighbours whose labels differ by one, and by more where alpha
-    # shows no edge; of the unit of `cost`
-    step: float = 12.0
-    jump: float = 100.0
-    # size: what is matched around a block; its sides, pixels; the longer side of those of large images, which lies
-    # along the segments; the costs up to which a block is as high as the image, which saves margins
-    margin: int = 64
-    block: int = 320
-    long_block: int = 640
-    most_costs: int = 2**25
-    # size: what a block takes for each pixel, and for each label of each pixel: cost, and sum of costs
-    pixel_bytes: int = 128
-    label_bytes: int = 3
-    # tuned on Middlebury (tune): a match is consistent if matching back from beta ends less than this (times 8
-    # pixels) from it; strength, and 8-bit difference that is an edge, of the smoothing that fills (Min et al. 2014)
-    consistent: float = 0.2
-    fill: tuple[float, float] = (50.0, 4.0)
+    step: float = tuned(
+        12.0, "Source not recorded: penalty of neighbours whose labels differ by one, in the unit of `cost`"
+    )
+    jump: float = tuned(100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge")
+    margin: int = size(64, "What is matched around a block, pixels")
+    block: int = size(320, "Sides of a block, pixels")
+    long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
+    most_costs: int = size(2**25, "Costs up to which a block is as high as the image, which saves margins")
+    pixel_bytes: int = size(128, "What a block takes for each pixel")
+    label_bytes: int = size(3, "What it takes for each label of each pixel: cost, and sum of costs")
+    consistent: float = tuned(
+        0.2,
+        "Source not recorded: a match is consistent if matching back from beta ends less than this (times 8 "
+        "pixels) from it",
+    )
+    fill: tuple[float, float] = tuned(
+        (50.0, 4.0),
+        "Source not recorded: strength, and 8-bit difference that is an edge, of the smoothing that fills "
+        "(Min et al. 2014)",
+    )
 
 
 HALF_SIZE = SemiGlobalSettings()
 CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
-class SemiGlobalMatches(NamedTuple):
-    """The matches of images of H x W.
-
-    disparity: (B, 1, H, W), how far from its segment's end the match is, pixels of beta; where the match is
-        not consistent, diffused from where it is.
-    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better
-        than others, and its cost; each 0 to 1.
-    matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has
-    not.
-    colour: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
-    """
-
-    disparity: Tensor
-    facts: Tensor
-    matched: Tensor
-    colour: Tensor
-
-    def cut(self, box: Box) -> SemiGlobalMatches:
-        """The part at alpha's (top, bottom, left, right), all even."""
-        top, bottom, left, right = box
-        half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
-        whole = (..., slice(top, bottom), slice(left, right))
-        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
-
-    def stored(self) -> SemiGlobalMatches:
-        """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
-        return self._replace(matched=self.matched.half(), colour=self.colour.half())
-
-
 class HalfSizeMatches(NamedTuple):
-    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of
-    `SemiGlobalMatches`."""
+    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `BetaMatches`."""
 
     disparity: Tensor
     facts: Tensor
@@ -147,12 +120,10 @@ def matched_at_half_size(
     normalisation: Normalisation,
 ) -> HalfSizeMatches:
     """Matches of images at half the size; `normalisation` is that of half the size."""
-    own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
+    views = normalisation.views(avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE))
     geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
     del guide, blocks
-    guides = to_bytes(avg_pool2d(alpha, FINE)[:, 0])
-    disparity, facts = matched_by_labels(own, other, geometry, Windows.all(geometry), guides, HALF_SIZE)
+    disparity, facts = matched_by_labels(views, geometry, Windows.all(geometry), HALF_SIZE)
     return HalfSizeMatches(FINE * disparity[:, None].to(alpha), facts.movedim(-1, 1).to(alpha))
 
 
@@ -171,23 +142,22 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
 
 
 def matched_by_labels(
-    own: Float[Tensor, "b 1 h w"],
-    other: Float[Tensor, "b 1 hb wb"],
+    views: ComparedViews,
     geometry: _Geometry,
     windows: Windows,
-    guides: NDArray[np.uint8],
     settings: SemiGlobalSettings,
     facts: int = 3,
 ) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w facts"]]:
     """Semi-global matching of the labels in each pixel's window: disparity, and the first so many of the
-    facts of `SemiGlobalMatches` (1 or 3).
+    facts of `BetaMatches` (1 or 3).
 
-    Where matching back from beta disagrees, disparity is diffused from where it does not, along `guides` (B,
-    h, w).
+    Where matching back from beta disagrees, disparity is diffused from where it does not, within what is
+    connected in alpha.
     """
-    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry, windows, settings, facts)
+    own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
+    found, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
     consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
-    dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, guides))
+    dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides))
     smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
     return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
 

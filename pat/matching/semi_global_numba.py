@@ -367,7 +367,8 @@ def winners(
             of_best = 0 if label < starts[0] + count else 1
             sums, k = total[here][of_best], label - starts[of_best]
             last = count if cut[here] else _count_within(far, starts[of_best], count)
-            disparity[y, x] = np.float32(label) + _between(sums, k, last - 1)
+            shift = _rounding(end[here], along[here], np.float32(label))
+            disparity[y, x] = np.float32(label) + shift + _between(sums, k, last - 1)
             place = places[of_best * lanes + k]
             positions[y, x] = place if place >= 0 else nowhere
             facts[y, x, 0] = np.float32(label)
@@ -389,6 +390,13 @@ def _lowest(costs, first, last):
     for i in range(first, last):
         least = min(least, costs[i])
     return least
+
+
+@compiled(inline="always")
+def _rounding(end, along, label):
+    """How far along its segment a label's pixel of beta, to which its position is rounded, is from that position."""
+    x, y = end[0] + label * along[0], end[1] + label * along[1]
+    return (np.floor(x + HALF) - x) * along[0] + (np.floor(y + HALF) - y) * along[1]
 
 
 @compiled(inline="always")

@@ -17,121 +17,82 @@ import torch
 from jaxtyping import Float
 from numpy.typing import NDArray
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, interpolate
 
 from arraygeom import Segments
 
-from ..media.colour import to_bytes
+from ..support.settings import size, tuned
 from .colour_transfer import at_matches, box_mean
+from .normalisation import ComparedViews
 from .semi_global import (
     CONSISTENT,
     FINE,
     Extent,
-    HalfSizeMatches,
-    Normalisation,
-    Normalisations,
     SemiGlobalSettings,
     Windows,
     filled,
     geometry_of,
-    matched_at_half_size,
     matched_by_labels,
     numpy_of,
 )
 
 FULL_SIZE = SemiGlobalSettings(
-    step=20.0,  # tuned on Middlebury (tune); half the size, where a label is two pixels, has others
-    jump=80.0,  # tuned with it
-    margin=48,  # size
+    step=20.0,
+    jump=80.0,
+    margin=48,
 )
+"""Penalties chosen on Middlebury's pairs of the tune half; half the size, where a label is two pixels, has others."""
 
 
 @dataclass(frozen=True)
 class SubpixelSettings:
     """The numbers of matching at full size, and to a fraction of a pixel."""
 
-    # size: labels in a run, of which each pixel has two; side of the neighbourhood at half the size, pixels
-    run: int = 5
-    neighbourhood: int = 5
-    # tuned on Middlebury (tune): nearer matches at both sizes are of one surface, pixels
-    same: float = 0.7
-    # size: window of the step to a fraction of a pixel
-    step_radius: int = 3
-    # tuned on Middlebury (tune): regulariser (variance of brightness) of that step, and its most pixels
-    step_floor: float = 2e-5
-    most_step: float = 0.25
-    # tuned on Middlebury (tune): slope of brightness (its square) along the segment at which a match weighs half in
-    # the smoothing of surfaces, and what any consistent match weighs
-    flat: float = 3e-6
-    least_weight: float = 0.01
-    # tuned on Middlebury (tune): strength of that smoothing, and the 8-bit difference that counts as an edge; how
-    # many such levels a pixel of disparity counts
-    surface: tuple[float, float] = (30.0, 4.0)
-    pixel: float = 8.0
+    run: int = size(5, "Labels in a run, of which each pixel has two")
+    neighbourhood: int = size(5, "Side of the neighbourhood at half the size, pixels")
+    same: float = tuned(0.7, "Middlebury: nearer matches at both sizes are of one surface, pixels")
+    step_radius: int = size(3, "Window of the step to a fraction of a pixel")
+    step_floor: float = tuned(2e-5, "Source not recorded: regulariser (variance of brightness) of that step")
+    most_step: float = tuned(0.25, "Source not recorded: the most pixels of that step")
+    flat: float = tuned(
+        3e-6,
+        "Middlebury: slope of brightness (its square) along the segment at which a match weighs half in the "
+        "smoothing of surfaces",
+    )
+    least_weight: float = tuned(0.01, "Source not recorded: what any consistent match weighs in it")
+    surface: tuple[float, float] = tuned(
+        (30.0, 4.0), "Middlebury: strength of that smoothing, and the 8-bit difference that counts as an edge"
+    )
+    pixel: float = tuned(8.0, "Middlebury: how many such levels a pixel of disparity counts")
 
 
 SETTINGS = SubpixelSettings()
 
 
-@torch.no_grad()
-def matched(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    segments: Segments,
-    blocks: Segments | None,
-    normalisations: Normalisations,
-    half: HalfSizeMatches | None = None,
-) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 3 h2 w2"]]:
-    """Agree on where the pixels of alpha are in beta, whose brightness is `guide`: `disparity` and `facts` of
-    `SemiGlobalMatches`.
-
-    `segments` (B or 1, H, W) are those of alpha's pixels and `blocks` (B or 1, H / 2, W / 2) those of the
-    centres of its 2x2 pixels, in beta's pixels. All sides are even. `normalisations` are those of the whole
-    images if these are parts, and `half` what is known of these parts from the whole images. On the CPU, with
-    as many threads as torch may use; the same whatever their number.
-    """
-    if half is None:
-        assert blocks is not None, "matching without blocks begins with matches at half the size"
-        half = matched_at_half_size(alpha, guide, blocks, normalisations.half)
-    rough, facts = half
-    disparity, unlike = matched_at_full_size(alpha, guide, segments, rough, normalisations.whole)
-    rough = interpolate(rough, scale_factor=FINE, mode="bilinear")
-    disparity = precise(alpha, guide, segments, disparity, unlike, rough, normalisations.whole)
-    return disparity, torch.cat([avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
-
-
 def matched_at_full_size(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
-    segments: Segments,
-    disparity: Float[Tensor, "b 1 h2 w2"],
-    normalisation: Normalisation,
+    views: ComparedViews, segments: Segments, disparity: Float[Tensor, "b 1 h2 w2"]
 ) -> tuple[Float[Tensor, "b 1 h w"], Float[Tensor, "b 1 h w"]]:
     """Disparity from that at half the size, and how far matching back from beta disagrees, 0 to 1.
 
-    Where it disagrees, disparity is diffused from where it does not. `normalisation` is that of whole images.
+    Where it disagrees, disparity is diffused from where it does not.
     """
-    own, other = normalisation.equally_sharp(alpha, normalisation.normalised(guide))
-    geometry = geometry_of(segments, len(alpha), (guide.shape[-2], guide.shape[-1]), factor=1)
+    own, other = views.alpha, views.beta
+    geometry = geometry_of(segments, len(own), (other.shape[-2], other.shape[-1]), factor=1)
     windows = Windows(np.stack([_runs(half) for half in numpy_of(disparity[:, 0])]), SETTINGS.run)
-    guides = to_bytes(alpha[:, 0])
-    found, unlike = matched_by_labels(own, other, geometry, windows, guides, FULL_SIZE, facts=1)
-    return found[:, None].to(alpha), unlike.movedim(-1, 1).to(alpha)
+    found, unlike = matched_by_labels(views, geometry, windows, FULL_SIZE, facts=1)
+    return found[:, None].to(own), unlike.movedim(-1, 1).to(own)
 
 
 def precise(
-    alpha: Float[Tensor, "b 1 h w"],
-    guide: Float[Tensor, "b 1 hb wb"],
+    views: ComparedViews,
     segments: Segments,
     disparity: Float[Tensor, "b 1 h w"],
     unlike: Float[Tensor, "b 1 h w"],
     rough: Float[Tensor, "b 1 h w"],
-    normalisation: Normalisation,
 ) -> Float[Tensor, "b 1 h w"]:
     """Disparity to a fraction of a pixel: where that of half the size (`rough`) is near, the mean of both;
     from there a step of least squares of the brightness around each pixel (Lucas and Kanade 1981); and the
     result smoothed within surfaces, where brightness says little of the position more than elsewhere."""
-    own, other = normalisation.equally_sharp(alpha, normalisation.normalised(guide))
+    own, other, guides = views
     consistent = unlike < CONSISTENT
     near = consistent & ((disparity - rough).abs() < SETTINGS.same)
     start = torch.where(near, (disparity + rough) / 2, disparity)
@@ -145,7 +106,7 @@ def precise(
     common, slope = box_mean(torch.cat([rise * rest, rise.square()], 1), SETTINGS.step_radius).split(1, 1)
     step = (common / (slope + SETTINGS.step_floor)).clamp(-SETTINGS.most_step, SETTINGS.most_step)
     weight = torch.where(consistent, slope / (slope + SETTINGS.flat) + SETTINGS.least_weight, 0.0) + 1e-5
-    planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), to_bytes(alpha[:, 0]))
+    planes = zip(numpy_of(torch.where(near, start + step, start)), numpy_of(weight[:, 0]), guides)
     smooth = np.stack([filled(d, w, _surfaces(d[0], brightness), SETTINGS.surface) for d, w, brightness in planes])
     return torch.from_numpy(smooth).to(disparity)
 

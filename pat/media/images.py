@@ -70,8 +70,29 @@ def read_image(
     Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another size than
     expected, or is larger than `MOST_PIXELS` where no size is.
     """
-    path = Path(path)
     label = f"{name}: {path}" if name else f"{path}"
+    planes, packed = _planes(Path(path), label, hw, orientation)
+    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
+
+
+def read_recorded(
+    path: str | Path,
+    *,
+    name: str | None = None,
+    hw: HW | None = None,
+    orientation: Literal["apply", "ignore"] = "apply",
+) -> NDArray[Any]:
+    """The values (C, H, W) of an image file in its own type and counts; else, and in what it raises, as `read_image`.
+
+    Those that a TIFF file packs into less than 16 bits are as its camera counted them.
+    """
+    label = f"{name}: {path}" if name else f"{path}"
+    planes, packed = _planes(Path(path), label, hw, orientation)
+    return np.ascontiguousarray(planes >> (16 - packed) if packed else planes)
+
+
+def _planes(path: Path, label: str, hw: HW | None, orientation: Literal["apply", "ignore"]) -> tuple[NDArray, int]:
+    """The values (C, H, W) as OpenCV reads them, upright, and the bits of packed ones (else 0)."""
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = _png_of_raw(path, label) if path.suffix.lower() in RAW_SUFFIXES else path.read_bytes()
@@ -86,8 +107,7 @@ def read_image(
     values = _opaque(_upright(values, applied), label)
     if orientation == "apply":
         values = in_srgb(values, content, label)
-    planes = values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)
-    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
+    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), packed
 
 
 def write_image(

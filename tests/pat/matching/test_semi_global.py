@@ -21,10 +21,9 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
 )
-from pat.matching.matches import BetaMatches
+from pat.matching.matches import BetaMatches, Comparison
+from pat.matching.normalisation import Normalisation, Normalisations, equalising_blurs
 from pat.matching.semi_global import (
-    Normalisation,
-    equalising_blurs,
     length_of,
     matched_at_half_size,
     matches,
@@ -192,7 +191,9 @@ def test_no_segment_is_nothing_found():
 
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
-    cut = BetaMatches(whole - 1, half, None, whole + 1, whole).cut((4, 10, 2, 16))
+    cut = BetaMatches(whole - 1, half, Comparison(None, Normalisations.of(whole, whole)), whole + 1, whole).cut(
+        (4, 10, 2, 16)
+    )
     assert torch.equal(cut.disparity, whole[..., 4:10, 2:16] - 1)
     assert torch.equal(cut.facts, half[..., 2:5, 1:8])
     assert torch.equal(cut.diffused, whole[..., 4:10, 2:16])

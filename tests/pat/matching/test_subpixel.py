@@ -6,9 +6,10 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, pixel_grid
-from pat.matching.semi_global import Normalisations, matched_at_half_size
-from pat.matching.subpixel import SETTINGS, _runs, _surfaces, matched
-from tests.pat.matching.matched_scenes import beside, blurred
+from pat.matching.normalisation import Normalisations
+from pat.matching.semi_global import matched_at_half_size
+from pat.matching.subpixel import SETTINGS, _runs, _surfaces
+from tests.pat.matching.matched_scenes import beside, blurred, matched
 
 H, W, NEAREST = 96, 160, 30
 FAR, NEAR = 6, 21
