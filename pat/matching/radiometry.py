@@ -26,10 +26,8 @@ from arraygeom import pixel_grid
 from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
 
 from ..media.colour import REC601
-from ..support.settings import size, tuned
+from ..support.settings import physics, size, tuned
 from .normalisation import box_mean
-
-GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
 
 
 @dataclass(frozen=True)
@@ -44,17 +42,14 @@ class ResponseSettings:
         (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
     )
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
-    independent: float = tuned(
-        20.0,
-        "Middlebury: as how many independent observations all points count: about as many as there are materials",
-    )
-    error: float = tuned(
-        0.012,
-        "Middlebury: standard deviation of one of those, at least: light and surfaces differ between the views",
-    )
+    independent: float = tuned(20.0, "Middlebury: as how many independent observations, or materials, all points count")
+    error: float = tuned(0.012, "Middlebury: standard deviation of one of those, at least: light differs between views")
     outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
-    gammas: tuple[float, ...] = size(GAMMAS, "Gammas that are tried")
+    gammas: tuple[float, ...] = size(
+        (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6),
+        "Gammas that are tried",
+    )
     unlikely: tuple[float, float, float] = tuned(
         (22.0, 12.0, 45.0),
         "Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken",
