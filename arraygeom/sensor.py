@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
 
 @dataclass(frozen=True)
 class Band:
@@ -47,3 +49,6 @@ class Sensor:
     black_level: float = 0.0
     exposure: float | None = None
     gain: float | tuple[float, float, float] = 1.0
+
+
+torch.serialization.add_safe_globals([Band, Curve, Sensor])

@@ -136,7 +136,7 @@ def _attend(
         raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
     def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
-        form = _form(given, q, samples)
+        form = sample_positions(given, q, samples)
         found = _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
         return found if measured else found[:1]
 
@@ -185,7 +185,7 @@ def _attend_local(query: Tensor, key: Tensor, value: Tensor, field: Local) -> tu
     return (cpu.forward_local(query, key, value, field),)
 
 
-def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
+def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
         points, mask, straight = torch.stack([locations.start, locations.end], -2), locations.valid[..., None], True
@@ -230,7 +230,7 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 
 
 def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
-    chosen = _choose(backend, inputs.query.device.type)
+    chosen = chosen_backend(backend, inputs.query.device.type)
     tensors = inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias
     missing = "" if chosen == "reference" else _missing(*tensors)
     if missing and backend != "auto":
@@ -250,7 +250,7 @@ def _missing(*tensors: Tensor | None) -> str:
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 
 
-def _choose(backend: Backend, device: str) -> str:
+def chosen_backend(backend: Backend, device: str) -> str:
     """The backend that serves; raises if the one asked for cannot."""
     triton = importlib.util.find_spec("triton") is not None
     if backend == "auto":

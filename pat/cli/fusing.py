@@ -40,10 +40,11 @@ class Fuse:
     Without a rig: pat fuse mono.png colour.png
     With one: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    Without a rig it is found from the images, and written to rig.yaml beside the result. Cameras are then called as
-    their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused
-    one by one: the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised
-    (frame_rate and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
+    Without a rig it is found from the images, and written to found_rig.yaml beside the result. Cameras are then
+    called as their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images,
+    frames are fused one by one, matched by names or by the numbers or times in them. With --sequence the cameras
+    need not be synchronised (frame_rate and time_offset in the rig): every frame of alpha gets colour from the
+    betas' frames nearest in time.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {
@@ -126,6 +127,7 @@ class Fuse:
 
     def run(self) -> None:
         """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
+        from ..media.images import exr_writer
         from ..support.memory import limited, parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
@@ -134,6 +136,8 @@ class Fuse:
         options.response_of(self.response)
         options.noise_of(self.noise)
         options.device_of(self.device)
+        if self.kind == "exr":
+            exr_writer(self.out)
         if self.classical and not self.report:
             raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
@@ -149,6 +153,7 @@ class Fuse:
 
         rig = self._rig()
         alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
+        found = self._frames(found)
         views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
             return self._many(rig, found, alpha)
@@ -187,8 +192,11 @@ class Fuse:
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
         """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
+        from ..fusion.results import FOUND_RIG
         from .from_images import array_of
 
+        self.sequence |= bool(rates)
+        files = self._frames(files)
         first = {name: paths[0] for name, paths in files.items()}
         options.say_when_compiling()
         with options.working("finding the rig"):
@@ -202,10 +210,19 @@ class Fuse:
         for name, rate in rates.items():
             if name in rig.names:
                 rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
-        self.sequence, self.video = self.sequence or bool(rates), rates.get(array.alpha, self.video)
+        self.video = rates.get(array.alpha, self.video)
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
-        rig.save(self.out / "rig.yaml")
-        say(f"the rig that was found: {self.out / 'rig.yaml'}")
+        rig.save(self.out / FOUND_RIG)
+        say(f"the rig that was found: {self.out / FOUND_RIG}")
+
+    def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
+        """The files of the frames that every camera has; all of them, of a sequence."""
+        from ..fusion.frame_matching import matched_frames, warn_of_gaps
+
+        if self.sequence:
+            warn_of_gaps(files)
+            return files
+        return matched_frames(files)
 
     @contextmanager
     def _judged(self) -> Iterator[list[str]]:

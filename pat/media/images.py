@@ -21,6 +21,7 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
+from arraygeom.image_bytes import decodable
 
 from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
@@ -250,9 +251,9 @@ def _log_level(level: int) -> int:
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
     """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
-    level = _log_level(0)
+    level, checked = _log_level(0), decodable(content)
     try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
     except cv2.error:
         return None
     finally:
@@ -316,15 +317,21 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     return planes.astype(np.float32) / np.float32(white)
 
 
-def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
-    if bits != 32:
-        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+def exr_writer(path: Path) -> Any:
+    """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
     try:
         import OpenEXR
     except ImportError:
         raise ValueError(
             f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
         ) from None
+    return OpenEXR
+
+
+def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
+    if bits != 32:
+        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+    OpenEXR = exr_writer(path)
     names = {1: "Y", 3: "RGB", 4: "RGBA"}[len(planes)]
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
