@@ -286,6 +286,8 @@ class Fuse:
             frame = fuse_with_progress(rig=rig, images=images, alpha=alpha, **further)
             before_writing()
             frame, gain = self._exposed(frame)
+            if found is None and not frame.depth.isfinite().any():
+                self._note("no depth: the rig knows its cameras by F alone, or the images match nowhere")
             view = view_of(rig, alpha, bits=self.bits, bands=len(frame.image))
             found_rig = rig if found is not None else None
             points = rig[alpha] if self.points else None
