@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from .batching import stack
 from .camera import Camera, LensView, Projected, View, intrinsics
+from .checks import unchecked
 from .distortion import Distortion
 from .epipolar import (
     Depth,
@@ -113,6 +114,7 @@ __all__ = [
     "to_grid",
     "track",
     "triangulate",
+    "unchecked",
 ]
 
 sys.meta_path.insert(0, OldModules({"arraygeom.io.whole": "arraygeom.atomic"}, {}))

@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .checks import check_batches, check_hw, check_K, checking
 from .distortion import Distortion
 from .pixels import (
     HW,
@@ -48,6 +49,12 @@ class View(Batched):
 
     hw: HW
     sensor: Sensor = field(default_factory=Sensor)
+
+    def __post_init__(self) -> None:
+        if checking():
+            check_hw(self.hw)
+            if not isinstance(self.sensor, Sensor):
+                raise TypeError(f"sensor is a {type(self.sensor).__name__}: give a Sensor, as Sensor(response='mono')")
 
     def resize(self: AnyView, hw: HW) -> AnyView:
         """The same view at another size."""
@@ -99,6 +106,14 @@ class LensView(View):
     item_axes: ClassVar = {"K": 2}
     K: Float[Tensor, "*b 3 3"]
     distortion: Distortion | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if checking():
+            check_K(self.K)
+            if not isinstance(self.distortion, Distortion | None):
+                kind = type(self.distortion).__name__
+                raise TypeError(f"distortion is a {kind}: give a Distortion(model, coefficients)")
 
     def project_local(self, X: Real[Tensor, "*n 3"]) -> Projected:
         """Points in the camera's own frame to pixels."""
@@ -159,6 +174,13 @@ class Camera(LensView):
     """
 
     cam_from_world: Pose
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if checking():
+            if not isinstance(self.cam_from_world, Pose):
+                raise TypeError(f"cam_from_world is a {type(self.cam_from_world).__name__}: give a Pose(R, t)")
+            check_batches("K and cam_from_world", self.K.shape[:-2], self.cam_from_world.batch_shape)
 
     @property
     def R(self) -> Float[Tensor, "*b 3 3"]:

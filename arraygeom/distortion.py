@@ -33,6 +33,7 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .batching import Batched
+from .checks import check_numbers, checking
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
 from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
@@ -64,12 +65,17 @@ class Distortion(Batched):
     coefficients: Float[Tensor, "*b n"]
 
     def __post_init__(self) -> None:
+        if checking() and not isinstance(self.coefficients, Tensor):
+            kind = type(self.coefficients).__name__
+            raise TypeError(f"the coefficients are a {kind}: give a tensor, such as torch.tensor([-0.1, 0, 0, 0])")
         if self.model not in COEFFICIENT_COUNTS:
             raise ValueError(f"unknown lens model {self.model!r}: use one of {', '.join(COEFFICIENT_COUNTS)}")
         counts = COEFFICIENT_COUNTS[self.model]
         if self.coefficients.shape[-1] not in counts:
             given, wanted = self.coefficients.shape[-1], " or ".join(map(str, counts))
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
+        if checking():
+            check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
 
     @property
     def is_identity(self) -> bool:

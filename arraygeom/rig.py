@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -17,6 +17,7 @@ from torch import Tensor
 
 from .batching import Batched
 from .camera import Camera, LensView, View
+from .checks import check_numbers, checking, derived
 from .epipolar import fundamental_matrix
 from .homography import plane_homography
 from .pixels import HW, product, resize_matrix, rot90_matrix, shift_matrix
@@ -40,6 +41,12 @@ class Link(Batched):
     item_axes: ClassVar = {"F": 2, "H": 2}
     F: Float[Tensor, "*b 3 3"]
     H: Float[Tensor, "*b 3 3"] | None = None
+
+    def __post_init__(self) -> None:
+        if checking():
+            for name, matrix in (("F", self.F), ("H", self.H)):
+                if not (name == "H" and matrix is None):
+                    check_numbers(matrix, (3, 3), name)
 
     def reversed(self) -> Link:
         """The same link with alpha and beta exchanged."""
@@ -184,9 +191,23 @@ class Rig(Batched):
     name: str = ""
 
     def __post_init__(self) -> None:
+        if not isinstance(self.cameras, Mapping):
+            raise TypeError(f"the cameras are a {type(self.cameras).__name__}: give a mapping of names to cameras")
         object.__setattr__(self, "cameras", {name: _view(name, camera) for name, camera in self.cameras.items()})
         if self.depth is not None:
+            if not isinstance(self.depth, Sequence | Tensor) or len(self.depth) != 2:
+                raise TypeError(f"depth is {self.depth!r}: wanted (near, far), in metres")
             object.__setattr__(self, "depth", depth_range(*self.depth))
+        if checking():
+            self._check_links()
+
+    def _check_links(self) -> None:
+        for names, link in self.links.items():
+            if not isinstance(link, Link):
+                raise TypeError(f"the link {names} is a {type(link).__name__}: give a Link(F)")
+            alpha, beta = names
+            if self.require(alpha) == self.require(beta):
+                raise ValueError(f"a link relates two cameras; this one is from '{alpha}' to itself")
 
     @classmethod
     def from_kornia(cls, cameras: Mapping[str, PinholeCamera], **fields: Any) -> Rig:
@@ -272,12 +293,22 @@ class Rig(Batched):
         unknown = set(changes) - set(self._parameter_shapes())
         if unknown:
             raise ValueError(f"no such rig parameter: {', '.join(sorted(unknown))}")
-        cameras = {name: _perturbed_camera(name, camera, changes) for name, camera in self.cameras.items()}
+        cameras = {name: derived(_perturbed_camera, name, camera, changes) for name, camera in self.cameras.items()}
         depth = self.depth
         if depth is not None:
             near, far = depth
             depth = near + changes.get("depth.near", 0), far + changes.get("depth.far", 0)
         return self.replace(cameras=cameras, depth=depth)
+
+    def check(self) -> tuple[str, ...]:
+        """What is odd about the rig, a sentence each; none if nothing is.
+
+        Constructors refuse numbers that cannot be; these can, and are mistakes more often than not: another unit, poses
+        of another convention, axes exchanged, views that do not overlap.
+        """
+        from .rig_check import oddities
+
+        return oddities(self)
 
     @classmethod
     def load(cls, path: str | Path) -> Rig:

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ..camera import Camera, LensView, View
+from ..checks import check_above, check_bounds, check_field
 from ..chunks import spans
 from ..epipolar import FRONT, Track, beside, clipped
 from ..pixels import HW, floating, map_homogeneous, product
@@ -44,6 +45,11 @@ class Curved:
     far: float | None = None
     nodes: int = 64
 
+    def __post_init__(self) -> None:
+        check_above(1, whole=True, samples=self.samples)
+        check_above(2, whole=True, nodes=self.nodes)
+        check_bounds(self.near, self.far)
+
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2), differentiable in all numbers of the rig, lenses included."""
         pair.cameras  # noqa: B018  (raises for an uncalibrated pair, before the depth range is asked for)
@@ -71,6 +77,10 @@ class ThroughLenses:
 
     field: ReceptiveField
     samples: int = 96
+
+    def __post_init__(self) -> None:
+        check_field(self.field)
+        check_above(1, whole=True, samples=self.samples)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Positions:
         """Positions (*n, samples, 2) in beta's own pixels. Raises ValueError for a batch of rigs with lenses."""

@@ -41,7 +41,7 @@ import difflib
 import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 import yaml
@@ -53,8 +53,10 @@ from ..epipolar import shift_origin
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
-from ..sensor import PATTERNS, Band, Curve, Sensor
+from ..sensor import CODINGS, PATTERNS, Band, Curve, Sensor
 from .source import RigSource
+
+T = TypeVar("T")
 
 FORMAT = "arraygeom-rig 1"
 UNITS = {"metres": 1.0, "millimetres": 1e-3}
@@ -205,17 +207,14 @@ class _Document(RigSource):
             return None
         self.keys(value, ("model", "coefficients"), entry)
         coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
-        try:
-            return Distortion(str(value.get("model")), coefficients)
-        except ValueError as error:
-            raise self.fail(entry, str(error)) from None
+        return self.made(entry, Distortion, str(value.get("model")), coefficients)
 
     def sensor(self, entry: str, fields: Mapping[str, Any]) -> Sensor:
         response = fields.get("response")
         if isinstance(response, dict):
             response = self.response(f"{entry}.response", response)
         known: dict[str, Any] = {}
-        for key, choices in (("coding", ("srgb", "linear")), ("bayer", PATTERNS)):
+        for key, choices in (("coding", CODINGS), ("bayer", PATTERNS)):
             if fields.get(key) is not None:
                 known[key] = self.one_of(fields[key], choices, f"{entry}.{key}")
         for key, above in (("frame_rate", 0.0), ("time_offset", -math.inf), ("exposure", 0.0)):
@@ -260,10 +259,17 @@ class _Document(RigSource):
         if "centre" in fields:
             self.keys(fields, ("centre", "width"), entry)
             centre, width = self.numbers([fields["centre"], fields.get("width")], (2,), entry).tolist()
-            return Band(centre, width)
+            return self.made(entry, Band, centre, width)
         self.keys(fields, ("wavelength", "response"), entry)
         curve = self.numbers([fields.get("wavelength"), fields.get("response")], None, entry)
-        return Curve(tuple(curve[0].tolist()), tuple(curve[1].tolist()))
+        return self.made(entry, Curve, *(tuple(row) for row in curve.reshape(2, -1).tolist()))
+
+    def made(self, entry: str, kind: Callable[..., T], *numbers: Any) -> T:
+        """What a constructor makes, its refusals with the entry's name."""
+        try:
+            return kind(*numbers)
+        except ValueError as error:
+            raise self.fail(entry, str(error)) from None
 
     def link(self, entry: str, fields: Any, cameras: Mapping[str, View]) -> tuple[tuple[str, str], Link]:
         self.keys(fields, ("alpha", "beta", "F", "H"), entry)

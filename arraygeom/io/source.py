@@ -14,18 +14,13 @@ import yaml
 from torch import Tensor
 
 from ..camera import Camera
+from ..checks import LARGEST_SIDE, MOST_PIXELS, ROUNDED
 from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Distortion
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
 from ..safe_yaml import load_yaml, yaml_problem
 
-# A baseline outside these bounds, in metres, is more likely a mistaken unit than a camera array.
-SMALLEST_BASELINE, LARGEST_BASELINE = 1e-4, 50.0
-# A size beyond these bounds is more likely a damaged number than an image (the largest sensors have some 4e8 pixels).
-LARGEST_SIDE, MOST_PIXELS = 65_535, 2**30
-# Rotations in text files are rounded: this much of a deviation is put right, more is refused.
-ROUNDED = 1e-3
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
 
@@ -267,23 +262,3 @@ class RigSource:
             names = [name for name, _ in pairs]
             raise self.fail(next(n for n in names if names.count(n) > 1), "occurs twice; keep one")
         return fields
-
-
-def unit_warning(rig: Rig) -> str | None:
-    """What to say of baselines that suggest another unit than metres."""
-    centres = [camera.centre for camera in rig.cameras.values() if isinstance(camera, Camera)]
-    if len(centres) < 2:
-        return None
-    longest = float(torch.pdist(torch.stack(centres)).max())
-    if longest > LARGEST_BASELINE:
-        return (
-            f"has cameras {longest:.3g} m apart: is this file in millimetres? "
-            "Then convert it (`pat rig convert`) and write units: millimetres, or read it with scale=0.001; "
-            "if its scale is arbitrary, all is well"
-        )
-    if 0 < longest < SMALLEST_BASELINE:
-        return (
-            f"has cameras at most {1e3 * longest:.3g} mm apart: is this file in metres, and read as millimetres? "
-            "Then read it with scale=1000"
-        )
-    return None

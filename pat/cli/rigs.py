@@ -142,6 +142,8 @@ class Info:
         rig = load_rig(self.rig, self.depth)
         if rig.name:
             say(rig.name)
+        for oddity in rig.check():
+            say(f"pat: {oddity}", style="yellow")
         alpha = None if self.alpha is None else rig.require(self.alpha)
         if alpha is None and len(rig.names) > MOST_CAMERAS:
             alpha = rig.names[0]
