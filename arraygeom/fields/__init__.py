@@ -13,7 +13,7 @@ A rig whose numbers have batch axes *b takes pixels (*b, ..., 2), or with axes o
 
 from .approximation import approximated, placement_error
 from .curved import Curved, ThroughLenses
-from .default import FIELDS, default_field, recorded_field
+from .default import FIELDS, default_field, named_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
 from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
@@ -39,6 +39,7 @@ __all__ = [
     "covering_displacement",
     "default_field",
     "lazily",
+    "named_field",
     "pinhole_track",
     "placement_error",
     "recorded_field",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from tyro.conf import Fixed, Positional, arg
 
 from . import options
-from .options import MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
+from .options import FieldName, MaybeOut, MaybePath, Memory, Out, Weights, optional, say, writable
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -147,12 +147,13 @@ class Ablate:
     """Height and width of both images."""
     seed: int = 0
     """Of the scenes."""
+    field: FieldName = "auto"
     out: Out = Path("out/ablate")
     """Folder for ablation.md, ablation.csv and ablation.png."""
 
     def run(self) -> None:
         """Write and print the table. Raises ValueError for less than one scene."""
-        from ..evaluation.ablation import ablate, layered_cases, rendered_cases
+        from ..evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
         from ..networks.weights import load_weights
 
         if self.scenes < 1:
@@ -162,7 +163,10 @@ class Ablate:
             cases = rendered_cases(self.rendered, seed=self.seed)
         else:
             cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
-        ablate(load_weights(self.weights), cases, out=self.out)
+        chosen, own = families(), options.field_named(self.field)
+        if own is not None:
+            chosen[self.field] = FieldFamily(lambda disparity: own)
+        ablate(load_weights(self.weights), cases, out=self.out, chosen=chosen)
         print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
         say(f"written: {self.out / 'ablation.md'}, ablation.csv and ablation.png beside it")
 

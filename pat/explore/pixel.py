@@ -38,7 +38,7 @@ from arraygeom import (
     sample,
 )
 from arraygeom.fields import covering_displacement
-from arraygeom.fields.default import FIELDS, LINE_SHARE, recorded_field
+from arraygeom.fields.default import FIELDS, LINE_SHARE, named_field, recorded_field
 from arraygeom.pixels import HW
 
 from ..media.colour import luminance
@@ -140,7 +140,7 @@ SIZED: dict[str, Callable[[Pair, ExplorerState], ReceptiveField]] = {
 }
 """Families whose extent is set by the controls or by the images' size."""
 FAMILIES = ("auto", *FIELDS)
-"""Names of the fields: `auto` is the default field, which `pat fuse` uses."""
+"""Names of the fields: `auto` is the default field, which `pat fuse` uses. A state takes MODULE:OBJECT, too."""
 
 
 def chosen_field(pair: Pair, state: ExplorerState) -> ReceptiveField:
@@ -148,7 +148,7 @@ def chosen_field(pair: Pair, state: ExplorerState) -> ReceptiveField:
     family = state.family
     if family in SIZED:
         return SIZED[family](pair, state)
-    found = recorded_field(pair) if family == "auto" else FIELDS[family]()
+    found = recorded_field(pair) if family == "auto" else named_field(family)
     if state.displacement is not None and isinstance(found, HomographyDisplacement | Rectified):
         return SIZED["homography" if isinstance(found, HomographyDisplacement) else "rectified"](pair, state)
     return found

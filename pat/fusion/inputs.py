@@ -12,13 +12,15 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from arraygeom import Moved, Pair
-from arraygeom.epipolar import Track
+from arraygeom import Moved, Pair, depth_of
+from arraygeom.epipolar import Depth, Track
 from arraygeom.fields import default_field, pinhole_track
 from arraygeom.fields.grid import BLOCK, FieldOnGrid
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Beta, Inputs
+from ..matching.matches import combined_bands
+from ..matching.tangents import along_tangents
 from ..networks.protocol import FusionNetwork
 from .steps import FusionStep, Undo
 from .views import Views
@@ -40,9 +42,18 @@ class Placement(NamedTuple):
         """Whether positions in beta give depth."""
         return self.pair.link is None and self.pair.calibrated
 
+    @property
+    def has_track(self) -> bool:
+        """Whether they do by a straight track."""
+        return self.has_depth and not self.pair.has_lens
+
     def track(self, x: Float[Tensor, "*n 2"]) -> Track:
-        """The tracks in beta of alpha's pixels."""
+        """The tracks in beta of alpha's pixels, of pinholes."""
         return pinhole_track(self.pair, self.points(x))
+
+    def depth(self, x: Float[Tensor, "*n 2"], x_beta: Float[Tensor, "*n 2"]) -> Depth:
+        """The depth of what alpha's pixels see at beta's pixels."""
+        return depth_of(self.pair, self.points(x), x_beta)
 
 
 class FrameInputs(NamedTuple):
@@ -113,8 +124,10 @@ def frame_inputs(network: FusionNetwork, views: Views) -> FrameInputs:
         pair = views.pair(name)
         field = views.fields.get(name) or default_field(pair)
         on_grid = FieldOnGrid.of(field, pair, hw=(alpha.shape[-2], alpha.shape[-1]), blocks=m % BLOCK == 0)
+        if network.uses_matches and on_grid.pixels is None:
+            on_grid = along_tangents(alpha, combined_bands(image), on_grid, name)
         place = Placement(pair, field.points if isinstance(field, Moved) else lambda x: x)
-        betas.append(Beta(image, on_grid, track=place.track if place.has_depth else None))
+        betas.append(Beta(image, on_grid, track=place.track if place.has_track else None))
         if not on_grid.any_valid(pair.alpha.hw):
             bounds = "" if pair.depth is None else f" between {pair.depth[0]:g} and {pair.depth[1]:g} m"
             raise ValueError(f"alpha's and '{name}'s views do not overlap{bounds}: check the poses and the depth range")

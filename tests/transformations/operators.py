@@ -119,7 +119,7 @@ GEOMETRY = {
     "sample": Operator(lambda x: ag.sample(_image(), x.reshape(1, -1, 2) / 10).values, X),
     "to_grid": Operator(lambda x: ag.to_grid(pixels(x), (48, 64)), X),
     "Camera.project": Operator(lambda x: A.project(x.reshape(-1, 3) @ A.R + A.centre).x, POINTS),
-    "Camera.resize": Operator(lambda w: A.replace(K=A.K + w[0]).resize((24, 30)).rot90(1).K, W),
+    "Camera.resize": Operator(lambda w: A.replace(K=A.K + w[0] * A.K.new_tensor([[1], [1], [0]])).resize((24, 30)).rot90(1).K, W),
     "Pose.perturbed, inverse": Operator(lambda w: A.cam_from_world.perturbed(w[:3], w[3:]).inverse().t, W),
     "Camera.unproject": Operator(lambda x: A.unproject(pixels(x), x[::2]), X),
     "Camera.rays": Operator(lambda x: A.rays(pixels(x))[0], X),
