@@ -25,19 +25,19 @@ Each follows its lens up to some radius or angle. Points past it are not valid; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
-from .batching import Batched
 from .checks import check_numbers, checking
 from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
 from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
+from .lenses.model import CameraModel
 from .pixels import to_homogeneous
 
 BROWN_CONRADY = "brown-conrady"
@@ -50,7 +50,7 @@ COEFFICIENT_COUNTS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Distortion(Batched):
+class Distortion(CameraModel):
     """One lens, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
@@ -61,8 +61,8 @@ class Distortion(Batched):
     """
 
     item_axes: ClassVar = {"coefficients": 1}
-    model: str
-    coefficients: Float[Tensor, "*b n"]
+    model: str  # type: ignore[assignment]
+    coefficients: Float[Tensor, "*b n"]  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if checking() and not isinstance(self.coefficients, Tensor):
@@ -76,6 +76,10 @@ class Distortion(Batched):
             raise ValueError(f"{self.model} takes {wanted} coefficients, got {given}: pad with zeros")
         if checking():
             check_numbers(self.coefficients, self.coefficients.shape[-1:], f"a lens ({self.model})")
+
+    def with_coefficients(self, coefficients: Tensor) -> Distortion:
+        """The same model with other numbers."""
+        return replace(self, coefficients=coefficients)
 
     @property
     def is_identity(self) -> bool:

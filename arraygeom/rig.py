@@ -122,7 +122,7 @@ class Pair(Batched):
             return self.link.F
         if not self.calibrated:
             raise ValueError("neither the cameras' calibration nor F is known for this pair: give the rig a link")
-        alpha, beta = self.cameras
+        alpha, beta = self._central("fundamental matrix")
         F = fundamental_matrix(alpha.K, beta.K, self.beta_from_alpha)
         baseline, rounding = self.beta_from_alpha.t.norm(dim=-1), torch.finfo(alpha.t.dtype).eps
         moved = baseline > 8 * rounding * (alpha.t.norm(dim=-1) + beta.t.norm(dim=-1))
@@ -159,10 +159,18 @@ class Pair(Batched):
 
     def homography_at(self, depth: Float[Tensor, "*d"]) -> Float[Tensor, "*b 3 3"]:
         """The homography of the plane z = depth in alpha's frame (metres; may be inf)."""
-        alpha, beta = self.cameras
+        alpha, beta = self._central("homography")
         normal = alpha.K.new_tensor([0.0, 0.0, 1.0])
         pose = self.beta_from_alpha
         return plane_homography(alpha.K, beta.K, pose.R, pose.t, normal=normal, d=-depth.to(alpha.K))
+
+    def _central(self, what: str) -> tuple[Camera, Camera]:
+        """Both cameras. Raises ValueError if the rays of one do not meet in a point."""
+        for camera in self.cameras:
+            if not camera.central and camera.distortion is not None:
+                model = camera.distortion.model
+                raise ValueError(f"rays of a camera ({model}) do not meet in a point: there is no {what}; use Curved")
+        return self.cameras
 
     def _text(self) -> str:
         views = {"alpha": self.alpha, "beta": self.beta}
@@ -342,8 +350,9 @@ class Rig(Batched):
             if isinstance(camera, Camera):
                 known |= {f"{name}.rotation": camera.t, f"{name}.translation": camera.t}
                 known |= {f"{name}.focal": camera.K[..., 0, :2], f"{name}.centre": camera.K[..., :2, 2]}
-            if isinstance(camera, LensView) and camera.distortion is not None:
-                known[f"{name}.distortion"] = camera.distortion.coefficients
+            lens = camera.distortion if isinstance(camera, LensView) else None
+            if lens is not None and lens.coefficients.numel():
+                known[f"{name}.distortion"] = lens.coefficients
         if self.depth is not None:
             known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
         return known
@@ -388,7 +397,7 @@ def _perturbed_camera(name: str, camera: View, changes: Mapping[str, Tensor]) ->
     if not mine or not isinstance(camera, LensView):
         return camera
     if "distortion" in mine and (lens := camera.distortion) is not None:
-        lens = dataclasses.replace(lens, coefficients=lens.coefficients + mine["distortion"])
+        lens = lens.with_coefficients(lens.coefficients + mine["distortion"])
         camera = camera.replace(distortion=lens)
     if not isinstance(camera, Camera):
         return camera

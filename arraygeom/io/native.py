@@ -37,9 +37,11 @@ Numbers in pixels are converted to ours (first centre at 0) when read; files are
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import MISSING
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -50,6 +52,7 @@ from torch import Tensor
 from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import Distortion
 from ..epipolar import shift_origin
+from ..lenses.model import CAMERA_MODELS, CameraModel
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
@@ -153,7 +156,7 @@ class _Document(RigSource):
             K=self.K(entry, fields, view.hw),
             cam_from_world=self.stated_pose(entry, fields),
             hw=view.hw,
-            distortion=None if lens is not None and lens.is_identity else lens,
+            distortion=None if isinstance(lens, Distortion) and lens.is_identity else lens,
             sensor=view.sensor,
         )
 
@@ -202,12 +205,33 @@ class _Document(RigSource):
             return self.rotation(self.numbers(value, (3, 3), entry), entry)
         return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
 
-    def distortion(self, entry: str, value: Any) -> Distortion | None:
+    def distortion(self, entry: str, value: Any) -> CameraModel | None:
         if value is None:
             return None
+        kind = CAMERA_MODELS.get(str(value.get("model"))) if isinstance(value, dict) else None
+        if kind is not None:
+            return self.model(entry, kind, value)
         self.keys(value, ("model", "coefficients"), entry)
         coefficients = self.numbers(value.get("coefficients"), None, f"{entry}.coefficients")
         return self.made(entry, Distortion, str(value.get("model")), coefficients)
+
+    def model(self, entry: str, kind: type[CameraModel], value: dict[str, Any]) -> CameraModel:
+        """A camera model with its own numbers: tensors, models within it, and what is neither as it is."""
+        known = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+        self.keys(value, ("model", *known), entry)
+        numbers: dict[str, Any] = {}
+        for name, given in value.items():
+            if isinstance(given, dict):
+                numbers[name] = self.distortion(f"{entry}.{name}", given)
+            elif name != "model" and "Tensor" in str(known[name].type):
+                several = isinstance(given, list)
+                numbers[name] = self.numbers(given, None if several else (), f"{entry}.{name}")
+            elif name != "model":
+                numbers[name] = given
+        missing = [n for n, f in known.items() if n not in numbers and f.default is f.default_factory is MISSING]
+        if missing:
+            raise self.fail(entry, f"has no {' or '.join(missing)}, which a {value['model']} camera has")
+        return self.made(entry, lambda: kind(**numbers))
 
     def sensor(self, entry: str, fields: Mapping[str, Any]) -> Sensor:
         response = fields.get("response")
@@ -332,9 +356,26 @@ def _camera_entry(camera: View) -> dict[str, Any]:
         entry |= _K_entry(camera.K, "focal")
         entry |= {"rotation": camera.R.tolist(), "translation": camera.t.tolist()}
     if isinstance(camera, LensView) and (lens := camera.distortion) is not None:
-        entry["distortion"] = {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+        entry["distortion"] = _model_entry(lens)
         entry["distortion"] |= {} if calibrated else _K_entry(camera.K, "scale")
     return entry | _sensor_entry(camera.sensor)
+
+
+def _model_entry(lens: CameraModel) -> dict[str, Any]:
+    """A lens or a camera model with its numbers. Raises ValueError for one without a name."""
+    if isinstance(lens, Distortion):
+        return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
+    if not type(lens).registered:
+        kind = type(lens).__name__
+        raise ValueError(f"the camera model {kind} has no name for rig files: class {kind}(CameraModel, name=...)")
+    held = {f.name: getattr(lens, f.name) for f in dataclasses.fields(lens)}  # type: ignore[arg-type]
+    entry: dict[str, Any] = {"model": lens.model}
+    for name, value in held.items():
+        if isinstance(value, CameraModel):
+            entry[name] = _model_entry(value)
+        elif value is not None:
+            entry[name] = value.tolist() if isinstance(value, Tensor) else value
+    return entry
 
 
 def _K_entry(K: Tensor, scale: str) -> dict[str, Any]:

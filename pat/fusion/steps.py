@@ -33,7 +33,7 @@ from arraygeom import (
     pixel_grid,
     resampled,
 )
-from arraygeom.fields.default import default_field
+from arraygeom.fields.default import default_field, natural_bounds
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between, sampled_between
 
@@ -76,7 +76,8 @@ def _as_it_is(frame: Frame) -> Frame:
 
 @dataclass(frozen=True)
 class Undistort:
-    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through lenses.
+    """Pinhole views in place of views with lenses (up to 62 degrees off axis), unless a field goes through lenses, or
+    a camera has no pinhole view.
 
     Undone, the frame is at alpha's own pixels: the fusion's difference from alpha is resampled and added to alpha's
     own image, and what the pinhole view leaves out has confidence 0.
@@ -84,9 +85,9 @@ class Undistort:
 
     def do(self, views: Views) -> Done:
         """Resample every image with a lens."""
-        if not any(_has_lens(views.rig[name]) for name in views.images) or any(
-            map(_through_lenses, views.fields.values())
-        ):
+        cameras = [views.rig[name] for name in views.images]
+        as_recorded = any(map(_through_lenses, views.fields.values())) or not all(c.has_pinhole_view for c in cameras)
+        if as_recorded or not any(map(_has_lens, cameras)):
             return Done(views, _as_it_is)
         rig, images = without_lenses(views.rig, views.images)
         lens, pinhole = views.rig[views.alpha], rig[views.alpha]
@@ -285,10 +286,19 @@ def quarter_turns(pair: Pair) -> int:
     return round(math.atan2(c - b, a + d) / (math.pi / 2)) % 4
 
 
+def _transferred(pair: Pair, x: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 2"], Tensor]:
+    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of the curves of other cameras."""
+    if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
+        return apply_homography(pair.homography.detach().double(), x)
+    with torch.no_grad():
+        found = Curved(3, bounds=natural_bounds(pair))(pair, x)
+    return found.xy[:, 1], found.mask[:, 1]
+
+
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
     """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
-    x, valid = apply_homography(pair.homography.detach().double(), steps)
+    x, valid = _transferred(pair, steps)
     return x[1:] - x[:1] if bool(valid.all()) else None
