@@ -13,7 +13,7 @@ from torch import Tensor
 from .batching import Batched
 from .checks import check_batches, check_hw, check_K, checking
 from .distortion import Distortion
-from .lenses.model import CameraModel
+from .lenses.model import LensModel
 from .pixels import (
     HW,
     floating,
@@ -111,7 +111,7 @@ class LensView(View):
 
     item_axes: ClassVar = {"K": 2}
     K: Float[Tensor, "*b 3 3"]
-    distortion: CameraModel | None = None
+    distortion: LensModel | None = None
 
     def __init_subclass__(cls, **rest: Any) -> None:
         super().__init_subclass__(**rest)
@@ -126,7 +126,7 @@ class LensView(View):
         super().__post_init__()
         if checking():
             check_K(self.K)
-            if not isinstance(self.distortion, CameraModel | None):
+            if not isinstance(self.distortion, LensModel | None):
                 kind = type(self.distortion).__name__
                 raise TypeError(
                     f"distortion is a {kind}: give a Distortion(model, coefficients), or a camera model of your own, "

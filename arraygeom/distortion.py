@@ -37,7 +37,7 @@ from .lenses.brown import Brown, brown_distort, brown_limit, brown_undistort
 from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
-from .lenses.model import CameraModel
+from .lenses.model import LensModel
 from .pixels import to_homogeneous
 
 BROWN_CONRADY = "brown-conrady"
@@ -50,7 +50,7 @@ COEFFICIENT_COUNTS = {
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Distortion(CameraModel):
+class Distortion(LensModel):
     """One lens, or a batch of lenses of one model.
 
     The batch axes of `coefficients` meet the *leading* axes of the points: coefficients (5, 8) go with points
@@ -61,8 +61,8 @@ class Distortion(CameraModel):
     """
 
     item_axes: ClassVar = {"coefficients": 1}
-    model: str  # type: ignore[assignment]
-    coefficients: Float[Tensor, "*b n"]  # type: ignore[assignment]
+    model: str
+    coefficients: Float[Tensor, "*b n"]
 
     def __post_init__(self) -> None:
         if checking() and not isinstance(self.coefficients, Tensor):

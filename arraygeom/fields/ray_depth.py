@@ -10,9 +10,11 @@ from torch import Tensor
 
 from ..chunks import chunked
 from ..epipolar import Depth
+from ..homography import TransformedPoints, apply_homography
 from ..pixels import floating
 from ..rig import Pair
-from .curved import RayCurve
+from .curved import Curved, RayCurve
+from .default import natural_bounds
 
 ROWS = 1 << 12
 """Pixels that are searched at once."""
@@ -48,6 +50,15 @@ def ray_depth(
         return depth, torch.zeros_like(depth), valid
 
     return Depth(*chunked(of, floating(x), floating(x_beta), rows=ROWS, axis=0))
+
+
+def rough_transfer(pair: Pair, x: Real[Tensor, "n 2"]) -> TransformedPoints:
+    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of the curves of other cameras."""
+    if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
+        return apply_homography(pair.homography.detach().to(x), x)
+    with torch.no_grad():
+        found = Curved(3, bounds=natural_bounds(pair))(pair, x)
+    return TransformedPoints(found.xy[:, 1], found.mask[:, 1])
 
 
 def _apart(curve: RayCurve, fraction: Float[Tensor, "n l"], x_beta: Float[Tensor, "n 2"]) -> Float[Tensor, "n l"]:

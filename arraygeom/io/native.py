@@ -52,7 +52,7 @@ from torch import Tensor
 from ..camera import Camera, LensView, View, intrinsics
 from ..distortion import Distortion
 from ..epipolar import shift_origin
-from ..lenses.model import CAMERA_MODELS, CameraModel
+from ..lenses.model import CAMERA_MODELS, CameraModel, LensModel
 from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
@@ -205,7 +205,7 @@ class _Document(RigSource):
             return self.rotation(self.numbers(value, (3, 3), entry), entry)
         return rotation_from_vector(torch.deg2rad(self.numbers(value, (3,), entry)))
 
-    def distortion(self, entry: str, value: Any) -> CameraModel | None:
+    def distortion(self, entry: str, value: Any) -> LensModel | None:
         if value is None:
             return None
         kind = CAMERA_MODELS.get(str(value.get("model"))) if isinstance(value, dict) else None
@@ -361,17 +361,17 @@ def _camera_entry(camera: View) -> dict[str, Any]:
     return entry | _sensor_entry(camera.sensor)
 
 
-def _model_entry(lens: CameraModel) -> dict[str, Any]:
+def _model_entry(lens: LensModel) -> dict[str, Any]:
     """A lens or a camera model with its numbers. Raises ValueError for one without a name."""
     if isinstance(lens, Distortion):
         return {"model": lens.model, "coefficients": lens.coefficients.tolist()}
-    if not type(lens).registered:
+    if not isinstance(lens, CameraModel) or not lens.registered:
         kind = type(lens).__name__
         raise ValueError(f"the camera model {kind} has no name for rig files: class {kind}(CameraModel, name=...)")
     held = {f.name: getattr(lens, f.name) for f in dataclasses.fields(lens)}  # type: ignore[arg-type]
     entry: dict[str, Any] = {"model": lens.model}
     for name, value in held.items():
-        if isinstance(value, CameraModel):
+        if isinstance(value, LensModel):
             entry[name] = _model_entry(value)
         elif value is not None:
             entry[name] = value.tolist() if isinstance(value, Tensor) else value

@@ -13,7 +13,7 @@ from ..pixels import to_homogeneous
 from ..tracing import followed
 from .angular import BISECTIONS, NEWTON
 from .common import finite_points, unit
-from .model import CameraModel, beside_points
+from .model import CameraModel, LensModel, beside_points
 
 ITERATIONS = 16
 """Of the row at which a point is seen; each takes its error times the motion while a row's height is read."""
@@ -50,7 +50,7 @@ class Orthographic(CameraModel, name="orthographic"):
 class BehindModel(CameraModel):
     """A pinhole, or a camera with a central lens, behind something else."""
 
-    lens: CameraModel | None = None
+    lens: LensModel | None = None
 
     def __post_init__(self) -> None:
         if self.lens is not None and not self.lens.central:

@@ -28,12 +28,12 @@ from arraygeom import (
     ThroughLenses,
     View,
     Widened,
-    apply_homography,
     pinhole_view,
     pixel_grid,
     resampled,
 )
-from arraygeom.fields.default import default_field, natural_bounds
+from arraygeom.fields.default import default_field
+from arraygeom.fields.ray_depth import rough_transfer
 from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between, sampled_between
 
@@ -286,19 +286,10 @@ def quarter_turns(pair: Pair) -> int:
     return round(math.atan2(c - b, a + d) / (math.pi / 2)) % 4
 
 
-def _transferred(pair: Pair, x: Float[Tensor, "n 2"]) -> tuple[Float[Tensor, "n 2"], Tensor]:
-    """Pixels of alpha in beta, roughly: by the pair's homography, or the middle of the curves of other cameras."""
-    if pair.alpha.has_pinhole_view and pair.beta.has_pinhole_view:
-        return apply_homography(pair.homography.detach().double(), x)
-    with torch.no_grad():
-        found = Curved(3, bounds=natural_bounds(pair))(pair, x)
-    return found.xy[:, 1], found.mask[:, 1]
-
-
 def _steps_in_beta(pair: Pair) -> Float[Tensor, "2 2"] | None:
     """What a pixel to the right and one down from the middle of alpha are in beta, by the pair's rough homography."""
     h, w = pair.alpha.hw
     middle = torch.tensor([[(w - 1) / 2, (h - 1) / 2]], dtype=torch.float64)
     steps = torch.cat([middle, middle + torch.tensor([[1.0, 0.0], [0.0, 1.0]], dtype=torch.float64)])
-    x, valid = _transferred(pair, steps)
+    x, valid = rough_transfer(pair, steps)
     return x[1:] - x[:1] if bool(valid.all()) else None

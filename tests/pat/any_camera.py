@@ -42,7 +42,7 @@ def hit(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
     start = world.apply(camera.ray_origins(x))
     d = torch.where(valid[..., None], rays, rays.new_tensor([0.0, 0.0, 1.0])) @ world.R.mT
     d = d / d.norm(dim=-1, keepdim=True)
-    wall = ((d.sign() * ROOM - start) / torch.where(d == 0, 1e-12, d)).amin(-1)
+    wall = torch.where(d == 0, torch.inf, (d.sign() * ROOM - start) / torch.where(d == 0, 1.0, d)).amin(-1)
     centre, radius = d.new_tensor(BALL[0]), BALL[1]
     b = ((start - centre) * d).sum(-1)
     under = b.square() - (start - centre).square().sum(-1) + radius**2
