@@ -43,9 +43,12 @@ from .fields import (
 )
 from .homography import apply_homography, fit_homography, fit_similarity, infinite_homography, plane_homography
 from .moved import OldModules, moved_name
+from .multiview import ConsistentDepth, WorldRays, consistent_depth, plane_sweep, warp, world_rays
 from .pixels import pixel_grid, resize_matrix
 from .pose import Pose, rotation_from_vector
 from .rectification import Rectification, rectify
+from .relative_pose import TwoViewPose, poses_from_essential, relative_pose
+from .reprojection import Bundle, bundle_adjusted, reprojection_residuals
 from .rig import Link, Pair, Rig
 from .sampling import sample, to_grid
 from .segments import Positions, Segments
@@ -55,7 +58,9 @@ from .undistortion import pinhole_view, resampled
 
 __all__ = [
     "Band",
+    "Bundle",
     "Camera",
+    "ConsistentDepth",
     "Curve",
     "Curved",
     "Dense",
@@ -82,10 +87,14 @@ __all__ = [
     "ThroughLenses",
     "Track",
     "Triangulated",
+    "TwoViewPose",
     "View",
     "Widened",
+    "WorldRays",
     "apply_homography",
     "approximated",
+    "bundle_adjusted",
+    "consistent_depth",
     "default_field",
     "depth_from_track",
     "depth_of",
@@ -102,7 +111,11 @@ __all__ = [
     "pinhole_view",
     "pixel_grid",
     "plane_homography",
+    "plane_sweep",
+    "poses_from_essential",
     "rectify",
+    "relative_pose",
+    "reprojection_residuals",
     "resampled",
     "resize_matrix",
     "rotation_from_vector",
@@ -115,6 +128,8 @@ __all__ = [
     "track",
     "triangulate",
     "unchecked",
+    "warp",
+    "world_rays",
 ]
 
 sys.meta_path.insert(0, OldModules({"arraygeom.io.whole": "arraygeom.atomic"}, {}))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import GetAttrKey, register_pytree_node, tree_leaves
+from torch.utils.data._utils.collate import default_collate_fn_map
 
 from .checks import derived
 
@@ -24,6 +26,12 @@ class Batched:
     """
 
     item_axes: ClassVar[Mapping[str, int]] = {}
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Every kind is a pytree, and may be read by `torch.load(weights_only=True)`."""
+        super().__init_subclass__(**options)
+        register_pytree_node(cls, _flattened, _unflattened, flatten_with_keys_fn=_flattened_with_keys)  # type: ignore[arg-type]
+        torch.serialization.add_safe_globals([cls])
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -121,6 +129,53 @@ def tensors_of(value: Any, axes: int = 0) -> Iterator[tuple[Tensor, int]]:
     elif isinstance(value, Mapping | tuple):
         for v in value.values() if isinstance(value, Mapping) else value:
             yield from tensors_of(v, axes)
+
+
+class _Layout(NamedTuple):
+    """A flattened value but for its tensors: its kind, the names of what holds tensors, and the rest."""
+
+    kind: type
+    names: tuple[str, ...]
+    rest: dict[str, Any]
+
+
+def _flattened(value: Batched) -> tuple[list[Any], _Layout]:
+    held = {f.name: getattr(value, f.name) for f in _fields(value)}
+    names = vars(value).get(_NAMES)  # of a tree with something else in place of tensors
+    if names is None:
+        names = tuple(name for name, v in held.items() if isinstance(v, Batched) or any(True for _ in tensors_of(v)))
+    rest = {name: v for name, v in held.items() if name not in names}
+    return [held[name] for name in names], _Layout(type(value), names, rest)
+
+
+def _flattened_with_keys(value: Batched) -> tuple[list[tuple[GetAttrKey, Any]], _Layout]:
+    held, layout = _flattened(value)
+    return [(GetAttrKey(name), v) for name, v in zip(layout.names, held)], layout
+
+
+def _unflattened(held: Iterable[Any], layout: _Layout) -> Any:
+    """Without the checks of a constructor: what takes a tensor's place in a tree need not be a tensor."""
+    held = list(held)
+    made: Any = object.__new__(layout.kind)
+    for name, v in (layout.rest | dict(zip(layout.names, held))).items():
+        object.__setattr__(made, name, v)
+    for f in dataclasses.fields(made):
+        if not f.init and f.default_factory is not dataclasses.MISSING:
+            object.__setattr__(made, f.name, f.default_factory())
+    if not all(isinstance(t, Tensor) for t in tree_leaves(held)):
+        object.__setattr__(made, _NAMES, layout.names)
+    return made
+
+
+_NAMES = "_tensors"
+
+
+def collated(items: list[Batched], *, collate_fn_map: Any = None) -> Batched:
+    """What a DataLoader makes of the items of a batch: `stack`."""
+    return stack(items)
+
+
+default_collate_fn_map[Batched] = collated
 
 
 def _fields(value: Any) -> list[dataclasses.Field[Any]]:

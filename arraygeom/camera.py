@@ -271,8 +271,8 @@ class Camera(LensView):
         return PinholeCamera(intrinsics, extrinsics, h, w)
 
     @classmethod
-    def from_kornia(cls, camera: PinholeCamera) -> Camera:
-        """The camera of a kornia pinhole; a batch of one becomes a single camera.
+    def from_kornia(cls, camera: PinholeCamera, *, batched: bool = False) -> Camera:
+        """The camera of a kornia pinhole; a batch of one becomes a single camera unless `batched`.
 
         Raises ValueError if the images of a batch differ in size.
         """
@@ -282,7 +282,7 @@ class Camera(LensView):
             raise ValueError(f"the cameras of a kornia batch have images of {found}: convert those of each size apart")
         pose = Pose(camera.extrinsics[..., :3, :3], camera.extrinsics[..., :3, 3])
         made = cls(K=camera.intrinsics[..., :3, :3], cam_from_world=pose, hw=sizes[0])
-        return made[0] if made.batch_shape == (1,) else made
+        return made[0] if made.batch_shape == (1,) and not batched else made
 
 
 def intrinsics(

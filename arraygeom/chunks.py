@@ -95,6 +95,23 @@ def assembled(lengths: Sequence[int], parts: Iterable[tuple[Tile, Any]], axes: S
     return joined[0] if single else joined
 
 
+def sides_by_work(hw: HW, halo: int, multiple: int, most: float) -> list[tuple[int, int]]:
+    """Heights and widths of tiles of at most `most` pixels with their halos, the least work first."""
+    h, w = hw
+    sides: dict[tuple[int, int], int] = {}
+    for rows in range(1, -(-h // 64) + 1):
+        for columns in range(1, -(-w // 64) + 1):
+            side = max(-(-h // rows // multiple) * multiple, 64), max(-(-w // columns // multiple) * multiple, 64)
+            if side not in sides and math.prod(min(s + 2 * halo, n) for s, n in zip(side, hw)) <= most:
+                sides[side] = math.prod(_covered_length(n, s, halo) for n, s in zip(hw, side))
+    return sorted(sides, key=lambda side: sides[side])
+
+
+def _covered_length(length: int, side: int, halo: int) -> int:
+    """The sum of the lengths of pieces with their halos."""
+    return sum(min(last + halo, length) - max(first - halo, 0) for first, last in spans(length, side))
+
+
 class _Plane:
     """A tensor put together from parts: written in place, so that parts can be forgotten.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 import inspect
 import warnings
+from collections.abc import Iterable
 from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,8 +23,8 @@ LONGEST = 60.0
 def compiled(function=None, **options):
     """numba's njit, of the bare function: a checker of types that tests put around it cannot be compiled.
 
-    With `cache` it is called from Python; without, by compiled functions alone. Where there is no folder that can be
-    written, what `cache` asks to keep is compiled by each process.
+    With `cache` it is called from Python; without, by compiled functions alone. Where there is no folder that
+    can be written, what `cache` asks to keep is compiled by each process.
     """
     from numba import njit
 
@@ -78,8 +80,8 @@ def _warn_of_no_folder() -> None:
 
 
 def numba_loaded() -> None:
-    """Let numba load what it needs before the first compiled function, which takes it half a second: in a thread beside
-    other work."""
+    """Let numba load what it needs before the first compiled function, which takes it half a second: in a
+    thread beside other work."""
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.registry import cpu_target
 
@@ -102,11 +104,19 @@ def is_kept(entry: Any, signature: Any) -> bool:
     return entry._cache._index_key(signature, entry.targetctx.codegen()) in cache_file(entry)._load_index()
 
 
+def renew_with(entry: Any, sources: Iterable[Path]) -> None:
+    """Let numba's cache of an entry point be renewed when any of these files changes, not when its own does
+    alone."""
+    if (file := cache_file(entry)) is not None:
+        text = b"".join(path.read_bytes() for path in sorted(sources))
+        file._source_stamp = hashlib.sha256(text).hexdigest()
+
+
 def separate_cache(entry: Any) -> None:
     """Let this process name the files of its compiled code in numba's cache by itself.
 
-    numba counts them. Two processes that compile at once, each for other types, can choose the same number: then the
-    index of one names the code of the other, which is loaded, and computes something else.
+    numba counts them. Two processes that compile at once, each for other types, can choose the same number:
+    then the index of one names the code of the other, which is loaded, and computes something else.
     """
     file = cache_file(entry)
     if file is not None:

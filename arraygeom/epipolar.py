@@ -15,7 +15,7 @@ from torch import Tensor
 
 from .homography import infinite_homography
 from .pixels import HW, floating, map_homogeneous, product, to_homogeneous
-from .pose import Pose, cross_matrix, matvec
+from .pose import Pose, cross_matrix, in_float64, matvec
 from .segments import FLAT, Segments
 from .tracing import traced
 
@@ -28,9 +28,10 @@ def essential_matrix(beta_from_alpha: Pose) -> Float[Tensor, "*b 3 3"]:
 def fundamental_matrix(
     K_alpha: Float[Tensor, "*b 3 3"], K_beta: Float[Tensor, "*b 3 3"], beta_from_alpha: Pose
 ) -> Float[Tensor, "*b 3 3"]:
-    """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0."""
-    E = essential_matrix(beta_from_alpha)
-    return product(product(torch.linalg.inv(K_beta).mT, E), torch.linalg.inv(K_alpha))
+    """F = K_beta^-T E K_alpha^-1, so that x_beta^T F x_alpha = 0: kornia's, in float64."""
+    from kornia.geometry.epipolar import fundamental_from_essential
+
+    return in_float64(fundamental_from_essential, essential_matrix(beta_from_alpha), K_alpha, K_beta)
 
 
 def shift_origin(F: Float[Tensor, "*b 3 3"], first_pixel: float) -> Float[Tensor, "*b 3 3"]:

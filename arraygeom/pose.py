@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import reduce
+from typing import TYPE_CHECKING, ClassVar
 
 import torch
 from jaxtyping import Float, Real
@@ -13,6 +15,10 @@ from .batching import Batched
 from .checks import check_batches, check_numbers, check_rotation, checking, derived
 from .pixels import broadcasts, floating, product
 from .text import angle, range_text
+from .tracing import traced
+
+if TYPE_CHECKING:
+    from kornia.geometry.liegroup import Se3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,6 +48,65 @@ class Pose(Batched):
     def from_centre(cls, R: Float[Tensor, "*b 3 3"], centre: Float[Tensor, "*b 3"]) -> Pose:
         """`cam_from_world` of a camera with rotation R whose optical centre is at `centre` in the world."""
         return cls(R, -matvec(R, centre))
+
+    @classmethod
+    def look_at(
+        cls, centre: Float[Tensor, "*b 3"], target: Float[Tensor, "*b 3"], *, down: Float[Tensor, "*b 3"] | None = None
+    ) -> Pose:
+        """`cam_from_world` of a camera at `centre` whose optical axis meets `target`, and whose y is towards `down`.
+
+        All in world coordinates (metres); down is (0, 1, 0) unless given: that of a world with z upwards is (0, 0, -1).
+        Raises ValueError where down is along the axis, or the target at the centre.
+
+        >>> Pose.look_at(torch.tensor([0.0, 0.0, -2.0]), torch.zeros(3)).t.tolist()
+        [-0.0, -0.0, 2.0]
+        """
+        down = centre.new_tensor([0.0, 1.0, 0.0]) if down is None else down
+        z = target - centre
+        x = torch.linalg.cross(down.expand_as(z), z)
+        if not traced() and not bool((x.norm(dim=-1) > 1e-6 * down.norm(dim=-1) * z.norm(dim=-1)).all()):
+            raise ValueError("the target is at the centre, or `down` along the axis to it: give another `down`")
+        x, z = (v / v.norm(dim=-1, keepdim=True) for v in (x, z))
+        return cls.from_centre(torch.stack([x, torch.linalg.cross(z, x), z], -2), centre)
+
+    @classmethod
+    def from_matrix(cls, matrix: Float[Tensor, "*b 4 4"]) -> Pose:
+        """Of (*b, 4, 4) or (*b, 3, 4), [R t]."""
+        return cls(matrix[..., :3, :3], matrix[..., :3, 3])
+
+    @property
+    def matrix(self) -> Float[Tensor, "*b 4 4"]:
+        """[R t; 0 0 0 1]."""
+        R, t = self.R.expand(*self.batch_shape, 3, 3), self.t.expand(*self.batch_shape, 3)
+        return torch.cat(
+            [torch.cat([R, t[..., None]], -1), R.new_tensor([0.0, 0, 0, 1]).expand(*R.shape[:-2], 1, 4)], -2
+        )
+
+    @classmethod
+    def from_quaternion(cls, q: Float[Tensor, "*b 4"], t: Float[Tensor, "*b 3"]) -> Pose:
+        """Of quaternions (w, x, y, z), of any length but zero."""
+        from kornia.geometry.conversions import quaternion_to_rotation_matrix
+
+        return cls(quaternion_to_rotation_matrix(q), t)
+
+    @property
+    def quaternion(self) -> Float[Tensor, "*b 4"]:
+        """Of the rotation: (w, x, y, z), unit length, the sign as it comes (q and -q are the same rotation)."""
+        from kornia.geometry.conversions import rotation_matrix_to_quaternion
+
+        return rotation_matrix_to_quaternion(self.R)
+
+    @classmethod
+    def from_kornia(cls, pose: Se3) -> Pose:
+        """Of kornia's `Se3`, with its gradient."""
+        return cls.from_matrix(pose.matrix())
+
+    def to_kornia(self) -> Se3:
+        """The same as kornia's `Se3`, which keeps the rotation as a quaternion: R comes back but for rounding."""
+        from kornia.geometry.liegroup import Se3, So3
+        from kornia.geometry.quaternion import Quaternion
+
+        return Se3(So3(Quaternion(self.quaternion)), self.t)
 
     def __matmul__(self, other: Pose) -> Pose:
         return derived(Pose, product(self.R, other.R), matvec(self.R, other.t) + self.t)
@@ -90,10 +155,10 @@ class Pose(Batched):
 
 
 def cross_matrix(v: Float[Tensor, "*b 3"]) -> Float[Tensor, "*b 3 3"]:
-    """[v]x, the matrix with [v]x w = v x w."""
-    x, y, z = v.unbind(-1)
-    zero = torch.zeros_like(x)
-    return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    """[v]x, the matrix with [v]x w = v x w: kornia's."""
+    from kornia.geometry.epipolar import cross_product_matrix
+
+    return cross_product_matrix(v)
 
 
 def matvec(M: Float[Tensor, "*b i j"], v: Float[Tensor, "*b j"]) -> Float[Tensor, "*b i"]:
@@ -120,6 +185,16 @@ def rotation_vector(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3"]:
     from kornia.geometry.conversions import rotation_matrix_to_axis_angle
 
     return rotation_matrix_to_axis_angle(R)
+
+
+def in_float64(function: Callable[..., Tensor], *tensors: Tensor) -> Tensor:
+    """A function of small matrices computed in float64, which neither autocast nor TF32 lowers; their own type again.
+
+    Matrices are given the same batch axes.
+    """
+    batch = torch.broadcast_shapes(*(t.shape[:-2] for t in tensors))
+    dtype = torch.promote_types(torch.float32, reduce(torch.promote_types, (t.dtype for t in tensors)))
+    return function(*(t.double().expand(*batch, *t.shape[-2:]) for t in tensors)).to(dtype)
 
 
 def nearest_rotation(R: Float[Tensor, "*b 3 3"]) -> Float[Tensor, "*b 3 3"]:

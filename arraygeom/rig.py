@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import fnmatch
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from pathlib import Path
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from .batching import Batched
+from .batching import Batched, map_tensors
 from .camera import Camera, LensView, View
 from .checks import check_numbers, checking, derived
 from .epipolar import fundamental_matrix
@@ -218,13 +218,41 @@ class Rig(Batched):
                 raise ValueError(f"a link relates two cameras; this one is from '{alpha}' to itself")
 
     @classmethod
-    def from_kornia(cls, cameras: Mapping[str, PinholeCamera], **fields: Any) -> Rig:
-        """The rig of kornia pinholes by name; `fields` are the rig's own, such as `depth`. As `Rig(cameras)` too."""
-        return cls(cameras, **fields)  # type: ignore[arg-type]
+    def from_kornia(cls, cameras: Mapping[str, PinholeCamera], *, batched: bool = False, **fields: Any) -> Rig:
+        """The rig of kornia pinholes by name; `fields` are the rig's own, such as `depth`.
+
+        Kornia's cameras are always batched: a batch of one becomes a single camera unless `batched`. Raises ValueError
+        for batches of unequal length. `Rig(cameras)` serves as well, for batches of one or more as they come.
+        """
+        lengths = {name: camera.batch_size for name, camera in cameras.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(
+                f"a rig's cameras are batches of one length, got {lengths}: expand those that are the same in all"
+            )
+        made = {name: Camera.from_kornia(camera, batched=batched) for name, camera in cameras.items()}
+        return cls(made, **fields)
+
+    def to_kornia(self) -> dict[str, PinholeCamera]:
+        """Kornia's pinholes by name, each a batch as long as the rig's (one for a single rig).
+
+        Raises ValueError for cameras with lenses and for those not calibrated.
+        """
+        views = [name for name, view in self.cameras.items() if not isinstance(view, Camera)]
+        if views:
+            raise ValueError(f"kornia has no camera without a calibration: {', '.join(views)} of this rig are such")
+        shape = self.batch_shape
+        return {name: _expanded(camera, shape).to_kornia() for name, camera in self.cameras.items()}
 
     def __getitem__(self, name: Any) -> Any:
         """The camera of a name; or, of a batch of rigs, those at an index."""
         return self.cameras[self.require(name)] if isinstance(name, str) else super().__getitem__(name)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.cameras
+
+    def __iter__(self) -> Iterator[Any]:
+        """The cameras' names in order; of a batch of rigs, the rigs."""
+        return (self[i] for i in range(len(self))) if self.batch_shape else iter(self.names)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -356,6 +384,11 @@ class Rig(Batched):
         if self.depth is not None:
             known |= {"depth.near": self.depth[0], "depth.far": self.depth[1]}
         return known
+
+
+def _expanded(camera: Camera, shape: torch.Size) -> Camera:
+    """The camera with a batch's axes in all of its tensors."""
+    return map_tensors(camera, lambda t, axes: t.expand(*shape, *t.shape[t.ndim - axes :]))
 
 
 def _view(name: str, camera: Any) -> View:

@@ -1,10 +1,11 @@
-"""YAML from files of unknown origin: bounded in size, nesting and aliases, without repeated keys.
+"""YAML and JSON from files of unknown origin: bounded in nesting, YAML in size and aliases, without repeated keys.
 
-The one loader of the project. It builds plain values only (`yaml.SafeLoader`'s), so nothing in a file can run code.
+The one loader of each in the project. Both build plain values only, so nothing in a file can run code.
 """
 
 from __future__ import annotations
 
+import json
 from typing import Any
 
 import yaml
@@ -36,6 +37,32 @@ def load_yaml(text: str) -> Any:
         raise
     except (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError) as error:
         raise _refused(f"holds a value that cannot be read ({' '.join(str(error).split())[:200]})") from None
+
+
+def load_json(text: str) -> Any:
+    """The document of a JSON text.
+
+    Raises json.JSONDecodeError, with the line, for text that is not JSON; ValueError for repeated keys, text that is
+    half a character (a lone surrogate, which cannot be printed), and for one that is nested too deeply.
+    """
+    try:
+        document = json.loads(text, object_pairs_hook=_without_repeated_keys)
+        if "\\u" in text:
+            json.dumps(document, ensure_ascii=False).encode()
+    except UnicodeEncodeError as error:
+        raise ValueError(f"holds half a character ({error.object[error.start]!a}): write it as UTF-8") from None
+    except RecursionError:
+        raise ValueError("is nested too deeply") from None
+    return document
+
+
+def _without_repeated_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    fields: dict[str, Any] = {}
+    for name, value in pairs:
+        if name in fields:
+            raise ValueError(f"'{name[:60]}' occurs twice; keep one".encode(errors="backslashreplace").decode())
+        fields[name] = value
+    return fields
 
 
 def yaml_problem(error: Exception) -> tuple[int | None, str]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from .batching import Batched
-from .pixels import HW
+from .pixels import HW, pixel_grid
 from .text import share_text
 
 
@@ -78,6 +78,24 @@ class Segments(Batched):
         u = sample_fractions(samples, like=self.start)
         xy = self.start[..., None, :] + u[:, None] * (self.end - self.start)[..., None, :]
         return Positions(xy, self.valid[..., None].expand(xy.shape[:-1]))
+
+    def distance(self, xy: Float[Tensor, "*n 2"]) -> Float[Tensor, "*n"]:
+        """Pixels from points to their segments, to an end beyond it; infinite where the segment is not valid."""
+        u = self.fraction(xy).clamp(0, 1)
+        squared = (xy - self.at(u)).square().sum(-1)
+        distance = torch.where(squared > 0, torch.where(squared > 0, squared, 1.0).sqrt(), 0.0)
+        return torch.where(self.valid, distance, torch.inf)
+
+    def mask(self, hw: HW, radius: float = 0.5) -> Bool[Tensor, "*n p"]:
+        """Which of beta's H W pixels, row by row, are within `radius` pixels of each segment.
+
+        As it is an `attn_mask` of `scaled_dot_product_attention` for alpha's pixels (n) as queries and beta's as keys:
+        n H W flags, so for small images; `pat.attention.segment_block_mask` is for large ones.
+        """
+        axes = (*self.valid.shape, hw[0] * hw[1])
+        xy = pixel_grid(hw, dtype=self.start.dtype, device=self.start.device).reshape(-1, 2).expand(*axes, 2)
+        start, end = (v[..., None, :].expand(*axes, 2) for v in (self.start, self.end))
+        return Segments(start, end, self.valid[..., None].expand(axes)).distance(xy) <= radius
 
     def _text(self) -> str:
         length = self.length[self.valid]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+
 from .checks import check_above
 
 
@@ -69,3 +71,6 @@ class Sensor:
         for name, value, known in (("coding", self.coding, CODINGS), ("bayer", self.bayer, (None, *PATTERNS))):
             if value not in known:
                 raise ValueError(f"{name} is {value!r}: wanted {' or '.join(repr(v) for v in known if v)}")
+
+
+torch.serialization.add_safe_globals([Band, Curve, Sensor])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -68,3 +69,9 @@ def range_text(values: Tensor, form: str) -> str:
 def share_text(mask: Tensor) -> str:
     """How much of a mask is true."""
     return f"{100 * float(mask.float().mean()):.0f} %" if mask.numel() else "none"
+
+
+def short(value: object, most: int = 60) -> str:
+    """A value in a message: its numbers with four digits, and no more than its first characters, in ASCII."""
+    text = re.sub(r"-?\d+\.\d{4,}(?:e[-+]\d+)?", lambda number: f"{float(number[0]):.4g}", ascii(value))
+    return text if len(text) <= most else f"{text[: most - 3]}..."

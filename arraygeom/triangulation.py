@@ -10,20 +10,24 @@ from jaxtyping import Bool, Float, Real
 from torch import Tensor
 
 from .camera import Camera
-from .epipolar import Depth, depth_from_track, track
+from .epipolar import Depth, beside, depth_from_track, track
+from .multiview import world_rays
 from .pixels import floating, product
+from .pose import matvec
+from .reprojection import projection_slopes
 from .rig import Pair
 
 
 class Triangulated(NamedTuple):
-    """World points (*n, 3) in metres, their covariance (*n, 3, 3) in m^2 for matches good to 1 px, and validity.
+    """World points (*n, 3) in metres, their covariance (*n, 3, 3) in m^2, validity, and residuals in pixels.
 
-    For matches good to s pixels the covariance is s^2 times as large.
+    `residual` is the largest distance, over the views that count, between a match and the point's image.
     """
 
     X: Float[Tensor, "*n 3"]
     covariance: Float[Tensor, "*n 3 3"]
     valid: Bool[Tensor, "*n"]
+    residual: Float[Tensor, "*n"]
 
 
 def triangulate(
@@ -31,37 +35,47 @@ def triangulate(
     x: Real[Tensor, "v *n 2"],
     *,
     seen: Bool[Tensor, "v *n"] | None = None,
-    refinements: int = 3,
+    deviation: float = 1.0,
+    residual: float | None = None,
+    refinements: int = 5,
 ) -> Triangulated:
-    """Points from their pixels in two views or more, through any lens.
+    """Points from their pixels in two views or more, of least reprojection error, through any lens.
 
-    Linear least squares on the distances from the point to the rays, repeated with each ray weighted by
-    (focal length / distance)^2, which turns metres into pixels: close to the least reprojection error (the
-    midpoint method and its reweighting; compare Hartley & Zisserman, section 12.2). A view that does not see a
-    point is left out where `seen` is False. Valid where two views or more see the point in front of them
-    and their rays meet at an angle: to 1 px, the point's depth is known to better than itself.
+    Gauss-Newton in float64 on direction and inverse distance from the first view that sees the point (Civera, Davison
+    and Montiel 2008), in which the error is nearly linear however far the point is; from the inverse distance at which
+    rays meet in least squares. Exact derivatives; batched cameras (*b) take pixels (views, *b, ..., 2).
+
+    `deviation` is the standard deviation of the pixels' coordinates. The covariance is of that noise, to first order
+    across the ray; along it, three deviations extend to where the inverse distance is three deviations less: the error
+    stays within them as often as a normal distribution's. Valid where that is still finite, all views that see the
+    point (`seen`) have it in front, and no residual exceeds `residual` pixels (five deviations).
     """
     if len(cameras) != len(x) or len(cameras) < 2:
         raise ValueError(f"wanted pixels (views, ..., 2) of {len(cameras)} >= 2 cameras, got {tuple(x.shape)}")
-    x = floating(x)
-    centres, rays, usable, focal = _rays(cameras, x)
-    if seen is not None:
-        usable = usable & seen
-    eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    across = eye - rays[..., :, None] * rays[..., None, :]
-    weight = usable.to(x.dtype) * focal.square()
-    X, information, solvable = _meet(across, centres, weight)
-    for _ in range(refinements):
-        squared = (X - centres).square().sum(-1).clamp(min=1e-12)
-        weight = torch.where(usable, focal.square() / squared, 0.0)
-        X, information, solvable = _meet(across, centres, weight)
-    covariance = torch.linalg.inv(torch.where(solvable[..., None, None], information, eye))
-    along = ((X - centres) * rays).sum(-1)
-    in_front = ((along > 0) | ~usable).all(0) & (usable.sum(0) >= 2)
-    distance = torch.where(usable, along, torch.inf).amin(0)
-    known = covariance.diagonal(dim1=-2, dim2=-1).sum(-1) < distance.square()
-    valid = solvable & in_front & known
-    return Triangulated(torch.where(valid[..., None], X, 0.0), covariance, valid)
+    dtype = torch.promote_types(floating(x).dtype, cameras[0].t.dtype)
+    sights, chart, p = _sighted([c.to(torch.float64) for c in cameras], x.double(), seen)
+    for i in range(refinements):
+        p = p.detach() if i == refinements - FOLLOWED else p
+        step = _normal_equations(sights, chart, p)
+        p = p + torch.linalg.solve(step.matrix, step.target[..., None])[..., 0]
+        p = torch.cat([p[..., :2], p[..., 2:].clamp(min=SMALLEST_PARALLAX)], -1)
+    last = _normal_equations(sights, chart, p)
+    of_chart = deviation**2 * torch.linalg.inv(last.matrix)
+    margin = 1 - 3 * of_chart[..., 2, 2].sqrt() / p[..., 2]
+    slopes = chart.slopes(p)
+    slopes = torch.cat([slopes[..., :2], slopes[..., 2:] / margin.clamp(min=0.1)[..., None, None]], -1)
+    within = last.residual <= (5 * deviation if residual is None else residual)
+    valid = last.solvable & last.in_front & within & (margin > 0)
+    X = torch.where(valid[..., None], chart.point(p), 0.0)
+    covariance = product(product(slopes, of_chart), slopes.mT)
+    return Triangulated(X.to(dtype), covariance.to(dtype), valid, last.residual.to(dtype))
+
+
+FOLLOWED = 3
+"""Steps that derivatives go through: each takes the difference to those of the least error down by about
+residual / disparity."""
+SMALLEST_PARALLAX = 1e-9
+"""Radians between two rays: what is farther away is so far that float64 pixels do not show it."""
 
 
 def depth_of(
@@ -76,6 +90,8 @@ def depth_of(
     x, x_beta = floating(x), floating(x_beta)
     if alpha.distortion is None and beta.distortion is None:
         return depth_from_track(track(alpha.K, beta.K, pair.beta_from_alpha, x), x_beta, deviation)
+    if not (alpha.central and beta.central):
+        raise ValueError("rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth")
     pose = pair.beta_from_alpha
     normalised, seen = zip(*(_normalised(c.to(x.dtype), p) for c, p in ((alpha, x), (beta, x_beta))))
     eye = torch.eye(3).to(pose.R).expand_as(pose.R)
@@ -102,26 +118,93 @@ def _normalised(camera: Camera, x: Tensor) -> tuple[Tensor, Tensor]:
     return rays[..., :2] / torch.where(seen, rays[..., 2], 1.0)[..., None], seen
 
 
-def _rays(cameras: Sequence[Camera], x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Centres and unit directions in the world, which pixels have one, and focal lengths, each (v, *n[, 3])."""
-    ones = [1] * (x.ndim - 2)
-    rays, usable = zip(*(c.to(x.dtype).rays(p) for c, p in zip(cameras, x)))
-    directions = torch.stack(
-        [product(r / r.norm(dim=-1, keepdim=True), c.R.to(x.dtype)) for r, c in zip(rays, cameras)]
-    )
-    centres = torch.stack([c.centre for c in cameras]).to(x.dtype).reshape(len(x), *ones, 3)
-    focal = torch.stack([c.K[:2, :2].det().abs().sqrt() for c in cameras]).to(x.dtype).reshape(len(x), *ones)
-    return centres, directions, torch.stack(usable), focal
+class _Sight(NamedTuple):
+    """A camera, the pixels (*n, 2) of the points in it, which of them count, and its centre (*n or 1, 3)."""
+
+    camera: Camera
+    x: Tensor
+    usable: Tensor
+    centre: Tensor
 
 
-def _meet(across: Tensor, centres: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(point nearest to all rays, information matrix, solvable): sum w (I - d d^T) (X - c) = 0."""
-    weighted = weight[..., None, None] * across
-    information = weighted.sum(0)
-    scale = information.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
-    normal = information / torch.where(scale > 0, scale, 1.0)
-    solvable = torch.linalg.det(normal) > 1e3 * torch.finfo(normal.dtype).eps ** 2
-    target = product(weighted, centres[..., None]).sum(0) / torch.where(scale > 0, scale, 1.0)
-    eye = torch.eye(3, dtype=across.dtype, device=across.device)
-    safe = torch.where(solvable[..., None, None], normal, eye)
-    return torch.linalg.solve(safe, target)[..., 0], information, solvable
+class _Chart(NamedTuple):
+    """Points by p = (a, b, w): `origin` + `scale` (a u + b v + d) / w; `axes` (*n, 3, 3) has the columns u, v, d."""
+
+    origin: Tensor
+    axes: Tensor
+    scale: Tensor
+
+    def direction(self, p: Tensor) -> Tensor:
+        return matvec(self.axes, torch.nn.functional.pad(p[..., :2], (0, 1), value=1.0))
+
+    def point(self, p: Tensor) -> Tensor:
+        return self.origin + (self.scale / p[..., 2])[..., None] * self.direction(p)
+
+    def slopes(self, p: Tensor) -> Tensor:
+        """dX / dp (*n, 3, 3)."""
+        along = -self.direction(p) / p[..., 2:]
+        columns = torch.cat([self.axes[..., :2], along[..., None]], -1)
+        return (self.scale / p[..., 2])[..., None, None] * columns
+
+
+class _NormalEquations(NamedTuple):
+    """Of a Gauss-Newton step, the identity where it is not `solvable`; and how the point is seen."""
+
+    matrix: Tensor
+    target: Tensor
+    solvable: Tensor
+    in_front: Tensor
+    residual: Tensor
+
+
+def _sighted(cameras: Sequence[Camera], x: Tensor, seen: Tensor | None) -> tuple[list[_Sight], _Chart, Tensor]:
+    """What is seen of each point, the chart of its first view, and where in it the rays meet in least squares."""
+    centres, directions, usable = (torch.stack(part) for part in zip(*(world_rays(c, p) for c, p in zip(cameras, x))))
+    usable = usable if seen is None else usable & seen
+    focal = [beside(c.K[..., :2, :2].det().abs(), x.ndim - 2).expand_as(u) for c, u in zip(cameras, usable)]
+    first = usable.to(torch.uint8).argmax(0)[None, ..., None].expand(1, *x.shape[1:-1], 3)
+    origin, d = (t.gather(0, first)[0] for t in (centres, directions))
+    baselines = origin - centres
+    longest = torch.where(usable, baselines.square().sum(-1), 0.0).amax(0)
+    scale = torch.where(longest > 0, torch.where(longest > 0, longest, 1.0).sqrt(), 1.0)
+    a = torch.linalg.cross(d.expand_as(directions), directions)
+    b = torch.linalg.cross(baselines / scale[..., None], directions)
+    weight = torch.where(usable, torch.stack(focal), 0.0)[..., None]
+    across = (weight * b.square()).sum((0, -1))
+    w = -(weight * a * b).sum((0, -1)) / torch.where(across > 0, across, 1.0)
+    axes = torch.stack([*_perpendicular(d), d], -1)
+    w = torch.where(across > 0, w, 1.0).clamp(min=SMALLEST_PARALLAX)
+    sights = [_Sight(*sight) for sight in zip(cameras, x, usable, centres)]
+    return sights, _Chart(origin, axes, scale), torch.nn.functional.pad(w[..., None], (2, 0))
+
+
+def _perpendicular(d: Tensor) -> tuple[Tensor, Tensor]:
+    """Two unit vectors perpendicular to a unit vector and to each other."""
+    x, z = d.new_tensor([1.0, 0, 0]), d.new_tensor([0.0, 0, 1])
+    u = torch.linalg.cross(d, torch.where(d[..., :1].abs() < 0.7, x, z))
+    u = u / u.norm(dim=-1, keepdim=True)
+    return u, torch.linalg.cross(d, u)
+
+
+def _normal_equations(sights: Sequence[_Sight], chart: _Chart, p: Tensor) -> _NormalEquations:
+    """Of the reprojection error in pixels, at p."""
+    X, slopes = chart.point(p), chart.slopes(p)
+    matrix, target = torch.zeros_like(slopes), torch.zeros_like(p)
+    in_front, worst = torch.ones_like(p[..., 0], dtype=torch.bool), torch.zeros_like(p[..., 0])
+    for sight in sights:
+        seen, by_X = projection_slopes(sight.camera, X, (X - sight.centre).norm(dim=-1))
+        used = sight.usable & seen.valid
+        J = torch.where(used[..., None, None], product(by_X, slopes), 0.0)
+        r = torch.where(used[..., None], sight.x - seen.x, 0.0)
+        matrix, target = matrix + product(J.mT, J), target + matvec(J.mT, r)
+        in_front = in_front & (used | ~sight.usable)
+        worst = torch.maximum(worst, r.detach().square().sum(-1))
+    size = matrix.diagonal(dim1=-2, dim2=-1).amax(-1)
+    ratio = torch.linalg.det(matrix / torch.where(size > 0, size, 1.0)[..., None, None])
+    solvable = (ratio > LEAST_DETERMINANT) & (torch.stack([s.usable for s in sights]).sum(0) >= 2)
+    matrix = torch.where(solvable[..., None, None], matrix, torch.eye(3).to(matrix))
+    return _NormalEquations(matrix, torch.where(solvable[..., None], target, 0.0), solvable, in_front, worst.sqrt())
+
+
+LEAST_DETERMINANT = 1e-18
+"""Of the normal equations, their largest diagonal entry at 1: inverse distance is known 1e-9 as well as directions."""

@@ -1,6 +1,7 @@
 """The physics-aware transformer: one image from an array of unlike cameras.
 
-The front door: `fuse`, its result `Frame`, `load_weights` and `read_image`. Nothing is imported before it is used.
+The front door: `fuse`, its result `Frame`, `align`, its result `Aligned`, `load_weights` and `read_image`. Nothing is
+imported before it is used.
 """
 
 from __future__ import annotations
@@ -13,14 +14,17 @@ from typing import TYPE_CHECKING, Any
 from .support.moved import OldNames
 
 if TYPE_CHECKING:
+    from .fusion.align import Aligned, align
     from .fusion.fuse import fuse
     from .fusion.results import Frame
     from .media.images import read_image
     from .networks.weights import Network, load_weights
 
-__all__ = ["Frame", "from_pretrained", "fuse", "load_weights", "read_image"]
+__all__ = ["Aligned", "Frame", "align", "from_pretrained", "fuse", "load_weights", "read_image"]
 
 _MODULES = {
+    "Aligned": "pat.fusion.align",
+    "align": "pat.fusion.align",
     "Frame": "pat.fusion.results",
     "fuse": "pat.fusion.fuse",
     "load_weights": "pat.networks.weights",

@@ -17,6 +17,7 @@ from .default import FIELDS, default_field, named_field, recorded_field
 from .explicit import Dense, Local, NearestVoxels
 from .moved import Moved
 from .protocol import ReceptiveField, SamplingLocations, lazily, sampling_locations
+from .ray_depth import ray_depth
 from .straight import Epipolar, EpipolarLine, HomographyDisplacement, Rectified, covering_displacement, pinhole_track
 from .widened import Widened
 
@@ -42,6 +43,7 @@ __all__ = [
     "named_field",
     "pinhole_track",
     "placement_error",
+    "ray_depth",
     "recorded_field",
     "sampling_locations",
 ]

@@ -236,7 +236,8 @@ class RayCurve(NamedTuple):
         return self._inverse_at(weights[1] / (weights[0] + weights[1]))
 
     def _inverse_at(self, s: Tensor) -> Tensor:
-        return torch.lerp(*(v[..., None] for v in self.inverse), s)
+        first, last = (v[..., None] for v in self.inverse)
+        return torch.lerp(first, last, s)
 
     def _weights_in_pixels(self, u: Tensor) -> tuple[Tensor, Tensor]:
         """How much of first and of last there is in the point whose pixel, without the lens, is a fraction u along."""

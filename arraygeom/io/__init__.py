@@ -40,6 +40,7 @@ from . import (
     ros,
     strecha,
     syntim,
+    xmp,
 )
 from .source import RigFileError, RigFileWarning, RigSource
 
@@ -64,6 +65,7 @@ READERS: dict[str, Any] = {
     "strecha": strecha,
     "open3d": open3d,
     "metashape": metashape,
+    "xmp": xmp,
 }
 READERS["caliscope"] = aniposelib
 WRITERS: dict[str, Any] = {
@@ -87,6 +89,8 @@ def read_rig(path: str | Path, *, format: str | None = None, scale: float = 1.0,
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such rig file")
+    if not (path.is_file() or path.is_dir()):
+        raise RigFileError(path, None, "is neither a file nor a folder")
     format = recognise(path) if format is None else format
     if format not in READERS:
         raise ValueError(f"unknown rig format '{format}' (known: {', '.join(READERS)})")

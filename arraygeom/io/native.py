@@ -57,7 +57,8 @@ from ..pixels import shift_matrix
 from ..pose import Pose, rotation_from_vector
 from ..rig import Link, Rig
 from ..sensor import CODINGS, PATTERNS, Band, Curve, Sensor
-from .source import RigSource
+from ..text import short
+from .source import RigSource, float64_of
 
 T = TypeVar("T")
 
@@ -114,7 +115,7 @@ class _Document(RigSource):
         """The rig of the whole document."""
         self.keys(document, TOP, None)
         if not str(document.get("format", FORMAT)).startswith("arraygeom-rig"):
-            raise self.fail("format", f"is '{document['format']}', wanted '{FORMAT}'")
+            raise self.fail("format", f"is {short(document['format'])}, wanted '{FORMAT}'")
         self.metre = self.choice(document.get("units", "metres"), UNITS, "units")
         self.origin = self.choice(
             document.get("first_pixel_centre", 0), {0: 0.0, 0.5: 0.5, 1: 1.0}, "first_pixel_centre"
@@ -264,7 +265,7 @@ class _Document(RigSource):
             several = isinstance(fields["gain"], list)
             gain = self.numbers(fields["gain"], (3,) if several else (), f"{entry}.gain")
             if not (gain > 0).all():
-                raise self.fail(f"{entry}.gain", f"is {fields['gain']}; gains are positive")
+                raise self.fail(f"{entry}.gain", f"is {short(fields['gain'])}; gains are positive")
             known["gain"] = tuple(gain.tolist()) if several else float(gain)
         return known
 
@@ -320,10 +321,9 @@ class _Document(RigSource):
     def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str, *, infinite: bool = False) -> Tensor:
         lengths = " x ".join(map(str, shape or ()))
         wanted = "a list of numbers" if shape is None else f"{lengths} numbers" if shape else "a number"
-        try:
-            tensor = torch.as_tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError):
-            raise self.fail(entry, f"is {value!r}; wanted {wanted}") from None
+        tensor = float64_of(value)
+        if tensor is None:
+            raise self.fail(entry, f"is {short(value)}; wanted {wanted}")
         if shape is not None and tensor.shape != shape:
             raise self.fail(entry, f"has shape {tuple(tensor.shape)}; wanted {wanted}")
         if tensor.isnan().any() or (tensor.isinf().any() and not infinite):
@@ -343,9 +343,9 @@ class _Document(RigSource):
         return int(value)
 
     def choice(self, value: Any, choices: Mapping[Any, float], entry: str) -> float:
-        if isinstance(value, str | int | float) and value in choices:
+        if isinstance(value, str | int | float) and not isinstance(value, bool) and value in choices:
             return choices[value]
-        raise self.fail(entry, f"is {value!r}; wanted one of {', '.join(map(str, choices))}")
+        raise self.fail(entry, f"is {short(value)}; wanted one of {', '.join(map(str, choices))}")
 
 
 def _camera_entry(camera: View) -> dict[str, Any]:

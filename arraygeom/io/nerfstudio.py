@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections import ChainMap
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +42,11 @@ def read(source: RigSource) -> Rig:
     frames = source.get(document, "frames", "")
     if not isinstance(frames, list) or not frames:
         raise source.fail("frames", "is no list, or an empty one; is the file whole?")
+    del document["frames"]
     cameras = []
     for i, frame in enumerate(frames):
         entry = f"frames[{i}]"
-        fields = {k: v for k, v in document.items() if k != "frames"} | source.mapping(frame, entry)
+        fields = ChainMap(source.mapping(frame, entry), document)
         cameras.append((str(source.get(fields, "file_path", entry)), _camera(source, fields, entry)))
     return source.rig(cameras)
 
@@ -54,7 +57,7 @@ def write(rig: Rig) -> str:
     return json.dumps({"frames": frames}, indent=1) + "\n"
 
 
-def _camera(source: RigSource, fields: dict[str, Any], entry: str) -> Camera:
+def _camera(source: RigSource, fields: Mapping[str, Any], entry: str) -> Camera:
     h, w = source.size(source.get(fields, "w", entry), source.get(fields, "h", entry), f"{entry} w, h")
     fx = _focal(source, fields, "x", w, entry)
     fy = _focal(source, fields, "y", h, entry) if fields.keys() & {"fl_y", "camera_angle_y"} else fx
@@ -66,7 +69,7 @@ def _camera(source: RigSource, fields: dict[str, Any], entry: str) -> Camera:
     return Camera(K=K, cam_from_world=pose, hw=(h, w), distortion=_lens(source, fields, entry))
 
 
-def _focal(source: RigSource, fields: dict[str, Any], axis: str, size: int, entry: str) -> float:
+def _focal(source: RigSource, fields: Mapping[str, Any], axis: str, size: int, entry: str) -> float:
     """Stated, or from the field of view in radians."""
     if fields.get(f"fl_{axis}") is not None:
         return source.number(fields[f"fl_{axis}"], f"{entry} fl_{axis}")
@@ -76,7 +79,7 @@ def _focal(source: RigSource, fields: dict[str, Any], axis: str, size: int, entr
     return size / 2 / math.tan(angle / 2)
 
 
-def _lens(source: RigSource, fields: dict[str, Any], entry: str) -> Distortion | None:
+def _lens(source: RigSource, fields: Mapping[str, Any], entry: str) -> Distortion | None:
     model = str(fields.get("camera_model", "OPENCV")).upper()
     if model not in FISHEYES + PERSPECTIVES:
         raise source.fail(f"{entry} camera_model", f"is {model}; supported: {', '.join(PERSPECTIVES + FISHEYES)}")

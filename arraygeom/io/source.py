@@ -19,7 +19,8 @@ from ..distortion import BROWN_CONRADY, COEFFICIENT_COUNTS, KANNALA_BRANDT, Dist
 from ..pixels import HW, shift_matrix
 from ..pose import Pose, rotation_error, rotation_from_vector
 from ..rig import Rig
-from ..safe_yaml import load_yaml, yaml_problem
+from ..safe_yaml import load_json, load_yaml, yaml_problem
+from ..text import short
 
 # Of a rotation vector, in radians; it may go round a few times.
 LARGEST_ANGLE = 1e3
@@ -72,9 +73,12 @@ class RigSource:
         """The file as a JSON object without repeated keys."""
         text = self.text()
         try:
-            return self.mapping(json.loads(text, object_pairs_hook=self._unique), None)
+            document = load_json(text)
         except json.JSONDecodeError as error:
             raise self.fail(f"line {error.lineno}", f"is not JSON ({error.msg}); is the file whole?") from None
+        except ValueError as error:
+            raise self.fail(None, str(error)) from None
+        return self.mapping(document, None)
 
     def toml(self) -> dict[str, Any]:
         """The file as TOML."""
@@ -108,10 +112,9 @@ class RigSource:
 
     def numbers(self, value: Any, shape: tuple[int, ...] | None, entry: str) -> Tensor:
         """Finite numbers as a float64 tensor of a shape (any order of nesting that has as many), or a vector."""
-        try:
-            tensor = torch.as_tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError):
-            raise self.fail(entry, f"holds something other than numbers: {str(value)[:60]!r}") from None
+        tensor = float64_of(value)
+        if tensor is None:
+            raise self.fail(entry, f"holds something other than numbers: {short(value)}")
         if shape is not None and tensor.numel() != torch.Size(shape).numel():
             wanted = " x ".join(map(str, shape))
             raise self.fail(entry, f"has {tensor.numel()} numbers, wanted {wanted}; is the file whole?")
@@ -124,7 +127,7 @@ class RigSource:
         try:
             values = [float(word) for word in text.split()]
         except ValueError:
-            raise self.fail(entry, f"holds something other than numbers: {text[:60]!r}") from None
+            raise self.fail(entry, f"holds something other than numbers: {short(text)}") from None
         return self.numbers(values, shape, entry)
 
     def number(self, value: Any, entry: str) -> float:
@@ -168,7 +171,7 @@ class RigSource:
         """K (3, 3) with the first pixel's centre moved from `first_pixel` to 0."""
         K = self.numbers(value, (3, 3), entry)
         if K[2].tolist() != [0.0, 0.0, 1.0]:
-            raise self.fail(entry, f"has last row {K[2].tolist()}, wanted [0, 0, 1]; is it transposed?")
+            raise self.fail(entry, f"has last row {short(K[2].tolist())}, wanted [0, 0, 1]; is it transposed?")
         if not (K[0, 0] > 0 and K[1, 1] > 0):
             raise self.fail(entry, f"has focal lengths {K[0, 0]:g} and {K[1, 1]:g}; they are positive, in pixels")
         return shift_matrix(first_pixel, first_pixel) @ K
@@ -206,7 +209,7 @@ class RigSource:
         numbers = self.numbers(T, None, entry)
         M = self.numbers(numbers, (3, 4) if numbers.numel() == 12 else (4, 4), entry)
         if len(M) == 4 and (M[3] - M.new_tensor([0, 0, 0, 1])).abs().max() > 1e-9:
-            raise self.fail(entry, f"has last row {M[3].tolist()}, wanted [0, 0, 0, 1]; is it transposed?")
+            raise self.fail(entry, f"has last row {short(M[3].tolist())}, wanted [0, 0, 0, 1]; is it transposed?")
         return self.pose(M[:3, :3], M[:3, 3], entry, metres=metres)
 
     def quaternion(self, wxyz: Any, entry: str) -> Tensor:
@@ -242,7 +245,7 @@ class RigSource:
         c = self.numbers(coefficients, (COEFFICIENT_COUNTS[model][0],), entry)
         lens = Distortion(model, c)
         if not lens.project(c.new_tensor([0.0, 0.0, 1.0]))[1]:
-            raise self.fail(entry, f"is {c.tolist()}, which no {model} lens has; was the calibration good?")
+            raise self.fail(entry, f"is {short(c.tolist())}, which no {model} lens has; was the calibration good?")
         return lens
 
     def rig(self, cameras: Iterable[tuple[str, Camera]], **fields: Any) -> Rig:
@@ -262,3 +265,17 @@ class RigSource:
             names = [name for name, _ in pairs]
             raise self.fail(next(n for n in names if names.count(n) > 1), "occurs twice; keep one")
         return fields
+
+
+def float64_of(value: Any) -> Tensor | None:
+    """Numbers, nested in lists or not, as a float64 tensor; None for what holds anything else, such as true or text."""
+    if _has_truth(value):
+        return None
+    try:
+        return torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError):
+        return None
+
+
+def _has_truth(value: Any) -> bool:
+    return isinstance(value, bool) or (isinstance(value, list | tuple) and any(map(_has_truth, value)))

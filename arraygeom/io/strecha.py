@@ -12,6 +12,7 @@ from pathlib import Path
 from ..camera import Camera
 from ..pose import Pose
 from ..rig import Rig
+from ..text import short
 from .source import RigSource
 
 CONVENTION = "first pixel's centre at 0 (shift 0); world_from_camera R and the centre; scale as in the file"
@@ -36,7 +37,9 @@ def _files(folder: Path) -> list[Path]:
 def _camera(source: RigSource) -> Camera:
     K, skipped, R, centre, wh = source.numbers_in(source.text(), (26,), "the file").split([9, 3, 9, 3, 2])
     if skipped.any():
-        raise source.fail("line 4", f"is {skipped.tolist()}: a lens, which is not read: undistort the images first")
+        raise source.fail(
+            "line 4", f"is {short(skipped.tolist())}: a lens, which is not read: undistort the images first"
+        )
     world_from_cam = source.rotation(R, "lines 5 to 7")
     return Camera(
         K=source.intrinsics(K, "lines 1 to 3"),

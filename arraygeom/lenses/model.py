@@ -98,12 +98,12 @@ class CameraModel(LensModel):
 
     def with_coefficients(self: AnyLens, coefficients: Float[Tensor, "*b n"]) -> AnyLens:
         """The same model with other numbers."""
-        own = self._own()
+        own = self._own()  # type: ignore[attr-defined]
         sizes = [t.shape[t.ndim - axes :].numel() for t, axes in own.values()]
         parts = zip(own.items(), coefficients.split(sizes, -1))
         batch = coefficients.shape[:-1]
-        new = {name: part.reshape(*batch, *t.shape[t.ndim - axes :]) for (name, (t, axes)), part in parts}
-        return dataclasses.replace(self, **new)
+        new = {name: part.reshape((*batch, *t.shape[t.ndim - axes :])) for (name, (t, axes)), part in parts}
+        return dataclasses.replace(self, **new)  # type: ignore[type-var]
 
     def _text(self) -> str:
         return self.model

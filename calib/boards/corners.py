@@ -14,8 +14,11 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 from scipy.special import erf
+
+from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
 LONGEST_EDGE = 12.0
 """Edges are used up to this many pixels from their corner: distorted edges are parabolas no further."""
@@ -82,16 +85,20 @@ def smooth_map(p: Float[np.ndarray, "n 2"], x: Float[np.ndarray, "n 2"], good: B
 
     Outliers are down-weighted.
     """
+
+    def weigh(rest: torch.Tensor) -> torch.Tensor:
+        off = rest.norm(dim=-1)
+        return cauchy(off, max(3 * float(off.quantile(0.5)), 1e-3)).square()
+
     middle, size = p[good].mean(0), max(float(np.abs(p[good] - p[good].mean(0)).max()), 1e-9)
     H, kept = cv2.findHomography(p[good], x[good], cv2.RANSAC, 3.0)
-    weight = kept[:, 0].astype(float) if kept.mean() > 0.5 else np.ones(int(good.sum()))
+    weight = torch.from_numpy(kept[:, 0]).double() if kept.mean() > 0.5 else torch.ones(len(kept)).double()
     degree = max(d for fewest, d in DEGREES.items() if good.sum() >= fewest)
     flat = cv2.perspectiveTransform(p[good][:, None], H)[:, 0]
-    basis = monomials((p[good] - middle) / size, degree)
-    for _ in range(4):
-        coefficients = np.linalg.lstsq(weight[:, None] * basis, weight[:, None] * (x[good] - flat), rcond=None)[0]
-        off = np.linalg.norm(x[good] - flat - basis @ coefficients, axis=-1)
-        weight = 1 / (1 + (off / max(3 * float(np.median(off)), 1e-3)) ** 2)
+    terms = torch.from_numpy(monomials((p[good] - middle) / size, degree).T)
+    bent = torch.from_numpy(x[good] - flat)
+    fit = robust_least_squares(terms, bent, least_squares(terms, bent, weight), weigh, steps=3)
+    coefficients = fit.coefficients.numpy()
     return lambda q: (
         cv2.perspectiveTransform(q[:, None], H)[:, 0] + monomials((q - middle) / size, degree) @ coefficients
     )

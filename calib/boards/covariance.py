@@ -13,6 +13,8 @@ from jaxtyping import Float
 
 from arraygeom import Camera, Rig
 from arraygeom.atomic import write_text
+from arraygeom.io.source import float64_of
+from arraygeom.safe_yaml import load_json
 
 from .camera_parameters import camera_jacobian, centre_derivatives, parameter_names
 
@@ -54,10 +56,13 @@ class RigCovariance:
         if not path.is_file():
             raise FileNotFoundError(f"{path}: no such covariance file")
         try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-            names, matrix = tuple(document["names"]), np.array(document["covariance"], dtype=np.float64)
+            document = load_json(path.read_text(encoding="utf-8"))
+            names, numbers = tuple(document["names"]), float64_of(document["covariance"])
+            if numbers is None:
+                raise TypeError
         except (ValueError, KeyError, OverflowError, RecursionError, TypeError):
             raise ValueError(f"{path}: is not a covariance file of this program") from None
+        matrix = numbers.numpy()
         if not all(isinstance(name, str) for name in names) or not np.isfinite(matrix).all():
             raise ValueError(f"{path}: holds names that are no text, or NaN or infinity: calibrate again")
         if matrix.shape != (len(names), len(names)):

@@ -16,6 +16,7 @@ TYPICAL_COEFFICIENTS = {
     "brown-conrady": (1.0, 1.0, 0.02, 0.02, 1.0, 1.0, 1.0, 1.0, 0.02, 0.02, 0.02, 0.02, 0.1, 0.1),
     "kannala-brandt": (0.3, 0.3, 0.3, 0.3),
     "thin-prism-fisheye": (0.3, 0.3, 0.02, 0.02, 0.3, 0.3, 0.02, 0.02),
+    "polynomial-fisheye": (0.1, 0.1, 0.1),
     "double-sphere": (0.3, 0.3),
     "extended-unified": (0.3, 0.5),
     "unified": (1.0, 1.0, 1.0, 0.02, 0.02),
@@ -27,6 +28,7 @@ LENS_TERMS = {
     "brown-conrady": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tx", "ty"),
     "kannala-brandt": ("k1", "k2", "k3", "k4"),
     "thin-prism-fisheye": ("k1", "k2", "p1", "p2", "k3", "k4", "sx", "sy"),
+    "polynomial-fisheye": ("k2", "k3", "k4"),
     "double-sphere": ("xi", "alpha"),
     "extended-unified": ("alpha", "beta"),
     "unified": ("xi", "k1", "k2", "p1", "p2"),
@@ -125,7 +127,7 @@ def _with_default(problem: BundleProblem, name: str, entry: str) -> BundleProble
     elif camera.distortion is not None:
         coefficients = camera.distortion.coefficients.clone()
         coefficients[int(index)] = 0.0
-        camera = camera.replace(distortion=type(camera.distortion)(camera.distortion.model, coefficients))
+        camera = camera.replace(distortion=camera.distortion.with_coefficients(coefficients))
     return replace(problem, cameras={**problem.cameras, name: camera})
 
 

@@ -18,6 +18,8 @@ import cv2
 import numpy as np
 from PIL import Image, ImageOps
 
+from arraygeom.image_bytes import decodable
+
 from .detect import Grey, to_grey
 
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".webp"}
@@ -161,10 +163,10 @@ def _orientation(file: Path) -> int:
 
 
 def _decode_file(path: Path) -> np.ndarray:
-    tag, content = _orientation(path), path.read_bytes()
+    tag, content = _orientation(path), decodable(path.read_bytes())
     flags = cv2.IMREAD_ANYDEPTH | cv2.IMREAD_COLOR  # orientation tags are applied, as when images are fused
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    if image is None:
+    image = None if content is None else cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    if content is None or image is None:
         raise ValueError(f"{path}: not an image that can be read: give a complete PNG, TIFF or JPEG file")
     if tag > 1 and content[8:12] == b"WEBP":  # of which OpenCV applies none
         with Image.open(path) as stored:

@@ -18,9 +18,10 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
+from arraygeom.robust import cauchy, least_squares, robust_least_squares
 
 from .held_out import image_parts, trimmed_square
-from .matches import Images, Matches, Pairs, match_cameras
+from .matches import Images, Pairs, PointMatches, match_cameras
 from .plausibility import DriftEvidence, plausible
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
@@ -226,10 +227,10 @@ def _clearly_better(
     )
 
 
-def _thinned(matches: Matches) -> Matches:
+def _thinned(matches: PointMatches) -> PointMatches:
     """At most `MOST` of them, evenly through the list."""
     step = max(1, -(-len(matches.alpha) // MOST))
-    return Matches(matches.alpha[::step], matches.beta[::step])
+    return PointMatches(matches.alpha[::step], matches.beta[::step])
 
 
 def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[FitStatistics], Tensor, float]:
@@ -254,7 +255,7 @@ def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[Fit
     return figures, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
 
 
-def handedness(matches: Matches) -> float:
+def handedness(matches: PointMatches) -> float:
     """The share of Delaunay triangles of the points in alpha that keep their orientation in beta."""
     try:
         corners = Delaunay(matches.alpha.numpy()).simplices
@@ -291,7 +292,7 @@ def _observe(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
     return PointObservations(*(torch.cat(part, 1) for part in zip(*parts)))
 
 
-def _observe_pair(pairs: Sequence[Pair], matches: Matches) -> PointObservations:
+def _observe_pair(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:
     """One pair of cameras under several rigs, batched by lens model."""
     count = len(matches.alpha)
     off, depth = torch.full((2, len(pairs), count), torch.nan, dtype=torch.float64)
@@ -327,17 +328,14 @@ def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tu
     return inliers, trimmed_square(left_over[inliers])
 
 
-def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
+def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
     """The residual of the distances after a robust first-order fit of F."""
-    basis = lines_basis(pair, matches)
-    weight = torch.ones_like(off)
-    residual = off
-    for _ in range(8):
-        solution = torch.linalg.lstsq(weight[:, None] * basis, (weight * off)[:, None], driver="gelsd").solution
-        residual = off - (basis @ solution)[:, 0]
-        scale = residual.abs().median().clamp(min=1e-3)
-        weight = 1 / (1 + (residual / (2 * scale)).square())
-    return residual
+    terms = lines_basis(pair, matches).T
+
+    def weigh(rest: Tensor) -> Tensor:
+        return cauchy(rest, 2 * max(float(rest.abs().median()), 1e-3)).square()
+
+    return robust_least_squares(terms, off, least_squares(terms, off, torch.ones_like(off)), weigh, steps=7).rest
 
 
 def _figures(

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from arraygeom.progress import log_step
+from arraygeom.robust import cauchy, normal_deviation, normal_equations
 
 LOG = logging.getLogger(__name__)
 
@@ -91,13 +92,13 @@ def left_out(residuals: Residuals, solution: Solution, groups: Int[Tensor, " m"]
     """The changes of the free parameters, to first order, when the residuals of one group (0 to g - 1) are left out."""
     r, J = jacobian(residuals, solution.full)
     J = J[:, torch.cat([solution.active, torch.ones(J.shape[1] - len(solution.active), dtype=torch.bool)])]
-    weight = 1 / (noise_scale(r) ** 2 + r.square())
-    information = J.T @ (weight[:, None] * J) + torch.eye(J.shape[1], dtype=J.dtype)
+    weight = _weight(r)
+    information = normal_equations(J.T, r, weight)[0] + torch.eye(J.shape[1], dtype=J.dtype)
     changes = torch.zeros(count, len(solution.z), dtype=J.dtype)
     for group in range(count):
         mine = groups == group
-        part = J[mine].T @ (weight[mine, None] * J[mine])
-        step = torch.linalg.solve(information - part, J[mine].T @ (weight[mine] * r[mine]))
+        part, slope = normal_equations(J[mine].T, r[mine], weight[mine])
+        step = torch.linalg.solve(information - part, slope)
         changes[group, solution.active] = step[: int(solution.active.sum())]
     return changes
 
@@ -133,15 +134,20 @@ def _cost(r: Tensor, z: Tensor, scale: float) -> float:
 
 
 def noise_scale(r: Tensor) -> float:
-    """The scale of the residuals: 1.48 times their median size, which is the deviation of normal ones."""
-    return max(1.4826 * float(r.abs().median()), LEAST_NOISE)
+    """The scale of the residuals: the deviation of normal ones of their median size."""
+    return normal_deviation(r, LEAST_NOISE)
+
+
+def _weight(r: Tensor) -> Tensor:
+    """What the square of each residual counts: Cauchy's weights over the noise's variance."""
+    scale = noise_scale(r)
+    return cauchy(r, scale) / scale**2
 
 
 def _normal_equations(r: Tensor, J: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
     """J^T W J + I and -(J^T W r + z), reweighted for Cauchy's loss."""
-    weight = 1 / (noise_scale(r) ** 2 + r.square())
-    eye = torch.eye(len(z), dtype=z.dtype)
-    return J.T @ (weight[:, None] * J) + eye, -(J.T @ (weight * r) + z)
+    information, slope = normal_equations(J.T, r, _weight(r))
+    return information + torch.eye(len(z), dtype=z.dtype), -(slope + z)
 
 
 def jacobian(f: Residuals, z: Float[Tensor, " n"]) -> tuple[Float[Tensor, " m"], Float[Tensor, "m n"]]:

@@ -130,8 +130,9 @@ def _attend(
     if isinstance(locations, Dense) and backend == "auto" and samples is None and not measured:
         return (_attend_dense(query, key, value, locations.stride, bias),)
     if isinstance(locations, Local | Dense):
-        windows = isinstance(locations, Local) and nearest and samples is None and bias is None and not measured
-        if windows and backend in ("auto", "local") and _local_serves(query, key, value, locations):
+        values_alone = nearest and samples is None and bias is None and not measured
+        asked = values_alone and backend in ("auto", "local")
+        if isinstance(locations, Local) and asked and _local_serves(query, key, value, locations):
             return _attend_local(query, key, value, locations)
         alpha, beta = (View(hw=(t.shape[2], t.shape[3])) for t in (query, key))
         locations = lazily(locations, Pair(alpha, beta))
@@ -139,7 +140,7 @@ def _attend(
         raise RuntimeError(f"backend 'local' serves {LOCAL_SERVES} only: ask for 'auto'")
 
     def run(q: Tensor, k: Tensor, v: Tensor, given: Locations, part: Tensor | None) -> tuple[Tensor, ...]:
-        form = _form(given, q, samples)
+        form = sample_positions(given, q, samples)
         found = _run(AttentionInputs(q, k, v, form, _bias(part, q, form.samples), nearest), backend, measured)
         return found if measured else found[:1]
 
@@ -196,7 +197,7 @@ def _attend_dense(query: Tensor, key: Tensor, value: Tensor, stride: int, bias: 
     return scaled_dot_product_attention(q, k, v, attn_mask=mask, scale=1.0).mT.reshape(b, dv, ha, wa)
 
 
-def _form(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
+def sample_positions(locations: Locations, query: Tensor, samples: int | None) -> SamplePositions:
     """Segments or Positions in the one form that the backends take, in the precision that they count in."""
     if isinstance(locations, Segments):
         points, mask, straight = torch.stack([locations.start, locations.end], -2), locations.valid[..., None], True
@@ -241,7 +242,7 @@ def _bias(bias: Tensor | None, query: Tensor, samples: int) -> Tensor | None:
 
 
 def _run(inputs: AttentionInputs, backend: Backend, measured: bool) -> Attended:
-    chosen = _choose(backend, inputs.query.device.type)
+    chosen = chosen_backend(backend, inputs.query.device.type)
     tensors = inputs.query, inputs.key, inputs.value, inputs.positions.points, inputs.bias
     missing = "" if chosen == "reference" else _missing(*tensors)
     if missing and backend != "auto":
@@ -261,7 +262,7 @@ def _missing(*tensors: Tensor | None) -> str:
     return "gradients by torch.func (by torch.autograd it has)" if "Grad" in under_way else ""
 
 
-def _choose(backend: Backend, device: str) -> str:
+def chosen_backend(backend: Backend, device: str) -> str:
     """The backend that serves; raises if the one asked for cannot."""
     triton = importlib.util.find_spec("triton") is not None
     if backend == "auto":

@@ -29,7 +29,7 @@ def attend(inputs: AttentionInputs, *, measured: bool, backend: str, strict: boo
     `strict`: no second order by the reference."""
     query, key, value, positions, bias, nearest = inputs
     if is_plain(query, key, value, positions.points, bias):
-        out, statistics, *_ = _kernels(backend).forward(inputs, measured)
+        out, statistics, *_ = compiled(backend).forward(inputs, measured)
     else:
         out, statistics, *_ = _attend(
             *(query, key, value, positions.points, positions.mask, bias),
@@ -50,7 +50,7 @@ def is_plain(*given: Tensor | None) -> bool:
     return not (gradient or followed()) and all(type(t) in (Tensor, Parameter) for t in tensors)
 
 
-def _kernels(backend: str) -> ModuleType:
+def compiled(backend: str) -> ModuleType:
     """The module of a backend, imported when first needed: compilers take their time to load."""
     if backend == "cpu":
         from pat.attention import cpu
@@ -79,7 +79,7 @@ def _attend(
     strict: bool,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     positions = SamplePositions(points, mask, samples, straight)
-    return _kernels(backend).forward(AttentionInputs(query, key, value, positions, bias, nearest), measured)
+    return compiled(backend).forward(AttentionInputs(query, key, value, positions, bias, nearest), measured)
 
 
 @_attend.register_fake
@@ -128,7 +128,7 @@ def _attend_backward(
     positions = SamplePositions(points, mask, samples, straight)
     inputs = AttentionInputs(query, key, value, positions, bias, nearest)
     saved, cotangents = (statistics, logsum, best, out), (value_cotangent, statistics_cotangent)
-    return _kernels(backend).backward(inputs, saved, cotangents, wanted)
+    return compiled(backend).backward(inputs, saved, cotangents, wanted)
 
 
 @_attend_backward.register_fake

@@ -130,45 +130,76 @@ def with_found_rig(network: Network) -> StereoMethod:
 
 @dataclass
 class Ablate:
-    """Compare families of receptive fields with the same weights on the same scenes: what calibration is worth.
+    """What calibration is worth: receptive fields compared by one network as the calibration or the rig changes.
 
-    Scenes are layered photographs seen by unrectified rigs, alpha's focal length 1 to 3 times beta's.
-    Example: pat ablate --scenes 12 --out out/ablate
+    Curves of calibrated segments, rectified and resampled images, rows, a local window and all of beta, on layered
+    scenes with exact positions. Example: pat ablate --sweeps rotation ahead --scenes 4 --out out/ablate
     """
 
-    weights: Weights = "mono-colour"
+    weights: Weights = "pat-supervised"
+    sweeps: tuple[str, ...] = ()
+    """Of rotation, "principal point", baseline, "focal ratio" and ahead; all by default."""
+    without: tuple[str, ...] = ()
+    """Fields to leave out, such as dense, which takes most of the time."""
+    families: bool = False
+    """Instead: a table of families of fields, on unrectified rigs with focal lengths 1 to 3 times beta's."""
     photos: tuple[Path, ...] = ()
     """Folders of photographs; those that scikit-image ships if none is given."""
     rendered: MaybePath = None
-    """Folder of scenes written by `pat render`, instead: their first camera is alpha, their second beta."""
-    scenes: int = 12
-    """Number of scenes."""
-    hw: tuple[int, int] = (240, 320)
-    """Height and width of both images."""
+    """Folder of scenes written by `pat render`, for --families: their first camera is alpha, their second beta."""
+    scenes: int = 6
+    """Number of scenes, of each rig."""
+    hw: Annotated[tuple[int, int] | None, optional("H W")] = None
+    """Height and width of both images: 96 128, or 240 320 with --families."""
     seed: int = 0
     """Of the scenes."""
     field: FieldName = "auto"
     out: Out = Path("out/ablate")
-    """Folder for ablation.md, ablation.csv and ablation.png."""
+    """Folder for ablation.md, ablation.json, ablation.svg and ablation.png; with --families ablation.csv."""
 
     def run(self) -> None:
-        """Write and print the table. Raises ValueError for less than one scene."""
-        from ..evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
+        """Write and print the tables. Raises ValueError for less than one scene, and for names that there are not."""
         from ..networks.weights import load_weights
 
         if self.scenes < 1:
             raise ValueError(f"--scenes: {self.scenes}: give at least 1")
         writable(self.out, folder=True)
+        network = load_weights(self.weights)
+        if self.families or self.rendered is not None:
+            self._families(network)
+        else:
+            self._sweeps(network)
+        print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
+        say(f"written: {self.out / 'ablation.md'}, and its figures and numbers beside it")
+
+    def _families(self, network: Network) -> None:
+        from ..evaluation.ablation import FieldFamily, ablate, families, layered_cases, rendered_cases
+
         if self.rendered is not None:
             cases = rendered_cases(self.rendered, seed=self.seed)
         else:
-            cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw, seed=self.seed)
+            cases = layered_cases(self.scenes, photos=self.photos, hw=self.hw or (240, 320), seed=self.seed)
         chosen, own = families(), options.field_named(self.field)
         if own is not None:
             chosen[self.field] = FieldFamily(lambda disparity: own)
-        ablate(load_weights(self.weights), cases, out=self.out, chosen=chosen)
-        print((self.out / "ablation.md").read_text(encoding="utf-8"), end="")
-        say(f"written: {self.out / 'ablation.md'}, ablation.csv and ablation.png beside it")
+        ablate(network, cases, out=self.out, chosen=chosen)
+
+    def _sweeps(self, network: Network) -> None:
+        from ..evaluation.sweep_report import write_report
+        from ..evaluation.sweeps import FIELDS, SIZE, SWEEPS, ablate, points
+        from ..networks.protocol import Comparing
+        from ..synthesis.photos import PhotoBank
+
+        if not isinstance(network, Comparing):
+            raise ValueError(f"--weights {self.weights}: its matches are not of its attention alone: add --families")
+        unknown = [name for name in self.without if name not in FIELDS]
+        if unknown:
+            raise ValueError(f"--without: no field '{unknown[0]}': there are {', '.join(FIELDS)}")
+        fields = {name: field for name, field in FIELDS.items() if name not in self.without}
+        rigs = list(points(self.sweeps or tuple(SWEEPS), hw=self.hw or SIZE))
+        bank = PhotoBank.load(*self.photos) if self.photos else None
+        shown = options.progress("ablating")(rigs, len(rigs))
+        write_report(ablate(network, shown, fields, scenes=self.scenes, photos=bank, seed=self.seed), self.out)
 
 
 @dataclass
@@ -367,3 +398,26 @@ class Train:
         from ..training.train import train
 
         say(f"written: {train(self.config)}")
+
+
+@dataclass
+class Settings:
+    """List the numbers that matching, fusion and networks were given: value, kind, and where each is from.
+
+    Kinds: *physics* follows from what is measured, *size* says how much is done at a time, *tuned* was chosen.
+    Example: pat settings --kind tuned
+    """
+
+    kind: Literal["physics", "size", "tuned", "all"] = "all"
+    """Those of one kind alone."""
+
+    rooms: ClassVar[tuple[str, ...]] = ("pat.matching", "pat.fusion", "pat.networks")
+
+    def run(self) -> None:
+        """Print a line for each."""
+        from ..support.settings import all_settings
+
+        found = [s for s in all_settings(*self.rooms) if self.kind in ("all", s.kind)]
+        for entry in found:
+            print(f"{entry.kind:8}{entry.algorithm.removesuffix('Settings')}.{entry.name} = {entry.value}  {entry.why}")
+        print(f"{sum(s.numbers for s in found)} numbers under {len(found)} names")

@@ -18,16 +18,22 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from arraygeom import Rig
+from arraygeom.io.xmp import named_by_band, rig_of_images, states_cameras
 from arraygeom.progress import log_step, part, stage
+from arraygeom.undistortion import pixels_between
 from calib.images.from_images import UncalibratedRig, rig_from_images
-from calib.images.self_calibration import RefinedPair, joined, refined_by_depth, self_calibrated
+from calib.images.known_intrinsics import centres_found
+from calib.images.self_calibration import UNSCALED, RefinedPair, joined, refined_by_depth, self_calibrated
 
 from ..fusion.batch import find_images
 from ..fusion.fuse import fuse
 from ..fusion.inputs import equal_bands
 from ..fusion.results import Frame
+from ..fusion.steps import without_lenses
+from ..fusion.views import read_view
 from ..media.exif import focal_length
 from ..media.images import read_image, write_image
+from ..media.raw import developed_rig
 from ..media.video import read_video
 from ..networks.weights import Network, load_weights
 
@@ -78,16 +84,22 @@ def array_of(
         notes.append(line)
         say(line)
 
+    tagged = _tagged_rig(files, note)
     images = {name: _read(name, path, note) for name, path in files.items()}
     alpha = _chosen_alpha(images, alpha, note)
+    if tagged is not None:
+        images = {name: read_view(tagged, name, files[name], like=tagged[alpha].sensor) for name in images}
     names = _ordered_betas(images, alpha, note)
     bands = [len(images[name]) for name in names]
     weights = weights or ("mono-colour" if 3 in (*bands, sum(bands)) else "mono-spectral")
     images = {name: images[name] for name in (alpha, *names)}
-    focal = {name: length for name in images if (length := focal_length(files[name]))}
-    for name, length in focal.items():
-        note(f"{name}: focal length {length:.0f} pixels, by EXIF")
-    rig, names = found_rig(images, alpha, focal, load_weights(weights), note)
+    if tagged is None:
+        focal = {name: length for name in images if (length := focal_length(files[name]))}
+        for name, length in focal.items():
+            note(f"{name}: focal length {length:.0f} pixels, by EXIF")
+        rig, names = found_rig(images, alpha, focal, load_weights(weights), note)
+    else:
+        rig, names = _translated_rig(tagged, images, alpha, note)
     images = {name: images[name] for name in names}
     several = len(names) > 2 and all(len(images[name]) == 1 for name in names[1:])
     if several:
@@ -96,7 +108,10 @@ def array_of(
 
 
 def camera_names(paths: Sequence[Path]) -> dict[str, Path]:
-    """Names of cameras for their files: the files' own without suffix, or the folders', or numbers."""
+    """Names of cameras for their files: the bands' that their tags state, the files' own without suffix, or the
+    folders', or numbers."""
+    if states_cameras(paths):
+        return named_by_band(paths)
     for names in ([p.stem for p in paths], [p.resolve().parent.name for p in paths]):
         plain = [re.sub(r"[^\w.-]+", "_", name).strip("_") for name in names]
         if len(set(plain)) == len(plain) and all(plain):
@@ -127,6 +142,42 @@ def frames_of_videos(videos: Mapping[str, Path], folder: Path) -> tuple[dict[str
         if not files[name]:
             raise ValueError(f"{path}: a video without frames")
     return files, rates
+
+
+def _tagged_rig(files: Mapping[str, Path], note: Say) -> Rig | None:
+    """The rig that the images' tags state, but for translations; None if not every image has such tags."""
+    if not states_cameras(list(files.values())):
+        return None
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        rig = rig_of_images(files)
+    note(f"lenses and orientations of {', '.join(files)}: by the images' tags")
+    for warning in caught:
+        note(str(warning.message))
+    return rig
+
+
+@stage()
+def _translated_rig(tagged: Rig, images: Images, alpha: str, note: Say) -> tuple[Rig, list[str]]:
+    """The rig of tags with translations and depths by the images, and the cameras that match; alpha comes first."""
+    straight, pinhole = without_lenses(Rig({name: tagged[name] for name in images}), images)
+    shown = {name: pixels_between(tagged[name], straight[name])[1][None].float() for name in images}
+    lengths = {name: float(straight[name].K[0, 0]) for name in images}
+    longest = max(images[alpha].shape[-2:])
+    factors = {
+        name: min(lengths[alpha] / length * min(MATCHED / longest, 1.0), 1.0) for name, length in lengths.items()
+    }
+    reduced = {name: _scaled(image, factors[name]) for name, image in pinhole.items()}
+    masks = {name: _scaled(mask, factors[name])[0] > 0.99 for name, mask in shown.items()}
+    found, facts = centres_found(_resized(straight, reduced), reduced, masks, alpha=alpha)
+    for name, (points, distance) in facts.items():
+        note(f"{name}: {points} points, {distance:.2f} px from their lines, intrinsics kept")
+    for name in images.keys() - {*found.names}:
+        note(f"{name}: left out, too little in common with the others")
+    note(f"depths are multiples of the baseline {alpha} to {found.betas(alpha)[0]}")
+    rig = developed_rig(tagged, images)
+    cameras = {n: rig[n].replace(cam_from_world=found[n].cam_from_world) for n in (alpha, *found.betas(alpha))}
+    return Rig(cameras, depth=found.depth, name=UNSCALED), list(cameras)
 
 
 @stage()

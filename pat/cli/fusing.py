@@ -7,7 +7,7 @@ import shutil
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -40,10 +40,11 @@ class Fuse:
     Without a rig: pat fuse mono.png colour.png
     With one: pat fuse rig.yaml --alpha mono --image mono=a.png --image colour=b.png --depth 2 20 --out out/
 
-    Without a rig it is found from the images, and written to rig.yaml beside the result. Cameras are then called as
-    their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images, frames are fused
-    one by one: the first of each camera, the second, and so on. With --sequence the cameras need not be synchronised
-    (frame_rate and time_offset in the rig): every frame of alpha gets colour from the betas' frames nearest in time.
+    Without a rig it is found from the images, and written to found_rig.yaml beside the result. Cameras are then
+    called as their files are. With folders, or patterns such as "mono=day1/m_*.png" (quoted), for the images,
+    frames are fused one by one, matched by names or by the numbers or times in them. With --sequence the cameras
+    need not be synchronised (frame_rate and time_offset in the rig): every frame of alpha gets colour from the
+    betas' frames nearest in time.
     """
 
     spellings: ClassVar[Mapping[str, str]] = {
@@ -125,6 +126,7 @@ class Fuse:
 
     def run(self) -> None:
         """Check the options that can be checked at once, and fuse, with the rig that is given or one that is found."""
+        from ..media.images import exr_writer
         from ..support.memory import limited, parse_bytes
 
         if self.bits not in {"png": (8, 16), "tif": (8, 16, 32), "exr": (32,)}[self.kind]:
@@ -133,48 +135,27 @@ class Fuse:
         options.response_of(self.response)
         options.noise_of(self.noise)
         options.device_of(self.device)
+        if self.kind == "exr":
+            exr_writer(self.out)
         if self.classical and not self.report:
             raise ValueError("--classical is shown on the page: leave out --no-report")
         self._notes: list[str] = []
         options.compile_at_once()
         with limited(limit), self._judged() as self._warnings:
-            self._with_rig() if self._rig_given() else self._without_rig()
-
-    def _rig_given(self) -> bool:
-        """Whether the first argument is a rig. Raises ValueError for arguments that do not go together.
-
-        Images that follow a rig are of the cameras that their names say.
-        """
-        if self.given and (self.image or is_rig_file(self.given[0])):
-            self.image = (*self.image, *(f"{path.stem}={path}" for path in self.given[1:]))
-            if not self.image:
-                raise ValueError(f"with the rig {self.given[0]}, give --image NAME=FILE for each camera")
-            return True
-        if self.image:
-            raise ValueError("--image NAME=FILE needs a rig: give --rig RIG, or the images alone, without names")
-        if len(self.given) < 2:
-            raise ValueError(
-                "give two images or more, as `pat fuse mono.png colour.png`; or a rig, --alpha and each --image"
-            )
-        return False
+            self.image, with_rig = named_images(self.given, self.image, "fuse")
+            self._with_rig() if with_rig else self._without_rig()
 
     def _with_rig(self) -> None:
         from arraygeom.compiled import numba_loaded
 
-        from ..fusion.batch import find_images
         from ..fusion.views import ViewFiles
 
         rig = self._rig()
-        if self.alpha is None:
-            raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
-        files = options.files_by_name(self.image)
-        if unknown := [path for path in self.given[1:] if path.stem not in rig.names]:
-            raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
-        found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
-        refuse_equal_files({name: paths[0] for name, paths in found.items()})
-        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=rig.require(self.alpha))
+        alpha, found = files_by_camera(rig, self.alpha, self.given, self.image)
+        found = self._frames(found)
+        views = ViewFiles(rig, {name: paths[0] for name, paths in found.items()}, alpha=alpha)
         if self.sequence:
-            return self._many(rig, found, self.alpha)
+            return self._many(rig, found, alpha)
         with ThreadPoolExecutor(2) as beside:
             beside.submit(numba_loaded)
             compared = beside.submit(warn_of_wrong_rig, views)
@@ -183,8 +164,8 @@ class Fuse:
                 with options.working("comparing the rig with the images"):
                     compared.result()
             if several:
-                return self._many(rig, found, self.alpha)
-            self._one(views.developed, views, self.alpha, before_writing=compared.result)
+                return self._many(rig, found, alpha)
+            self._one(views.developed, views, alpha, before_writing=compared.result)
 
     def _without_rig(self) -> None:
         from ..support.locks import folder_lock
@@ -210,8 +191,11 @@ class Fuse:
 
     def _without_rig_from(self, files: dict[str, list[Path]], rates: Mapping[str, float]) -> None:
         """Find the rig from the first image of each camera and fuse; `rates` are frames a second, of videos."""
+        from ..fusion.results import FOUND_RIG
         from .from_images import array_of
 
+        self.sequence |= bool(rates)
+        files = self._frames(files)
         first = {name: paths[0] for name, paths in files.items()}
         options.say_when_compiling()
         with options.working("finding the rig"):
@@ -225,10 +209,19 @@ class Fuse:
         for name, rate in rates.items():
             if name in rig.names:
                 rig = rig.with_camera(name, rig[name].replace(sensor=replace(rig[name].sensor, frame_rate=rate)))
-        self.sequence, self.video = self.sequence or bool(rates), rates.get(array.alpha, self.video)
+        self.video = rates.get(array.alpha, self.video)
         self._many(rig, {name: files[name] for name in rig.names}, array.alpha)
-        rig.save(self.out / "rig.yaml")
-        say(f"the rig that was found: {self.out / 'rig.yaml'}")
+        rig.save(self.out / FOUND_RIG)
+        say(f"the rig that was found: {self.out / FOUND_RIG}")
+
+    def _frames(self, files: dict[str, list[Path]]) -> dict[str, list[Path]]:
+        """The files of the frames that every camera has; all of them, of a sequence."""
+        from ..fusion.frame_matching import matched_frames, warn_of_gaps
+
+        if self.sequence:
+            warn_of_gaps(files)
+            return files
+        return matched_frames(files)
 
     @contextmanager
     def _judged(self) -> Iterator[list[str]]:
@@ -463,6 +456,43 @@ def _score(image: Tensor, ground_truth: Tensor) -> Score:
     from ..evaluation.metrics import score
 
     return score(image.clamp(0, 1), ground_truth)
+
+
+def named_images(given: Sequence[Path], image: Sequence[str], command: str) -> tuple[tuple[str, ...], bool]:
+    """The images NAME=FILE of a rig's cameras, and whether the first argument is a rig.
+
+    Images that follow a rig are of the cameras that their names say. Raises ValueError for arguments that do not go
+    together.
+    """
+    if given and (image or is_rig_file(given[0])):
+        named = (*image, *(f"{path.stem}={path}" for path in given[1:]))
+        if not named:
+            raise ValueError(f"with the rig {given[0]}, give --image NAME=FILE for each camera")
+        return named, True
+    if image:
+        raise ValueError("--image NAME=FILE needs a rig: give --rig RIG, or the images alone, without names")
+    if len(given) < 2:
+        raise ValueError(
+            f"give two images or more, as `pat {command} mono.png colour.png`; or a rig, --alpha and each --image"
+        )
+    return (), False
+
+
+def files_by_camera(
+    rig: Rig, alpha: str | None, given: Sequence[Path], image: Sequence[str]
+) -> tuple[str, dict[str, list[Path]]]:
+    """Alpha's name, and the image files of each camera of a rig. Raises ValueError without alpha, for names that the
+    rig lacks, and for one image given twice."""
+    from ..fusion.batch import find_images
+
+    if alpha is None:
+        raise ValueError(f"--alpha: give the camera whose view is wanted, one of {', '.join(rig.names)}")
+    files = options.files_by_name(image)
+    if unknown := [path for path in given[1:] if path.stem not in rig.names]:
+        raise ValueError(f"{unknown[0]}: no camera of the rig has its name: give --image NAME={unknown[0]}")
+    found = {rig.require(name): find_images(path, name=name) for name, path in files.items()}
+    refuse_equal_files({name: paths[0] for name, paths in found.items()})
+    return rig.require(alpha), found
 
 
 def is_rig_file(path: Path) -> bool:

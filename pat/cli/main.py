@@ -13,7 +13,7 @@ from typing import Annotated, Any, ClassVar, NoReturn, Union
 import tyro
 
 from ..support.moved import CallableModule
-from . import authors, calibration, fusing, rigs
+from . import aligning, authors, calibration, fusing, rigs, weights
 from .options import respelled, say
 
 
@@ -22,6 +22,7 @@ class Pat:
 
     users: ClassVar[Mapping[str, Any]] = {
         "fuse": fusing.Fuse,
+        "align": aligning.Align,
         "show": rigs.Show,
         "explore": rigs.Explore,
         "calibrate": calibration.Calibrate,
@@ -38,6 +39,8 @@ class Pat:
         "data": authors.Data,
         "render": authors.Render,
         "train": authors.Train,
+        "settings": authors.Settings,
+        "weights": weights.WeightsCommands,
     }
     commands: ClassVar[Mapping[str, Any]] = {**users, **authors}
 

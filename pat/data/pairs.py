@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pat.media.images import read_image
+from pat.support.folders import files_below
 
 T = TypeVar("T")
 
@@ -136,8 +137,8 @@ def _middlebury_scenes(root: Path) -> list[tuple[Path, _Middlebury]]:
     return sorted(
         (file, layout)
         for key, layout in MIDDLEBURY.items()
-        for file in root.rglob(layout.left)
-        if any(key in folder for folder in file.parts[-3:-1])
+        for file in files_below(root)
+        if file.name == layout.left and any(key in folder for folder in file.parts[-3:-1])
     )
 
 
@@ -154,7 +155,7 @@ def _middlebury_pair(root: Path, left: Path, layout: _Middlebury) -> StereoPair:
 
 def _named(root: Path) -> list[tuple[Path, Path]]:
     """Left and right by their names."""
-    return [(left, right) for left in sorted(root.rglob("*")) for right in _right_of(left, root)]
+    return [(left, right) for left in files_below(root) for right in _right_of(left, root)]
 
 
 def _right_of(left: Path, root: Path) -> list[Path]:

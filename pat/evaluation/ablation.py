@@ -50,6 +50,7 @@ from ..media.colour import luminance, srgb_image
 from ..media.figures import save_panels
 from ..networks.protocol import FusionNetwork
 from ..sensors import Clip, Noise, Quantise, record
+from ..support.folders import files_below
 from ..synthesis.layered import LayeredScenes
 from ..synthesis.photos import PhotoBank
 from ..synthesis.rendered import RENDER_FILE, Rendered, is_rendered
@@ -172,7 +173,7 @@ def rendered_cases(folder: Path, *, seed: int = 0) -> Iterator[AblationCase]:
 
     Raises ValueError for a folder without rendered scenes, or with incomplete ones.
     """
-    found = sorted({path.parent for name in ("scene.yaml", RENDER_FILE) for path in folder.rglob(name)})
+    found = sorted({path.parent for path in files_below(folder) if path.name in ("scene.yaml", RENDER_FILE)})
     broken = [path for path in found if not is_rendered(path)]
     if not found or broken:
         incomplete = f"{broken[0]} is incomplete ({RENDER_FILE} is missing)" if broken else ""

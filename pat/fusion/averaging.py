@@ -6,6 +6,7 @@ it, and then what betas recorded there.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -18,15 +19,28 @@ from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
 from ..media.colour import from_luma_chroma, luminance
+from ..support.settings import size, tuned
 
-OWN = 0.22, 6, 2.0
-"""Colour is averaged by itself first: the scale of unlikeness over the root of the noise's standard deviation, how
-far away pixels are, and how much more luma counts than a colour difference. These and the next were chosen on
-Middlebury's pairs of the tune half."""
-RECORDED = 0.11, 16, 1.25, 0.75
-"""Colour is averaged as beta recorded it then: the same, and how much of it is taken where enough is alike."""
-ROWS = 16
-"""Rows that a thread works on at once: what it sums stays in its cache."""
+
+@dataclass(frozen=True)
+class AveragingSettings:
+    """Of means over pixels that are alike."""
+
+    own: tuple[float, int, float] = tuned(
+        (0.22, 6, 2.0),
+        "Middlebury, tune half: colour is averaged by itself first: the scale of unlikeness over the root of the "
+        "noise's standard deviation, how far away pixels are, and how much more luma counts than a colour difference",
+    )
+    recorded: tuple[float, int, float, float] = tuned(
+        (0.11, 16, 1.25, 0.75),
+        "Middlebury, tune half: colour is averaged as beta recorded it then: the same, and how much of it is taken "
+        "where enough is alike",
+    )
+    rows: int = size(16, "Rows that a thread works on at once: what it sums stays in its cache")
+
+
+SETTINGS = AveragingSettings()
+OWN, RECORDED, ROWS = SETTINGS.own, SETTINGS.recorded, SETTINGS.rows
 
 
 def averaged_with_alike(

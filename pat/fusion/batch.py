@@ -63,7 +63,7 @@ class Batch:
     """What is to be fused and how: `files` by camera, the frames in order; `out`, the folder of the results.
 
     Options are as of `fuse` and `save_frame`. A `sequence` is fused as `fuse_sequence` does, else the first frame with
-    the first of every other camera, the second with the second and so on.
+    the first of every other camera, the second with the second and so on (`frame_matching` finds which these are).
     """
 
     rig: Rig
@@ -171,7 +171,8 @@ class Batch:
         if self.sequence and not self.alone:
             missing = [i for i in many if not (resume and self.fused_file(i).exists())]
             keys = self.fusion.keys_of(missing)
-            first = [Task(self._key_file(k), fuse_key, (plan, k)) for k in keys]
+            alphas = self.files[self.alpha]
+            first = [Task(self._key_file(k), fuse_key, (plan, k), str(alphas[k.alpha])) for k in keys]
             run_tasks(first, title="key frames", **options)
         tasks = [Task(self.fused_file(i), fuse_one, (plan, i)) for i in many]
         report = run_tasks(tasks, title="frames", **options)
@@ -257,7 +258,10 @@ class Batch:
         try:
             return KeyColour(**load_file(file)) if file.exists() else None
         except SafetensorError as error:
-            raise ValueError(f"{file}: {error}") from None
+            image = self.files[self.alpha][key.alpha]
+            raise ValueError(
+                f"{image}: its colour in {file} is damaged ({error}): fuse again without --resume"
+            ) from None
 
     def fuse_key(self, key: KeyFrame) -> None:
         """Write the colour of a key frame."""

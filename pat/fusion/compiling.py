@@ -28,7 +28,10 @@ def seems_compiled() -> bool:
     """Whether numba's cache has code of attention for this version of Python, of whatever age; numba is not imported
     for it."""
     cache_home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folders = [ROOT / "pat" / "attention" / "kernels" / "__pycache__", *Path(cache_home, "numba").glob("kernels_*")]
+    folders = [
+        ROOT / "pat" / "attention" / "kernels" / "__pycache__",
+        *Path(cache_home, "numba").glob("kernels_*"),
+    ]
     if chosen := os.environ.get("NUMBA_CACHE_DIR"):
         folders = [*Path(chosen).glob("kernels_*")]
     index = f"forward.forward-*py{sys.version_info.major}{sys.version_info.minor}*.nbi"
@@ -83,25 +86,21 @@ def _end_with_parent() -> None:
 def kernels() -> Iterator[tuple[Any, tuple[Any, ...]]]:
     """The kernels that a frame of two cameras is fused by, in the order of their use, and the types of what they are
     given."""
-    from numba import float32, float64, int16, int32, int64, uint8, uint64
+    from numba import float32, float64, int16, int32, int64, types, uint8, uint64
 
     from ..attention.kernels import attend_rows
-    from ..matching import semi_global_numba, window_numba
+    from ..matching import cost, semi_global_numba
     from ..networks.unshuffle_numba import unshuffle
 
-    plane, bits, labels = float32[:, ::1], uint64[:, ::1], int32[:, ::1]
-    planes, cost, sums = float32[:, :, ::1], uint8[:, :, ::1], int16[:, :, ::1]
-    strided = float32[:, :, :]
-    images, segments = (plane, bits, plane, bits), (planes, planes, plane, plane)
-    yield semi_global_numba.census, (plane, bits)
-    yield semi_global_numba.costs, (*images, *segments, cost)
-    yield semi_global_numba.aggregate, (cost, plane, sums)
-    counts = int64, int64
-    yield semi_global_numba.winners, (sums, *segments, *counts, *counts, int32[::1], plane, planes, labels, labels)
-    yield window_numba.band_costs, (*images, *segments, labels, labels, cost)
-    yield window_numba.band_aggregate, (cost, plane, labels, labels, float32, float32, planes)
-    order = int32[:, :, ::1]
-    yield window_numba.band_winners, (planes, order, labels, labels, *segments[:3], *counts, plane, plane)
+    plane, bits, labels = float32[:, ::1], uint64[:, ::1], int32[:, :, ::1]
+    planes, costs, sums = float32[:, :, ::1], uint8[:, :, :, ::1], int16[:, :, :, ::1]
+    strided, image = float32[:, :, :], types.Tuple((float32[::1], uint64[::1]))
+    windows, segments, hw = (labels, int64), (planes, planes, plane, plane), (int64, int64)
+    yield cost.census, (plane, bits)
+    yield semi_global_numba.costs, (image, image, *windows, *segments, *hw, costs)
+    yield semi_global_numba.aggregate, (costs, plane, *windows, float32, float32, sums)
+    found = int32[::1], plane, planes, int32[:, ::1]
+    yield semi_global_numba.winners, (sums, *windows, *segments, *hw, int64, int64, float32, *found)
     yield semi_global_numba.regression, (*(plane,) * 6, float64, plane, plane)
     yield _attention()
     yield unshuffle, (strided, strided, strided)

@@ -28,26 +28,41 @@ from ..matching.epipolar_offset import Misalignment, fit_misalignment, normals
 from ..matching.inputs import Beta, Inputs
 from ..matching.match import located
 from ..matching.matches import BetaMatches, combined_bands
+from ..matching.normalisation import SETTINGS as NORMALISATION
+from ..matching.normalisation import Normalisation, blurred, moments
 from ..matching.radiometry import Given, Response, fit, stated_response
-from ..matching.semi_global import CONSISTENT, Normalisation, blurred, enlarged, reduced
+from ..matching.semi_global import CONSISTENT, enlarged, reduced
 from ..networks.protocol import FusionNetwork
+from ..support.settings import size, tuned
 from .inputs import FrameInputs, padded
 from .results import Frame
 
 LOG = logging.getLogger(__name__)
 
-PIXELS = 400_000
-"""Alpha's pixels in the pre-pass, at most."""
-SMALL = 50_000
-"""Alpha's pixels below which the pre-pass is at full size."""
-MARGIN = 0.1
-"""By how much a match must be better than others to count, as of `BetaMatches.facts`."""
-BLUR = 1.0
-"""Standard deviation of the blur of what is compared, pixels of the pre-pass."""
-PASSES = 3
-"""Pre-passes at most: matches are better where what was found is put right."""
-SETTLED = 0.25
-"""Change of the largest displacement, pixels of the pre-pass, up to which no other pass is made."""
+
+@dataclass(frozen=True)
+class PrePassSettings:
+    """Of the matching of reduced images before a frame is matched."""
+
+    pixels: int = size(400_000, "Alpha's pixels in the pre-pass, at most")
+    small: int = size(50_000, "Alpha's pixels below which the pre-pass is at full size")
+    margin: float = tuned(
+        0.1,
+        "The first value tried, which held: by how much a match must be better than others to "
+        "count, as of `BetaMatches.facts`",
+    )
+    blur: float = tuned(
+        1.0,
+        "Source not recorded: standard deviation of the blur of what is compared, pixels of the pre-pass",
+    )
+    passes: int = size(3, "Pre-passes at most: matches are better where what was found is put right")
+    settled: float = size(
+        0.25,
+        "Change of the largest displacement, pixels of the pre-pass, up to which no other pass is made",
+    )
+
+
+SETTINGS = PrePassSettings()
 
 
 @dataclass(frozen=True)
@@ -104,21 +119,21 @@ def find_corrections(frame: FrameInputs, response: Given, *, align: bool) -> Cor
         return found
     small = _reduced_frame(frame)
     found = replace(found, misalignments=(Misalignment(),) * len(frame.inputs.betas))
-    for i in range(PASSES):
-        LOG.info("pre-pass %d of at most %d", i + 1, PASSES)
+    for i in range(SETTINGS.passes):
+        LOG.info("pre-pass %d of at most %d", i + 1, SETTINGS.passes)
         matches = _matches(small, found)
         response_now = _fitted(small, matches) if fits else found.response
         steps = [_misaligned(m) for m in matches] if align else [Misalignment()] * len(matches)
         moves = tuple(before + step for before, step in zip(found.misalignments, steps))
         found = Corrections(response_now, moves)
-        if all(step.largest(small.hw) <= SETTLED for step in steps):
+        if all(step.largest(small.hw) <= SETTINGS.settled for step in steps):
             break
     return found
 
 
 def expected_work(frame: FrameInputs, response: Given, *, align: bool) -> float:
     """About how much work `find_corrections` is, as a share of fusing the frame: mostly two passes."""
-    return 2 * min(PIXELS / math.prod(frame.hw), 1.0) if align or response == "fit" else 0.0
+    return 2 * min(SETTINGS.pixels / math.prod(frame.hw), 1.0) if align or response == "fit" else 0.0
 
 
 def _given(response: Given, inputs: Inputs) -> Response:
@@ -138,8 +153,8 @@ def _is_rgb(beta: Beta) -> bool:
 def _reduced_frame(frame: FrameInputs) -> FrameInputs:
     """The frame at a half, a quarter, ... of its size."""
     pixels, inputs = math.prod(frame.hw), frame.inputs
-    factor = 1 if pixels < SMALL else 2
-    while pixels > PIXELS * factor**2:
+    factor = 1 if pixels < SETTINGS.small else 2
+    while pixels > SETTINGS.pixels * factor**2:
         factor *= 2
     if factor == 1:
         return frame
@@ -211,10 +226,9 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
     weight = (_reliable(found)[0, 0, :h, :w] & valid[0, :h, :w]).to(alpha)
     whole = Normalisation.of(alpha, luma)
     own = whole.softened(alpha)[:, :, :h, :w]
-    mean, deviation = _moments(values[-1:][None], weight)
-    wanted, spread = _moments(own, weight)
-    bright = (luma - mean) * (spread / deviation.clamp(min=1e-3)).clamp(max=4) + wanted
-    soft = blurred(values[:-1][:, None], [BLUR] * (len(values) - 1))[:, 0]
+    seen_there, wanted = (moments(image, weight[None, None]) for image in (values[-1:][None], own))
+    bright = seen_there.matched(luma, wanted, NORMALISATION.largest_gain)
+    soft = blurred(values[:-1][:, None], [SETTINGS.blur] * (len(values) - 1))[:, 0]
     normal = normals(Segments(*(t[0, :h, :w] for t in _parts(beta.field.straight))))
     return _Matches(soft, own[0, 0], bright[0, 0], where, normal.to(where), weight)
 
@@ -222,23 +236,16 @@ def _of_beta(alpha: Tensor, before: Beta, beta: Beta, found: BetaMatches, hw: HW
 def _reliable(found: BetaMatches) -> Bool[Tensor, "b 1 h w"]:
     """Where a match is consistent and clearly better than others."""
     unlike, margin, _ = found.facts.split(1, 1)
-    return enlarged(((unlike < CONSISTENT) & (margin > MARGIN)).to(margin)) > 0
+    return enlarged(((unlike < CONSISTENT) & (margin > SETTINGS.margin)).to(margin)) > 0
 
 
 def _parts(found: Segments) -> tuple[Tensor, Tensor, Tensor]:
     return found.start, found.end, found.valid
 
 
-def _moments(image: Tensor, weight: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation where the weight is."""
-    share = (weight + 1e-6) / (weight + 1e-6).sum()
-    mean = (share * image).sum()
-    return mean, (share * (image - mean).square()).sum().sqrt()
-
-
 def _fitted(frame: FrameInputs, matches: list[_Matches]) -> Response:
     h, w = frame.hw
-    own = blurred(frame.inputs.alpha[:, :, :h, :w], [BLUR])[0, 0]
+    own = blurred(frame.inputs.alpha[:, :, :h, :w], [SETTINGS.blur])[0, 0]
     colour = [(m, m.weight > 0) for m in matches if len(m.before) == 3]
     points = [found.before[:, counts] for found, counts in colour]
     places = [found.place[counts] for found, counts in colour]

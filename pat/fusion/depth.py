@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -13,10 +15,25 @@ from arraygeom.pixels import HW
 
 from ..matching.inputs import Inputs
 from ..networks.protocol import FusionOutput
+from ..support.settings import physics, size, tuned
 from .inputs import Placement
 
-UNSEEN = 1e-4
-"""At confidences up to this beta does not see the point: then its position gives no depth."""
+
+@dataclass(frozen=True)
+class DepthSettings:
+    """Of the depth of fused pixels."""
+
+    unseen: float = size(
+        1e-4, "At confidences up to this beta does not see the point: then its position gives no depth"
+    )
+    lost: float = tuned(0.3, "Middlebury, tune half: confidence below which a pixel's depth is taken from beside it")
+    one_side: float = physics(
+        0.9,
+        "Length of the sum of all betas' segments, over the sum of their lengths, from which all count as on one side",
+    )
+
+
+SETTINGS = DepthSettings()
 
 
 def _within(where: Float[Tensor, "n 2"], segments: Segments, which: Bool[Tensor, "h w"]) -> Float[Tensor, "n 2"]:
@@ -60,20 +77,13 @@ def depth_and_confidence(
                 there = depth_from_track(Track(*(v.expand_as(track.a)[beyond] for v in track)), moved + offset)
                 found = Depth(*(t.masked_scatter(beyond, part) for t, part in zip(found, there)))
         valid = found.valid.reshape(h, w)
-        weight = torch.where(valid & (confidence[0, :h, :w] > UNSEEN), confidence[0, :h, :w], 0.0)
+        weight = torch.where(valid & (confidence[0, :h, :w] > SETTINGS.unseen), confidence[0, :h, :w], 0.0)
         total = total + weight / torch.where(found.valid, found.depth, 1.0).reshape(h, w)
         weights = weights + weight
     known = weights > 0
     depth = torch.where(known, weights / torch.where(known, total, 1.0), torch.nan)
     overall = torch.stack(output.confidence).amin(0) if output.overall is None else output.overall
     return depth.to(output.image), overall[0, :h, :w]
-
-
-LOST = 0.3
-"""Confidence below which a pixel's depth is taken from beside it. Chosen on the pairs that `ResponseSettings` names."""
-
-ONE_SIDE = 0.9
-"""Length of the sum of all betas' segments, over the sum of their lengths, from which all count as on one side."""
 
 
 def background_filled(
@@ -90,7 +100,7 @@ def background_filled(
         return depth
     every = (..., slice(None, None, 4), slice(None, None, 4), slice(None))
     apart = torch.stack([(part.end[every] - part.start[every]).mean((0, 1, 2)) for part in steps])
-    if apart.sum(0).norm() < ONE_SIDE * apart.norm(dim=1).sum():
+    if apart.sum(0).norm() < SETTINGS.one_side * apart.norm(dim=1).sum():
         return depth
     across, down = apart.sum(0).abs().tolist()
     if across < down:
@@ -101,7 +111,7 @@ def background_filled(
 def _filled_rows(depth: Float[Tensor, "h w"], confidence: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
     """What is computed on the way is seven times as large."""
     inverse = torch.where(depth.isfinite(), 1 / depth, torch.nan)
-    known = (confidence >= LOST) & depth.isfinite()
+    known = (confidence >= SETTINGS.lost) & depth.isfinite()
     before = _nearest_known(inverse, known)
     after = _nearest_known(inverse.flip(-1), known.flip(-1)).flip(-1)
     beside = torch.fmin(before, after)

@@ -24,6 +24,7 @@ from ..networks.collaborative import luma_refined, without_noise
 from ..networks.denoiser import LowLightNetwork, NoisyView, over_flips
 from ..networks.weights import load_denoiser
 from ..sensors import NoiseLevel
+from ..support.settings import physics, size
 from .averaging import averaged_with_alike
 from .results import Frame
 from .steps import FusionStep, Radiometry
@@ -34,15 +35,28 @@ LOG = logging.getLogger(__name__)
 Noise = Literal["estimate"] | Mapping[str, NoiseLevel]
 """The noise level of each camera that has noise, or that they are to be estimated from the images."""
 
-LEAST_DEVIATION = 1.5 / 255
-"""Images whose noise has a smaller standard deviation, in the mean, are left as they are."""
-FAR_MORE = 5.0
-"""Noise is warned of whose stated standard deviation is this many times what the image shows. Noise that a demosaicing
-has smoothed shows as half or less."""
-FOUND_BYTES = 12.0
-"""Of a position in a beta and its confidence."""
-JOINTLY = 0.5
-"""The time of the joint correction over that of denoising the views before, about (.45 to .47 were measured)."""
+
+@dataclass(frozen=True)
+class LowLightSettings:
+    """Of fusion with noise."""
+
+    least_deviation: float = physics(
+        1.5 / 255, "Images whose noise has a smaller standard deviation, in the mean, are left as they are"
+    )
+    far_more: float = physics(
+        5.0,
+        "Warn if the stated noise is more than this many times the noise measured in the image: "
+        "noise that a demosaicing has smoothed shows as half or less",
+    )
+    found_bytes: float = size(12.0, "Of a position in a beta and its confidence")
+    jointly: float = size(
+        0.5,
+        "The time of the joint correction over that of denoising the views before, about (.45 to .47 were measured)",
+    )
+
+
+SETTINGS = LowLightSettings()
+
 in_tiles = partial(chunked, rows=1024, halo=128, axis=(-2, -1))
 """Denoises images in tiles of this side, with so much seen around them, pixels."""
 
@@ -68,7 +82,7 @@ class LowLight:
     @property
     def seconds_left(self) -> float:
         """About how long the correction will take."""
-        return JOINTLY * self.seconds if self.noisy else 0.0
+        return SETTINGS.jointly * self.seconds if self.noisy else 0.0
 
     def kept(self, hw: HW, betas: int) -> float:
         """Bytes that are held until the frame of this size is corrected: the views, and where its pixels are in each
@@ -77,7 +91,7 @@ class LowLight:
             return 0.0
         images = [*self.given.images.values(), *self.views.images.values()]
         parts = [part for view in self.noisy.values() for part in view]
-        found = math.prod(hw) * betas * FOUND_BYTES
+        found = math.prod(hw) * betas * SETTINGS.found_bytes
         return found + sum({part.data_ptr(): part.nbytes for part in (*images, *parts)}.values())
 
     def corrected(
@@ -150,7 +164,7 @@ def warn_of_noise(name: str, image: Float[Tensor, "c h w"], view: NoisyView) -> 
     if shown == NoiseLevel():
         return
     stated, found = (255 * float(deviation.mean()) for deviation in (view.deviation, shown.deviation(image[None])))
-    if stated > FAR_MORE * max(found, 255 * LEAST_DEVIATION):
+    if stated > SETTINGS.far_more * max(found, 255 * SETTINGS.least_deviation):
         warnings.warn(
             f"noise of '{name}': a standard deviation of {stated:.0f}/255 is stated, its image shows {found:.1f}/255: "
             "detail will be lost; state electrons at white, or have the noise estimated",
@@ -168,7 +182,7 @@ def noise_levels(images: Mapping[str, Tensor], noise: Noise | None) -> Mapping[s
 def noisy_view(image: Float[Tensor, "c h w"], level: NoiseLevel) -> NoisyView | None:
     """An image as recorded but unbiased, and without its noise; None if there is hardly any."""
     deviation = level.deviation(image[None])
-    if float(deviation.mean()) <= LEAST_DEVIATION:
+    if float(deviation.mean()) <= SETTINGS.least_deviation:
         return None
     recorded = level.unbiased(image[None])
     return NoisyView(recorded, denoised(recorded, deviation), deviation)

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ..matching.colour_transfer import MOST_DETAIL, local_slope
-from ..matching.semi_global import Normalisation
+from ..matching.colour_transfer import SETTINGS, local_slope
+from ..matching.normalisation import Normalisation
 from ..media.colour import luminance
 from ..networks.protocol import FusionNetwork
 from .results import Frame
@@ -43,5 +43,5 @@ def with_alpha_detail(frame: Frame, alpha: Float[Tensor, "1 h w"]) -> Frame:
     own, other = alpha[None].to(luma), torch.nan_to_num(luma)
     normalisation = Normalisation.of(own, other)
     soft = normalisation.softened(own)
-    detail = local_slope(other, soft) * (own - soft).clamp(-MOST_DETAIL, MOST_DETAIL)
+    detail = local_slope(other, soft) * SETTINGS.detail(own - soft)
     return frame._replace(image=frame.image + detail[0])

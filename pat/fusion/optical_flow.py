@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import cv2
@@ -13,13 +14,22 @@ from torch import Tensor
 from arraygeom import pixel_grid, sample
 
 from ..media.colour import to_bytes
+from ..support.settings import tuned
 
-ASTRAY = 1.0
-"""Flow that does not lead back to within this many pixels has a weight below 1 / e."""
-UNLIKE = 0.08
-"""So is flow between pixels whose values differ by this."""
-STILL = 0.5
-"""Pixels that move less than this between two frames are still."""
+
+@dataclass(frozen=True)
+class FlowSettings:
+    """Of optical flow between frames."""
+
+    astray: float = tuned(
+        1.0,
+        "Source not recorded: flow that does not lead back to within this many pixels has a weight below 1 / e",
+    )
+    unlike: float = tuned(0.08, "Source not recorded: so is flow between pixels whose values differ by this")
+    still: float = tuned(0.5, "Source not recorded: pixels that move less than this between two frames are still")
+
+
+SETTINGS = FlowSettings()
 
 
 class Flow(NamedTuple):
@@ -38,7 +48,7 @@ def flow_between(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Flow:
     there, back = _steps(a, b), _steps(b, a)
     returned = there + warped(back, there)
     likeness = _smooth((warped(b, there) - a).abs()[0])
-    weight = torch.exp(-returned.square().sum(0) / ASTRAY**2 - (likeness / UNLIKE).square())
+    weight = torch.exp(-returned.square().sum(0) / SETTINGS.astray**2 - (likeness / SETTINGS.unlike).square())
     return Flow(there, weight * _inside(there))
 
 
@@ -52,7 +62,7 @@ def warped(image: Float[Tensor, "c h w"], step: Float[Tensor, "2 h w"]) -> Float
 
 def still(a: Float[Tensor, "1 h w"], b: Float[Tensor, "1 h w"]) -> Bool[Tensor, "h w"]:
     """Where nothing moves from frame a to b, and nothing near does."""
-    moves = (_steps(a, b).square().sum(0) > STILL**2).numpy().astype(np.uint8)
+    moves = (_steps(a, b).square().sum(0) > SETTINGS.still**2).numpy().astype(np.uint8)
     return torch.from_numpy(cv2.dilate(moves, np.ones((9, 9), np.uint8)) == 0)
 
 

@@ -67,27 +67,38 @@ def report_page(frame: Frame, images: Mapping[str, Float[Tensor, "_ _ _"]], rig:
     if facts.classical is not None:
         shown["classical"] = _shown(facts.classical)
     shown["fused"] = _shown(frame.image)
-    overlays = {"confidence": lambda: _confidence_layer(frame.confidence)}
+    overlays = {"confidence": lambda: shares_layer(frame.confidence)}
     known = frame.depth[frame.depth.isfinite()]
     if len(known):
-        overlays["depth"] = lambda: _data_url(reduced(colour_depth(frame.depth), LONGEST))
-    layers = {name: partial(lambda image: _data_url(reduced(_shown(image), LONGEST)), x) for name, x in shown.items()}
+        overlays["depth"] = lambda: data_url(reduced(colour_depth(frame.depth), LONGEST))
+    layers = {name: partial(lambda image: data_url(reduced(_shown(image), LONGEST)), x) for name, x in shown.items()}
     urls = _all_of({**layers, **overlays})
-    h, w = frame.depth.shape
-    parts = {
-        "TITLE": html.escape(f"{' + '.join(name for name in rig.names if name in images)}, fused"),
-        "RATIO": f"{w} / {h}",
-        "LAYERS": "\n".join(_layer(name, urls[name]) for name in layers),
-        "OVERLAYS": "\n".join(
-            f'<img class="overlay" id="{name}" alt="{name}" src="{urls[name]}" hidden>' for name in overlays
-        ),
-        "SWITCHES": "\n".join(_switch(name) for name in overlays),
-        "FACTS": "\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
-        "NOTES": _listed("What was found", facts.notes),
-        "WARNINGS": _listed("Warnings", facts.warnings, kind="warnings"),
-        "RIG": rig_drawing(rig, alpha),
-        "LEGEND": _depth_legend(known, facts.unit),
-    }
+    return filled_page(
+        f"{' + '.join(name for name in rig.names if name in images)}, fused",
+        frame.depth.shape,
+        {name: urls[name] for name in layers},
+        {name: urls[name] for name in overlays},
+        FACTS="\n".join(f"<tr><th>{k}<td>{html.escape(v)}" for k, v in _figures(frame, known, facts).items()),
+        NOTES=listed("What was found", facts.notes),
+        WARNINGS=listed("Warnings", facts.warnings, kind="warnings"),
+        RIG=rig_drawing(rig, alpha),
+        LEGEND=_depth_legend(known, facts.unit),
+    )
+
+
+def filled_page(
+    title: str, hw: Sequence[int], layers: Mapping[str, str], overlays: Mapping[str, str], **parts: str
+) -> str:
+    """The page with layers to compare and overlays to switch, URLs by name, and its further parts as HTML."""
+    h, w = hw
+    parts = {"LEGEND": "", **parts, "TITLE": html.escape(title), "RATIO": f"{w} / {h}"}
+    parts["LAYERS"] = "\n".join(_layer(name, url) for name, url in layers.items())
+    named = {name: html.escape(name) for name in overlays}
+    parts["OVERLAYS"] = "\n".join(
+        f'<img class="overlay" id="{named[name]}" alt="{named[name]}" src="{url}" hidden>'
+        for name, url in overlays.items()
+    )
+    parts["SWITCHES"] = "\n".join(_switch(name) for name in overlays)
     page = PAGE.read_text(encoding="utf-8")
     for name, text in parts.items():
         page = page.replace(f"{{{{{name}}}}}", text)
@@ -166,14 +177,15 @@ def _shown(image: Float[Tensor, "c h w"]) -> Float[Tensor, "d h w"]:
     return image if len(image) in (1, 3) else image.mean(0, keepdim=True)
 
 
-def _data_url(image: Float[Tensor, "c h w"]) -> str:
+def data_url(image: Float[Tensor, "c h w"]) -> str:
+    """The URL of an image as JPEG, grey or in colour."""
     pixels = to_bytes(image.detach().cpu().expand(3, -1, -1).flip(0)).transpose(1, 2, 0)
     _, content = cv2.imencode(".jpg", pixels, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     return f"data:image/jpeg;base64,{base64.b64encode(content.tobytes()).decode()}"
 
 
-def _confidence_layer(confidence: Float[Tensor, "h w"]) -> str:
-    """A PNG that covers pixels the more, the less their confidence."""
+def shares_layer(confidence: Float[Tensor, "h w"]) -> str:
+    """The URL of a PNG that covers pixels the more, the less their confidence."""
     cover = 1 - reduced(confidence[None].detach().cpu(), LONGEST)
     colour = torch.tensor(UNCONFIDENT[::-1])[:, None, None] / 255
     layers = torch.cat([colour.expand(3, *cover.shape[1:]), 0.85 * cover])
@@ -186,10 +198,12 @@ def _layer(name: str, url: str) -> str:
 
 
 def _switch(name: str) -> str:
-    said = {"confidence": "confidence (covered where it is low)", "depth": "depth"}[name]
+    said = {"confidence": "confidence (covered where it is low)"}.get(name, name)
+    name, said = html.escape(name), html.escape(said)
     return f'<label><input type="checkbox" data-overlay="{name}"> {said}</label>'
 
 
-def _listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
+def listed(title: str, lines: Iterable[str], *, kind: str = "notes") -> str:
+    """A section of the page with a list; empty without lines."""
     items = "".join(f"<li>{html.escape(line)}" for line in lines)
     return f'<section class="{kind}"><h2>{title}</h2><ul>{items}</ul></section>' if items else ""

@@ -33,6 +33,10 @@ MOST = 65535
 ImageFormat = Literal["png", "tif", "exr"]
 
 
+FOUND_RIG = "found_rig.yaml"
+"""The rig that was found from images. Not rig.yaml, which may be one that somebody wrote."""
+
+
 def save_frame(
     frame: Frame,
     out: Path,
@@ -48,8 +52,9 @@ def save_frame(
     depth.png (red is near).
 
     8 and 16 bits hold sRGB values; 32 bits (tif, exr) hold linear light as floats, nothing cut off. With `view`, the
-    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to rig.yaml; with `points`, the
-    camera of alpha, the pixels of known depth go to points.ply. With a `name` the files are name_fused.png and so on.
+    rig of alpha alone goes to view.yaml and says so; with `rig`, that of all cameras to found_rig.yaml; with
+    `points`, the camera of alpha, the pixels of known depth go to points.ply. With a `name` the files are
+    name_fused.png and so on.
     Without any known depth there are no depth files. Bands that are not one or three go to fused_1.png, fused_2.png
     and so on, their mean to fused.png. The image comes last: where it is, the others are of the same frame, and
     points.ply and the page index.html of a former one are gone. After an error all former files are as they were.
@@ -71,7 +76,7 @@ def save_frame(
         if view is not None:
             view.save(folder / "view.yaml")
         if rig is not None:
-            rig.save(folder / "rig.yaml")
+            rig.save(folder / FOUND_RIG)
         if points is not None:
             write_points(folder / "points.ply", points, frame.depth, frame.image)
         image = linear_from_srgb(frame.image) if bits == 32 else frame.image

@@ -24,10 +24,12 @@ from torch import Tensor
 from arraygeom import Moved, ReceptiveField, Rig, Widened
 from arraygeom.fields.default import straight_field
 
+from ..matching.normalisation import mean_moments
 from ..matching.radiometry import Given, Response
 from ..media.colour import to_luma_chroma
 from ..networks.protocol import FusionNetwork
 from ..sensors import NoiseLevel
+from ..support.settings import physics, size, tuned
 from .corrections import Corrections
 from .frames import CachedFrames, DenoisedFrames, Frames
 from .fuse import corrections_of, fuse
@@ -42,14 +44,24 @@ T = TypeVar("T")
 
 LOG = logging.getLogger(__name__)
 
-SYNCHRONOUS = 0.05
-"""Gaps shorter than this part of alpha's frame time count as none."""
-UNKNOWN_MOTION = 0.25
-"""The part of the motion in a gap that fields leave room for if no speed is given."""
-INTERVALS = 2.0
-"""Colour is warped from key frames up to this many intervals of theirs away."""
-NEIGHBOURS = 4
-"""Radiometry is normalised over this many key frames before and after."""
+
+@dataclass(frozen=True)
+class SequenceSettings:
+    """Of sequences of cameras with frames of their own."""
+
+    synchronous: float = physics(0.05, "Gaps shorter than this part of alpha's frame time count as none")
+    unknown_motion: float = physics(
+        0.25, "The part of the motion in a gap that fields leave room for if no speed is given"
+    )
+    intervals: float = size(2.0, "Colour is warped from key frames up to this many intervals of theirs away")
+    neighbours: int = size(4, "Radiometry is normalised over this many key frames before and after")
+    floor: float = size(1e-3, "The confidence that every source has at least when colours are mixed")
+    disagreement: float = tuned(
+        0.1, "Source not recorded: where sources' colours are this far apart, confidence falls to 1 / e"
+    )
+
+
+SETTINGS = SequenceSettings()
 
 
 class KeyColour(NamedTuple):
@@ -135,12 +147,12 @@ class SequenceFusion:
     def _around(self, i: int, keys: Sequence[KeyFrame]) -> list[KeyFrame]:
         """The key frames within reach, or the nearest one."""
         gaps = {k.alpha: abs(self._time(k.alpha) - self._time(i)) for k in keys}
-        disparity = max(INTERVALS * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
+        disparity = max(SETTINGS.intervals * self.timeline.interval * (1 - 1e-9), min(gaps.values()))
         return [k for k in keys if gaps[k.alpha] <= disparity]
 
     def _warped(self, i: int, own: Tensor, key: KeyFrame, colour: KeyColour) -> KeyContribution:
         gap = abs(self._time(key.alpha) - self._time(i))
-        nearness = max(1 - gap / (INTERVALS * self.timeline.interval), 1e-3)
+        nearness = max(1 - gap / (SETTINGS.intervals * self.timeline.interval), 1e-3)
         if key.alpha == i:
             return KeyContribution(nearness, *colour)
         LOG.info("motion of frame %d", i)
@@ -157,7 +169,7 @@ class SequenceFusion:
         weight = torch.ones(self.rig[self.alpha].hw)
         steps = (time - self._time(index)) * self.timeline.rate(self.alpha)
         count = len(self.frames[self.alpha])
-        if abs(steps) < SYNCHRONOUS or count < 2:
+        if abs(steps) < SETTINGS.synchronous or count < 2:
             return field, weight
         other = min(max(index + (round(steps) or (1 if steps > 0 else -1)), 0), count - 1)
         other = other if other != index else index - (1 if steps > 0 else -1)
@@ -169,7 +181,7 @@ class SequenceFusion:
     def _room(self, step: Tensor, gap: float) -> float:
         if self.speed is not None:
             return self.speed * abs(gap)
-        return UNKNOWN_MOTION * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
+        return SETTINGS.unknown_motion * float(step.norm(dim=0).flatten()[::16].quantile(0.995))
 
     def _fused(
         self, i: int, betas: Mapping[str, int], fields: Mapping[str, ReceptiveField], *, alone: bool = False
@@ -234,7 +246,7 @@ class SequenceFusion:
 
     def _found_at(self, key: KeyFrame) -> Corrections:
         gaps = (self._time(key.alpha) - self.timeline.time(name, j) for name, j in key.betas.items())
-        together = all(abs(gap) * self.timeline.rate(self.alpha) < SYNCHRONOUS for gap in gaps)
+        together = all(abs(gap) * self.timeline.rate(self.alpha) < SETTINGS.synchronous for gap in gaps)
         return corrections_of(
             self.network,
             self.rig,
@@ -252,10 +264,9 @@ class SequenceFusion:
         """Beta's image with alpha's mean and deviation over several key frames, so that it does not flicker."""
         keys = self.timeline.key_frames()
         nearest = min(range(len(keys)), key=lambda k: abs(keys[k].alpha - i))
-        around = keys[max(nearest - NEIGHBOURS, 0) : nearest + NEIGHBOURS + 1]
-        wanted = torch.tensor([_levels(self.grey(k.alpha)) for k in around]).mean(0)
-        mean, deviation = torch.tensor([_levels(self.frames[name][k.betas[name]]) for k in around]).mean(0)
-        return (image - mean) / deviation.clamp(min=1e-6) * wanted[1] + wanted[0]
+        around = keys[max(nearest - SETTINGS.neighbours, 0) : nearest + SETTINGS.neighbours + 1]
+        own = mean_moments([self.frames[name][k.betas[name]] for k in around])
+        return own.matched(image, mean_moments([self.grey(k.alpha) for k in around]))
 
 
 class KeyContribution(NamedTuple):
@@ -267,18 +278,12 @@ class KeyContribution(NamedTuple):
     inverse_depth: Tensor
 
 
-FLOOR = 1e-3
-"""The confidence that every source has at least when colours are mixed."""
-DISAGREEMENT = 0.1
-"""Where sources' colours are this far apart, confidence falls to 1 / e."""
-
-
 def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Frame:
     """Alpha's frame with the sources' colours, weighted by nearness in time and confidence.
 
     Confidence is the sources' own weighted mean, lowered where sources that are weighed about the same disagree.
     """
-    weights = torch.stack([s.nearness * (s.confidence + FLOOR) for s in sources])
+    weights = torch.stack([s.nearness * (s.confidence + SETTINGS.floor) for s in sources])
     share = (weights / weights.sum(0))[:, None]
     added = torch.stack([s.added for s in sources])
     colour = (share * added).sum(0)
@@ -288,7 +293,7 @@ def mixed(own: Float[Tensor, "1 h w"], sources: Sequence[KeyContribution]) -> Fr
     weights = torch.where(known, weights, 0.0)
     inverse = (weights * torch.stack([s.inverse_depth for s in sources])).sum(0) / weights.sum(0).clamp(min=1e-12)
     depth = torch.where(known.any(0), 1 / torch.where(known.any(0), inverse, 1.0), torch.nan)
-    return Frame(own + colour, depth, confidence * torch.exp(-apart / DISAGREEMENT**2))
+    return Frame(own + colour, depth, confidence * torch.exp(-apart / SETTINGS.disagreement**2))
 
 
 def fuse_sequence(
@@ -325,7 +330,7 @@ def fuse_sequence(
     )
     keys = job.timeline.key_frames()
 
-    @lru_cache(maxsize=2 * int(INTERVALS) + 1)
+    @lru_cache(maxsize=2 * int(SETTINGS.intervals) + 1)
     def colour(number: int) -> KeyColour:
         return job.colour(keys[number])
 
@@ -346,8 +351,3 @@ def flicker(images: Sequence[Float[Tensor, "3 h w"]], greys: Sequence[Float[Tens
         change = (to_luma_chroma(b)[1] - to_luma_chroma(a)[1]).abs().mean(0)
         changes.append(float(change[still(grey_a, grey_b)].mean()))
     return sum(changes) / len(changes)
-
-
-def _levels(image: Tensor) -> tuple[float, float]:
-    """Mean and standard deviation."""
-    return float(image.mean()), float(image.std())

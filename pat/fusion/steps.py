@@ -38,6 +38,7 @@ from arraygeom.pixels import coarse_grid, map_homogeneous, shift_matrix
 from arraygeom.undistortion import pixels_between, sampled_between
 
 from ..matching.inputs import box_around, ends_of
+from ..matching.normalisation import normalised
 from ..media.images import Images
 from ..media.raw import LIGHT, as_bright
 from ..networks.protocol import FusionNetwork, JoinsBands
@@ -253,11 +254,6 @@ def _distorted(frame: Frame, straight: Tensor, own: Tensor, pinhole: View, lens:
     back = sampled_between(torch.cat([added, frame.confidence[None]]), pinhole, where, "bilinear").values[0]
     depth = 1 / sampled_between(inverse[None], pinhole, where, "nearest").values[0, 0]
     return Frame(own + back[:-1], torch.where(depth.isfinite(), depth, torch.nan), back[-1])
-
-
-def normalised(image: Float[Tensor, "*b h w"], like: Float[Tensor, "*c ha wa"]) -> Float[Tensor, "*b h w"]:
-    """The image with the mean and the standard deviation of another; not cut to 0..1."""
-    return (image - image.mean()) / image.std().clamp(min=1e-6) * like.std() + like.mean()
 
 
 def _resized(views: Views, name: str) -> Views:

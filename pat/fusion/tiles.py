@@ -15,12 +15,11 @@ from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from arraygeom import pixel_grid
-from arraygeom.chunks import Box, Tile, area, assembled, tiles_of, whole
+from arraygeom.chunks import Box, Tile, area, assembled, sides_by_work, tiles_of, whole
 from arraygeom.pixels import HW
 
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
-from ..matching.pieces import matching_pieces, sides_by_work
 from ..networks.protocol import FusionNetwork, FusionOutput, matched_for
 from ..support.tensor_files import write_tensors
 from .depth import depth_and_confidence
@@ -86,7 +85,7 @@ def plan_frame(
     the caller holds beside the frame.
     Raises ValueError as `tiles_within`.
     """
-    pieces = matching_pieces(frame.hw, network.multiple)
+    pieces = frame.inputs.pieces
     large = math.prod(frame.hw) > 16 * PROBE[0] ** 2
     slow = math.prod(frame.hw) > ESTIMATED
     probe = Probe.of(network, frame) if (large and limit) or (slow and estimate) else None

@@ -1,8 +1,9 @@
-"""How far beta's points lie across their search segments: a camera that has moved a little since its calibration.
+"""How far beta's points lie across their search segments: a camera that has moved a little since its
+calibration.
 
-The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the optical
-axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade 1981), each
-freed of what it is off along its segment.
+The displacement across the segments is modelled as affine in alpha's pixels: a shift, a rotation about the
+optical axis, another angle of view. It is fitted robustly to displacements of small windows (Lucas and Kanade
+1981), each freed of what it is off along its segment.
 """
 
 from __future__ import annotations
@@ -20,34 +21,30 @@ from torch import Tensor
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
+from arraygeom.robust import cauchy, normal_deviation, robust_least_squares
 
+from ..support.settings import size, tuned
 from .semi_global import along
 
 Image = NDArray[Any]
 
 
-class AlignmentSettings(NamedTuple):
-    """Constants of the fit, in pixels of the images it is given; chosen on the pairs that `ResponseSettings` names.
+@dataclass(frozen=True)
+class AlignmentSettings:
+    """Lengths are in pixels of the images that are given, brightness is 0 to 1. Middlebury is its tune half."""
 
-    blur: standard deviation of the blur before gradients.
-    radius: of the windows.
-    steps: Gauss-Newton steps at most; a step below `finest` ends them.
-    contrast: mean squared gradient of a window that counts half.
-    farthest: a window's displacement in one step is at most this.
-    least: largest displacement of a pixel below which the rig is taken to be right.
-    better: residual with the displacement over that without, up to which it is accepted.
-    windows: fewest windows with texture.
-    """
-
-    blur: float = 1.5
-    radius: int = 7
-    steps: int = 6
-    finest: float = 5e-3
-    contrast: float = 2e-5
-    farthest: float = 2.0
-    least: float = 0.2
-    better: float = 0.98
-    windows: int = 50
+    blur: float = tuned(1.5, "Middlebury: standard deviation of the blur before gradients")
+    radius: int = tuned(7, "Middlebury: of the windows, to either side")
+    steps: int = size(6, "Gauss-Newton steps at most")
+    finest: float = size(5e-3, "A step below this ends them")
+    contrast: float = tuned(2e-5, "Middlebury: mean squared gradient of a window that counts half")
+    farthest: float = size(2.0, "A window's displacement in one step is at most this")
+    deviation: float = size(0.05, "The standard deviation of windows' displacements about the plane, at least")
+    least: float = tuned(0.2, "Middlebury: largest displacement of a pixel below which the rig is taken to be right")
+    better: float = tuned(
+        0.98, "Middlebury: residual with the displacement over that without, up to which it is accepted"
+    )
+    windows: int = size(50, "Fewest windows with texture")
 
 
 SETTINGS = AlignmentSettings()
@@ -57,8 +54,9 @@ SETTINGS = AlignmentSettings()
 class Misalignment:
     """The displacement across the segments, in widths of alpha: `shift` + `across` u + `down` v.
 
-    (u, v) is a pixel's place from the middle of alpha, in widths of alpha. Beta has about alpha's angular resolution.
-    Across is where along the segment from its end, turned by a right angle from x towards y, points.
+    (u, v) is a pixel's place from the middle of alpha, in widths of alpha. Beta has about alpha's angular
+    resolution. Across is where along the segment from its end, turned by a right angle from x towards y,
+    points.
     """
 
     shift: float = 0.0
@@ -103,7 +101,8 @@ def fit_misalignment(
 ) -> Misalignment:
     """How far across its segments beta is, from matches; none if that explains the images hardly better.
 
-    `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is 0 to 1.
+    `alpha` and `beta` are of equal brightness and sharpness; `position` are the matches in beta, `weight` is
+    0 to 1.
     """
     own, other, where, across, counts = (
         t.detach().cpu().float().numpy() for t in (alpha, beta, position, normal, weight)
@@ -191,15 +190,17 @@ class _Windows(NamedTuple):
         found = towards[some][useful] / (strength[some][useful] + self.settings.contrast / 10)
         counts = strength[some][useful] / (strength[some][useful] + self.settings.contrast)
         limit = self.settings.farthest
-        return _robust_plane(self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts)
+        return _robust_plane(
+            self.design[:, ::4, ::4][:, useful], np.clip(found, -limit, limit), counts, self.settings.deviation
+        )
 
 
-def _robust_plane(design: NDArray, values: NDArray, weight: NDArray) -> NDArray[np.float64]:
-    """Weighted least squares with Cauchy's weights."""
-    found = np.zeros(len(design))
-    for _ in range(8):
-        rest = values - found @ design
-        deviation = max(1.4826 * float(np.median(np.abs(rest))), 0.05)
-        counts = weight / (1 + np.square(rest / (2 * deviation)))
-        found = np.linalg.solve((design * counts) @ design.T + 1e-3 * np.eye(len(design)), (design * counts) @ values)
-    return found
+def _robust_plane(design: NDArray, values: NDArray, weight: NDArray, least: float) -> NDArray[np.float64]:
+    """Weighted least squares with Cauchy's weights; the deviation is at least this."""
+    terms, wanted, counts = (torch.from_numpy(x).double() for x in (design, values, weight))
+
+    def weigh(rest: Tensor) -> Tensor:
+        return counts * cauchy(rest, 2 * normal_deviation(rest, least))
+
+    eye = torch.eye(len(terms), dtype=torch.float64)
+    return robust_least_squares(terms, wanted, 0 * eye[0], weigh, precision=1e-3 * eye).coefficients.numpy()

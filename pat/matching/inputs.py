@@ -2,18 +2,33 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from arraygeom import Positions, Segments
-from arraygeom.chunks import Box
+from arraygeom.chunks import Box, Tile, assembled, sides_by_work, tiles_of, whole
 from arraygeom.epipolar import Track
 from arraygeom.fields.grid import FieldOnGrid
 from arraygeom.pixels import HW
+
+from ..support.settings import size
+
+
+@dataclass(frozen=True)
+class InputsSettings:
+    """Of the pieces in which large frames are matched at full size, the same whatever memory is allowed."""
+
+    halo: int = size(128, "Their halo, pixels")
+    at_once: int = size(1_600_000, "Pixels of alpha matched at once")
+
+
+SETTINGS = InputsSettings()
 
 
 @dataclass(frozen=True)
@@ -61,6 +76,30 @@ class Inputs:
     def nbytes(self) -> int:
         """Memory of images and fields."""
         return self.alpha.nbytes + sum(beta.image.nbytes + beta.field.nbytes for beta in self.betas)
+
+    @property
+    def pieces(self) -> list[Tile]:
+        """The pieces in which a frame is matched: one, or those with the least work of a size that fits into memory
+        (`InputsSettings`)."""
+        if math.prod(self.hw) <= SETTINGS.at_once:
+            return [whole(self.hw)]
+        sides = sides_by_work(self.hw, SETTINGS.halo, self.multiple, SETTINGS.at_once)
+        return list(tiles_of(self.hw, sides[0], SETTINGS.halo))
+
+    def in_pieces(self, make: Callable[[Box], Any]) -> Any:
+        """Planes (..., h, w), or several, put together from what is made of each piece, by its box."""
+        return assembled(self.hw, ((piece, make(piece.outer)) for piece in self.pieces))
+
+    def part(self, box: Box) -> Inputs:
+        """A part of alpha as `cut` gives it; of the whole, these inputs."""
+        return self if box == whole(self.hw).outer else self.cut(box)
+
+    @property
+    def can_agree(self) -> bool:
+        """Whether there are several betas, all calibrated and with straight fields, of one frame."""
+        fields = [beta.field.pixels for beta in self.betas]
+        one = len(self.alpha) == 1 and all(field is not None and len(field.valid) == 1 for field in fields)
+        return len(fields) > 1 and one and all(beta.track is not None for beta in self.betas)
 
     def shows_all_bands(self, beta: Beta) -> bool:
         """Whether the beta is one of several of which some show all bands of the result, and shows them."""

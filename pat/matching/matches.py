@@ -13,8 +13,9 @@ from arraygeom.pixels import HW
 from arraygeom.sampling import on_image
 
 from ..media.colour import luminance
-from .semi_global import FINE, Normalisations, matches
-from .spectral_mix import SpectralMix
+from .normalisation import Normalisations
+from .radiometry import SpectralMix
+from .semi_global import FINE, matches
 
 
 @dataclass(frozen=True)

@@ -21,13 +21,13 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, depth_from_track, pixel_grid
-from arraygeom.chunks import Box, assembled, spans
+from arraygeom.chunks import Box, spans
 from arraygeom.epipolar import FRONT, Track
 
 from ..media.colour import to_bytes
+from ..support.settings import size, tuned
 from .inputs import Beta, Inputs
 from .matches import BetaMatches, Matches
-from .pieces import matching_pieces
 from .semi_global import (
     CONSISTENT,
     DISPARITY_FILL,
@@ -37,22 +37,43 @@ from .semi_global import (
     filled,
 )
 
-SUPPORT = 1.5
-"""A beta supports an inverse depth that is less than this many of its pixels from its own match."""
-FARTHEST = 8.0
-"""A difference of disparities of this many half-size pixels is 1 in the facts, as in semi-global matching."""
+
+@dataclass(frozen=True)
+class MultiviewSettings:
+    """Of the agreement of several betas."""
+
+    support: float = tuned(
+        1.5,
+        "Source not recorded: a beta supports an inverse depth that is less than this many of "
+        "its pixels from its own match",
+    )
+    farthest: float = size(
+        8.0,
+        "A difference of disparities of this many half-size pixels is 1 in the facts, as in semi-global matching",
+    )
+    sampled_rows: int = size(64, "In how many pairs of alpha's rows the depths of betas are compared")
+    sampled_columns: int = size(4, "Every how many columns the depths of betas are compared")
+    trials: int = size(
+        400,
+        "Fits to four pixels each, of which that is taken with which most others agree (Fischler, Bolles 1981)",
+    )
+    more: float = tuned(
+        0.1,
+        "Nine bands and rendered arrays: by how much the share of pixels that agree has to rise "
+        "for betas' depths to be brought together: above that of the depths as they are, and above "
+        "that of a plane, which is what wrong matches and a flat background agree with",
+    )
+    parallax: float = tuned(
+        2.0,
+        "Twelve rendered arrays: the power of a beta's parallax by which the odds that its colour "
+        "is right fall: what it sees past depth's edges, and how far a wrong depth displaces it, "
+        "grow with parallax",
+    )
 
 
-SAMPLED_ROWS, SAMPLED_COLUMNS = 64, 4
-"""In how many pairs of alpha's rows, and every how many columns, the depths of betas are compared."""
-TRIALS = 400
-"""Fits to four pixels each, of which that is taken with which most others agree (Fischler, Bolles 1981)."""
-MORE = 0.1
-"""By how much the share of pixels that agree has to rise for betas' depths to be brought together: above that of the
-depths as they are, and above that of a plane, which is what wrong matches and a flat background agree with."""
-PARALLAX = 2.0
-"""The power of a beta's parallax by which the odds that its colour is right fall: what it sees past depth's edges, and
-how far a wrong depth displaces it, grow with parallax."""
+SETTINGS = MultiviewSettings()
+
+
 STRIP = 1 << 16
 """Alpha's pixels that are compared at a time, in rows: what is computed on the way stays in a core's cache."""
 
@@ -158,20 +179,11 @@ class MatchedBeta:
         return torch.where(inside, row * columns + column, rows * columns)
 
 
-def priors(inputs: Inputs) -> tuple[float, ...]:
+def _priors(inputs: Inputs) -> tuple[float, ...]:
     """Of each beta, by its parallax: the length of its segments that is exceeded by a tenth."""
     straight = [beta.field.straight[:, ::8, ::8] for beta in inputs.betas]
     lengths = [float(torch.where(s.valid, s.length, 0.0).flatten().float().quantile(0.9)) for s in straight]
-    return tuple(PARALLAX * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
-
-
-def can_agree(inputs: Inputs) -> bool:
-    """Whether there are several betas, all calibrated and with straight fields, of one frame."""
-    betas = inputs.betas
-    one = len(inputs.alpha) == 1 and all(
-        b.field.pixels is not None and b.field.pixels.valid.shape[0] == 1 for b in betas
-    )
-    return len(betas) > 1 and one and all(beta.track is not None for beta in betas)
+    return tuple(SETTINGS.parallax * math.log((min(lengths) + 1) / (length + 1)) for length in lengths)
 
 
 class Agreement(NamedTuple):
@@ -216,16 +228,17 @@ def agreed(inputs: Inputs, matches: Matches) -> Matches:
     parts = [Agreement.of([at(i, rows) for i in betas], inputs.alpha) for rows in strips]
     agreement = _dense(Agreement(*(torch.cat(planes, 1) for planes in zip(*parts))), inputs)
     del parts
-    return Matches(tuple(_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas))
+    agreeing = (_of_beta(partial(at, i), agreement, strips, found[i]) for i in betas)
+    return Matches(tuple(replace(one, prior=prior) for one, prior in zip(agreeing, _priors(inputs))))
 
 
 def ambiguities(inputs: Inputs, found: Sequence[BetaMatches]) -> list[Ambiguity]:
     """Of each beta against the one whose matches tell most: none, unless clearly more pixels agree with one."""
-    step = max(inputs.hw[0] // SAMPLED_ROWS // FINE, 1) * FINE
+    step = max(inputs.hw[0] // SETTINGS.sampled_rows // FINE, 1) * FINE
     rows = [(top, top + FINE) for top in range(0, inputs.hw[0], step)]
     sampled = [_Sampled.of(inputs.betas[i], found[i], rows) for i in range(len(found))]
     reference = max(sampled, key=lambda one: float((one.known * one.pixels_per_w).sum()))
-    columns = torch.arange(0, inputs.hw[1], SAMPLED_COLUMNS).to(reference.w)
+    columns = torch.arange(0, inputs.hw[1], SETTINGS.sampled_columns).to(reference.w)
     y, x = torch.meshgrid(
         reference.w.new_tensor([row for pair in rows for row in range(*pair)]), columns, indexing="ij"
     )
@@ -248,14 +261,14 @@ class _Sampled(NamedTuple):
             w, known = view.inverse_depth
             little = 1e-3 * w + 1e-9
             rise = (view.disparity_of(w + little) - view.disparity_of(w)).abs() / little
-            parts.append([plane[:, ::SAMPLED_COLUMNS] for plane in (w, known, rise)])
+            parts.append([plane[:, :: SETTINGS.sampled_columns] for plane in (w, known, rise)])
         return cls(*(torch.cat(planes) for planes in zip(*parts)))
 
     def against(self, other: _Sampled, x: Tensor, y: Tensor) -> Ambiguity:
         """The ambiguity with which most pixels agree."""
         both = self.known & other.known
         own, w, rise, x, y = (plane[both] for plane in (self.w, other.w, self.pixels_per_w, x, y))
-        if len(own) < SAMPLED_ROWS:
+        if len(own) < SETTINGS.sampled_rows:
             return NO_AMBIGUITY
         terms = torch.stack([w, x, y, torch.ones_like(x)], -1)
 
@@ -264,7 +277,7 @@ class _Sampled(NamedTuple):
 
         best, flat = _most_agreed(terms, own, rise), _most_agreed(terms[:, 1:], own, rise)
         without = max(share(torch.eye(4)[0].to(own)), share(torch.cat([torch.zeros_like(flat[:1]), flat])))
-        if best[0] <= 0 or share(best) < without + MORE:
+        if best[0] <= 0 or share(best) < without + SETTINGS.more:
             return NO_AMBIGUITY
         scale, *plane = best.tolist()
         return Ambiguity(scale, (plane[0], plane[1], plane[2]))
@@ -275,7 +288,7 @@ def _most_agreed(terms: Float[Tensor, "n k"], own: Float[Tensor, " n"], rise: Te
     n, k = terms.shape
     size = terms.abs().amax(0).clamp(min=1e-12)
     scaled = terms / size
-    some = torch.randint(n, (TRIALS, k), generator=torch.Generator().manual_seed(0)).to(own.device)
+    some = torch.randint(n, (SETTINGS.trials, k), generator=torch.Generator().manual_seed(0)).to(own.device)
     trials, _ = torch.linalg.solve_ex(scaled[some], own[some])
     trials = torch.where(trials.isfinite().all(1, keepdim=True), trials, 0.0).T
     best = trials[:, _agree(scaled, own, rise, trials).sum(0).argmax()][:, None]
@@ -286,8 +299,8 @@ def _most_agreed(terms: Float[Tensor, "n k"], own: Float[Tensor, " n"], rise: Te
 
 
 def _agree(terms: Tensor, own: Tensor, rise: Tensor, solutions: Float[Tensor, "k m"]) -> Float[Tensor, "n m"]:
-    """1 where a solution is less than `SUPPORT` pixels from what is measured."""
-    return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < SUPPORT).to(own)
+    """1 where a solution is less than `SETTINGS.support` pixels from what is measured."""
+    return ((terms @ solutions - own[:, None]).abs() * rise[:, None] < SETTINGS.support).to(own)
 
 
 def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
@@ -301,9 +314,7 @@ def _dense(agreement: Agreement, inputs: Inputs) -> Agreement:
         median = cv2.medianBlur(np.where(known, plane, smooth)[0], 5)
         return torch.from_numpy(median)[None].to(inputs.alpha)
 
-    pieces = matching_pieces(inputs.hw, inputs.multiple)
-    inverse_depth = assembled(inputs.hw, ((piece, of(piece.outer)) for piece in pieces))
-    return agreement._replace(inverse_depth=inverse_depth)
+    return agreement._replace(inverse_depth=inputs.in_pieces(of))
 
 
 def _of_beta(
@@ -321,7 +332,7 @@ def _of_beta(
         view, half = at((top, bottom)), slice(top // FINE, bottom // FINE)
         inverse_depth = agreement.inverse_depth[0, top:bottom].to(buffer)
         disparity[0, 0, top:bottom] = view.disparity_of(inverse_depth).clamp(min=0).minimum(view.extent.length)
-        unlike = (view.hidden(inverse_depth, buffer) / (FINE * FARTHEST)).clamp(0, 1)
+        unlike = (view.hidden(inverse_depth, buffer) / (FINE * SETTINGS.farthest)).clamp(0, 1)
         unlike = torch.where(agreement.known[0, top:bottom], unlike, 1.0)
         facts[0, :1, half] = avg_pool2d(unlike[None], FINE)
         facts[0, 1:, half] = agreement.facts[:, half]
@@ -330,4 +341,4 @@ def _of_beta(
 
 def _supported(views: Sequence[MatchedBeta], weights: Tensor, inverse_depth: Tensor) -> Float[Tensor, "betas h w"]:
     """The weights of the betas whose matches are near a proposed inverse depth."""
-    return torch.stack([w * (view.differs(inverse_depth) < SUPPORT) for view, w in zip(views, weights)])
+    return torch.stack([w * (view.differs(inverse_depth) < SETTINGS.support) for view, w in zip(views, weights)])

@@ -1,75 +1,128 @@
-"""Alpha's spectral response and tone curve relative to a colour beta, fitted to matches.
+"""Which combination of beta's bands alpha sees: of RGB (`Response`), and of any bands (`SpectralMix`).
 
-The network compares alpha with Rec. 601 luma of beta and keeps alpha as the result's luma. A real mono sensor weighs
-red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter. Here alpha is explained
-as weights . (gain * beta^gamma) over points that match, and beta is mapped so that its luma is that: scaled, raised to
-the power, and sheared along grey, so that neutral stays neutral. The fused image is sheared back.
+The network compares alpha with Rec. 601 luma of an RGB beta and keeps alpha as the result's luma. A real mono
+sensor weighs red, green and blue otherwise, and another exposure or tone curve makes beta darker or flatter.
+There alpha is explained as weights . (gain * beta^gamma) over points that match, and beta is mapped so that
+its luma is that: scaled, raised to the power, and sheared along grey, so that neutral stays neutral. The
+fused image is sheared back.
+
+Of other bands alpha is explained as offset + weights . beta around each pixel, and how alpha's detail adds to
+each is found too. All sums over such bands are of sorted summands, so that their order cannot matter at all.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from arraygeom import pixel_grid
+from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
 
 from ..media.colour import REC601
+from ..support.settings import size, tuned
+from .normalisation import box_mean
 
 GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
 
 
-class ResponseSettings(NamedTuple):
-    """Constants of the fit, chosen on Middlebury's Bowling1 and 2, Cloth1, 2 and 4, Flowerpots, Midd1, Plastic, Wood1.
+@dataclass(frozen=True)
+class ResponseSettings:
+    """Middlebury is the nine pairs of its tune half.
 
-    usual: weights of a usual sensor, when it is not Rec. 601's; prior: their standard deviation about these.
-    independent: how many independent observations all points count as: about as many as there are materials.
-    error: standard deviation of one of those, at least: light and surfaces differ between the views.
-    outlier: residuals of this many robust deviations count half.
-    points: pixels used at most, and the fewest that are enough.
-    unlikely: by how much another gain, other weights, and both together must lower the misfit (a sum of squares over
-        independent observations, in standard deviations) to be taken. In a scene of one hue several explain alpha.
-    negative: standard deviation of negative weights.
-    sensor: weights of an unfiltered sensor, which sees more blue than Rec. 601.
-    light: logarithm of a gain up to which light that differs between the views may be its cause: where a sensor might,
-        and where none would.
-    greenest: share of green beyond which weights are of no sensor, if they have less blue than Rec. 601's, and alpha is
-        brighter than luma where an unfiltered sensor would be darker, or the other way round: that is light too.
-    alike: a gain explains alpha as well as weights do if its misfit is up to this much larger.
-    equal_weights: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to be taken in
-        their place: a sensor without filters. Light may differ between the views by a gain of this standard deviation.
-    least_change: root mean square change of luma up to which the weights are left at Rec. 601's.
-    equal: the error over the least one up to which a gamma explains alpha as well.
-    better: the error with another gamma than 1, or with vignetting, over that without, up to which it is taken.
-    shading: logarithm of vignetting below which, at the points, there is none; above which, in a corner, there is none.
-    explained: share of alpha's variance that must be explained.
+    A misfit is a sum of squares over independent observations, in standard deviations. In a scene of one hue
+    several responses explain alpha.
     """
 
-    usual: tuple[float, float, float] = (0.32, 0.48, 0.20)
-    prior: float = 0.2
-    independent: float = 20.0
-    error: float = 0.012
-    outlier: float = 2.0
-    points: tuple[int, int] = (6000, 300)
-    unlikely: tuple[float, float, float] = (22.0, 12.0, 45.0)
-    negative: float = 0.05
-    sensor: tuple[float, float, float] = (0.33, 0.39, 0.28)
-    light: tuple[float, float] = (0.035, 0.12)
-    greenest: float = 0.62
-    alike: float = 2.0
-    equal_weights: tuple[float, float] = (8.0, 0.006)
-    least_change: float = 0.01
-    equal: float = 1.1
-    better: float = 0.8
-    shading: tuple[float, float] = (0.08, 0.7)
-    explained: float = 0.5
+    usual: tuple[float, float, float] = tuned(
+        (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
+    )
+    prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
+    independent: float = tuned(
+        20.0,
+        "Middlebury: as how many independent observations all points count: about as many as there are materials",
+    )
+    error: float = tuned(
+        0.012,
+        "Middlebury: standard deviation of one of those, at least: light and surfaces differ between the views",
+    )
+    outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
+    points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
+    gammas: tuple[float, ...] = size(GAMMAS, "Gammas that are tried")
+    unlikely: tuple[float, float, float] = tuned(
+        (22.0, 12.0, 45.0),
+        "Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken",
+    )
+    light: tuple[float, float] = tuned(
+        (0.035, 0.12),
+        "Middlebury: logarithm of a gain up to which light that differs between the views may be its cause: "
+        "where a sensor might, and where none would",
+    )
+    greenest: float = tuned(
+        0.62,
+        "Middlebury: share of green beyond which weights are of no sensor, if they have less blue than Rec. "
+        "601's, and alpha is brighter than luma where an unfiltered sensor would be darker, or the other "
+        "way round: that is light too",
+    )
+    equal_weights: float = tuned(
+        8.0,
+        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to "
+        "be taken in their place: a sensor without filters",
+    )
+    equal: float = tuned(1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well")
+    better: float = tuned(
+        0.8,
+        "Middlebury: the error with another gamma than 1, or with vignetting, over that without, to be taken",
+    )
+    shading: tuple[float, float] = tuned(
+        (0.08, 0.7),
+        "Middlebury: logarithm of vignetting below which, at the points, there is none; above which, in a "
+        "corner, no lens is",
+    )
+    explained: float = tuned(0.5, "Middlebury: share of alpha's variance that must be explained")
+
+
+@dataclass(frozen=True)
+class MixSettings:
+    """Brightness is 0 to 1."""
+
+    outlier: float = tuned(
+        0.06,
+        "Source not recorded: difference from alpha at which a match counts 1 / e in the second of two fits",
+    )
+    equal: float = size(
+        1e-4, "How strongly the combination is drawn to one of equal parts: share of the bands' mean variance"
+    )
+    misfit: float = tuned(
+        0.016,
+        "Source not recorded: difference from alpha, averaged over `smooth` pixels to either side, at which "
+        "the combination counts half",
+    )
+    smooth: int = size(4, "See `misfit`")
+    alike: float = tuned(
+        0.08,
+        "Source not recorded: where the combination's black and white are so near to alpha's, black is "
+        "taken for black and white for white, and the difference for that of two exposures",
+    )
+    diluted: float = tuned(
+        0.8,
+        "Source not recorded: wrong matches make least squares' weights too small; they are enlarged until "
+        "the combination varies as much as alpha, as if no less than this share of alpha's variance were "
+        "explained",
+    )
+    wide: int = size(
+        4, "Bands are compared with alpha within squares whose radius is the image's longer side over this"
+    )
 
 
 SETTINGS = ResponseSettings()
+MIX_SETTINGS = MixSettings()
 
 
 class Response(NamedTuple):
@@ -77,7 +130,8 @@ class Response(NamedTuple):
 
     The weights' sum is 1, where they are not stated otherwise.
     explained: the share of alpha's variance at the matches that this explains, 0 to 1.
-    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none without.
+    shading: coefficients of `_shading_terms` in the logarithm of a gain that beta's vignetting asks for; none
+        without.
     """
 
     weights: Float[Tensor, "3"]
@@ -135,7 +189,8 @@ Given = Literal["fit", "rec601"] | tuple[float, float, float] | Response
 
 
 def stated_response(weights: Sequence[float]) -> Response:
-    """The response of an alpha that is weights . beta. Raises ValueError unless these are three, none negative."""
+    """The response of an alpha that is weights . beta. Raises ValueError unless these are three, none
+    negative."""
     values = torch.tensor([float(w) for w in weights], dtype=torch.float64)
     if values.shape != (3,) or not bool((values >= 0).all() & (values.sum() > 0) & values.isfinite().all()):
         raise ValueError(f"a response is three weights, of red, green and blue, none negative; got {tuple(weights)}")
@@ -150,8 +205,8 @@ def fit(
 ) -> Response:
     """The response by robust least squares over points: the most plausible of those that explain alpha.
 
-    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found too. Rec.
-    601's where there are too few points, or where a combination of bands does not explain alpha.
+    `where` are the points in beta, in its width and height, from its middle: with them vignetting is found
+    too. Rec. 601's where there are too few points, or where a combination of bands does not explain alpha.
     """
     most, fewest = settings.points
     step = max(alpha.numel() // most, 1)
@@ -174,14 +229,26 @@ def fit(
     return _decided(x**gamma, y, gamma, found, settings)[1]._replace(shading=shading)
 
 
+class _Fit(NamedTuple):
+    """`counts` is what the square of each point's residual counts, in 1 / variance of independent
+    observations."""
+
+    weights: Float[Tensor, "3"]
+    counts: Float[Tensor, " n"]
+    error: float
+    explained: float
+
+
 def _best_gamma(x: Tensor, y: Tensor, settings: ResponseSettings) -> tuple[float, _Fit]:
-    """1, or the gamma that explains alpha clearly better; of several the one with the most plausible response."""
-    trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in GAMMAS}
+    """1, or the gamma that explains alpha clearly better; of several the one with the most plausible
+    response."""
+    trials = {gamma: _weighted_fit(x**gamma, y, settings) for gamma in settings.gammas}
     least = min(trial.error for trial in trials.values())
     if least > settings.better * trials[1.0].error:
         return 1.0, trials[1.0]
     equal = {gamma: trial for gamma, trial in trials.items() if trial.error <= settings.equal * least}
-    equal[1.0] = trials[1.0]._replace(deviation=min(trial.deviation for trial in equal.values()))
+    linear, most = trials[1.0], max(float(trial.counts.sum()) for trial in equal.values())
+    equal[1.0] = linear._replace(counts=linear.counts * (most / linear.counts.sum()))
     gamma = min(equal, key=lambda g: _decided(x**g, y, g, equal[g], settings)[0])
     return gamma, trials[gamma]
 
@@ -201,113 +268,225 @@ def _plausible(slopes: Tensor, terms: Tensor, settings: ResponseSettings) -> boo
 
 
 def _shading(x: Tensor, y: Tensor, terms: Tensor, settings: ResponseSettings) -> Float[Tensor, "5"]:
-    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's weights."""
+    """Coefficients of the logarithm of alpha over what explains it, by least squares with the fit's
+    weights."""
     slopes = terms.new_zeros(len(terms))
     design = torch.cat([terms, torch.ones_like(terms[:1])])
     for _ in range(3):
         even = x * (slopes @ terms).exp()
         found = _weighted_fit(even, y, settings)
         ratio = (y / (found.weights @ even).clamp(min=0.01)).log()
-        counts = found.share * y.square()
+        counts = found.counts * y.square()
         ridge = 1e-4 * counts.sum() * torch.eye(len(design)).to(y)
-        slopes = slopes + torch.linalg.solve((design * counts) @ design.T + ridge, (design * counts) @ ratio)[:-1]
+        slopes = slopes + least_squares(design, ratio, counts, ridge)[:-1]
     return slopes
-
-
-class _Fit(NamedTuple):
-    """`share` is what each point counts, 0 to 1; `deviation` the robust standard deviation of what is not explained."""
-
-    weights: Tensor
-    share: Tensor
-    deviation: float
-    error: float
-    explained: float
-
-
-def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
-    """The most plausible of four explanations of alpha, and its misfit.
-
-    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit, and what
-    each must gain to be taken decides.
-    """
-    rec601, usual, sensor = Response.rec601().weights, x.new_tensor(settings.usual), x.new_tensor(settings.sensor)
-    luma, grey, hues = rec601 @ x, usual @ x, CHANGES.T @ x
-    counts = found.share * _importance(found.share, found.deviation, settings)
-    precision = CHANGES.T @ CHANGES / settings.prior**2
-    scale = float(found.weights.sum())
-
-    def explained(rest: Tensor, design: Tensor, *precisions: Tensor) -> tuple[float, Tensor]:
-        prior = torch.block_diag(*precisions)
-        values = torch.linalg.solve((design * counts) @ design.T + prior, (design * counts) @ rest)
-        return float(counts @ (rest - values @ design).square() + values @ prior @ values), values
-
-    def or_equal(weights: Tensor, gain: float) -> tuple[Tensor, float]:
-        """1/3 of each band with the gain that fits best, if they explain alpha about as well as these weights."""
-        more, deviation = settings.equal_weights
-        precision = x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
-        equal = torch.full_like(weights, 1 / 3)
-        shades = [gain * (w @ x) for w in (weights, equal)]
-        (misfit, _), (of_equal, (light,)) = (explained(y - shade, shade[None], precision) for shade in shades)
-        if of_equal > misfit + more:
-            return weights, gain
-        return equal, gain if gain == 1 else gain * (1 + float(light))
-
-    def negative(weights: Tensor) -> float:
-        return float((weights.clamp(max=0) / settings.negative).square().sum())
-
-    only_gain, (gain,) = explained(y, luma[None], x.new_zeros(1, 1))
-    only_weights, change = explained(y - grey, hues, precision)
-    both, (total, *rest) = explained(y, torch.stack([grey, *hues]), x.new_zeros(1, 1), precision / scale**2)
-    weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
-    trials = [
-        (only_gain + settings.unlikely[0], rec601, float(gain)),
-        (both + settings.unlikely[2] + negative(further), further, float(total)),
-    ]
-    if gamma == 1:
-        trials.append((only_weights + settings.unlikely[1] + negative(weights), weights, 1.0))
-        trials.append((float(counts @ (y - luma).square()), rec601, 1.0))
-    misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    differing = float(((chosen - rec601) @ x).square().mean().sqrt())
-    unlike_sensors = float(gain - 1) * float((sensor @ x - luma) @ counts) < 0
-    light = settings.light[unlike_sensors]
-    by_light = only_gain < only_weights + settings.alike and abs(math.log(float(gain))) < light
-    no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in (weights, further))
-    by_light = by_light or (unlike_sensors and no_sensor)
-    if exposure == 1 and (differing < settings.least_change or by_light):
-        chosen = rec601
-    elif chosen is not rec601:
-        chosen, exposure = or_equal(chosen, exposure)
-    return misfit, Response(chosen, exposure, gamma, found.explained)
 
 
 CHANGES = torch.tensor([[1.0, 0.0], [0.0, 1.0], [-1.0, -1.0]], dtype=torch.float64)
 """What weights may change by while their sum stays."""
 
 
-def _importance(share: Tensor, deviation: float, settings: ResponseSettings) -> Tensor:
-    """What the square of a point's residual counts where its share is 1."""
-    return settings.independent / share.sum() / max(deviation, settings.error) ** 2
-
-
 def _weighted_fit(x: Tensor, y: Tensor, settings: ResponseSettings) -> _Fit:
-    """Weights s (usual ones + d), d's sum 0, by iteratively reweighted least squares with Cauchy's weights.
-
-    Nothing is assumed of s; d is drawn to 0.
-    """
+    """Weights s (usual ones + d), d's sum 0, robustly. Nothing is assumed of s; d is drawn to 0."""
     usual = x.new_tensor(settings.usual)
-    design = torch.stack([usual @ x, *(CHANGES.T @ x)])
-    weights, share, deviation = usual * (y.median() / (usual @ x).median()), torch.ones_like(y), 1.0
-    for _ in range(8):
-        rest = y - weights @ x
-        deviation = max(1.4826 * float(rest.abs().median()), 1e-3)
-        share = 1 / (1 + (rest / (settings.outlier * max(deviation, settings.error / 3))).square())
-        counts = share * _importance(share, deviation, settings)
-        prior = x.new_zeros(3, 3)
-        prior[1:, 1:] = CHANGES.T @ CHANGES / (settings.prior * float(weights.sum())) ** 2
-        scale, *change = torch.linalg.solve((design * counts) @ design.T + prior, (design * counts) @ y)
-        weights = scale * usual + CHANGES @ torch.stack(change)
-    rest = y - weights @ x
-    centred = y - share @ y / share.sum()
-    explained = 1 - float(share @ rest.square() / (share @ centred.square()).clamp(min=1e-12))
+    terms = torch.stack([usual @ x, *(CHANGES.T @ x)])
+    start = x.new_tensor([float(y.median() / terms[0].median()), 0.0, 0.0])
+
+    def weigh(rest: Tensor) -> Tensor:
+        deviation = normal_deviation(rest, settings.error / 3)
+        share = cauchy(rest, settings.outlier * deviation)
+        return share * (settings.independent / share.sum() / max(deviation, settings.error) ** 2)
+
+    def precision(found: Tensor) -> Tensor:
+        return torch.block_diag(x.new_zeros(1, 1), CHANGES.T @ CHANGES / (settings.prior * float(found[0])) ** 2)
+
+    (scale, *change), rest, counts = robust_least_squares(terms, y, start, weigh, precision=precision)
+    centred = y - counts @ y / counts.sum()
+    explained = 1 - float(counts @ rest.square() / (counts @ centred.square()).clamp(min=1e-12))
     error = float(torch.log1p((rest / 0.02).square()).mean())
-    return _Fit(weights, share, deviation, error, max(explained, 0.0))
+    return _Fit(scale * usual + CHANGES @ torch.stack(change), counts, error, max(explained, 0.0))
+
+
+class _Points(NamedTuple):
+    """Bands (raised to a power) and alpha at points, and what the squares of their residuals count."""
+
+    x: Float[Tensor, "3 n"]
+    y: Float[Tensor, " n"]
+    counts: Float[Tensor, " n"]
+
+    def explained(self, rest: Tensor, terms: Tensor, precision: Tensor) -> tuple[float, Tensor]:
+        """The misfit of the terms that explain a rest of alpha best, and their coefficients."""
+        found = least_squares(terms, rest, self.counts, precision)
+        return float(self.counts @ (rest - found @ terms).square() + found @ precision @ found), found
+
+    def misfit(self, shade: Tensor) -> float:
+        """That of alpha explained as it is."""
+        return float(self.counts @ (self.y - shade).square())
+
+
+def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: ResponseSettings) -> tuple[float, Response]:
+    """The most plausible of four explanations of alpha, and its misfit.
+
+    They are luma as it is, another gain, other weights of sum 1, or both. In a scene of one hue several fit,
+    and what each must gain to be taken decides.
+    """
+    points, rec601 = _Points(x, y, found.counts), Response.rec601().weights
+    usual = x.new_tensor(settings.usual)
+    grey, hues, free = usual @ x, CHANGES.T @ x, x.new_zeros(1, 1)
+    precision = CHANGES.T @ CHANGES / settings.prior**2
+    scale = float(found.weights.sum())
+    only_gain, (gain,) = points.explained(y, (rec601 @ x)[None], free)
+    only_weights, change = points.explained(y - grey, hues, precision)
+    scaled = torch.block_diag(free, precision / scale**2)
+    both, (total, *rest) = points.explained(y, torch.stack([grey, *hues]), scaled)
+    weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
+    trials = [
+        (only_gain + settings.unlikely[0], rec601, float(gain)),
+        (both + settings.unlikely[2], further, float(total)),
+    ]
+    if gamma == 1:
+        trials.append((only_weights + settings.unlikely[1], weights, 1.0))
+        trials.append((points.misfit(rec601 @ x), rec601, 1.0))
+    misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
+    as_well = only_gain < only_weights
+    if exposure == 1 and _is_light(points, float(gain), as_well, (weights, further), settings):
+        chosen = rec601
+    if chosen is not rec601:
+        chosen, exposure = _or_equal(points, chosen, exposure, settings)
+    return misfit, Response(chosen, exposure, gamma, found.explained)
+
+
+def _is_light(
+    points: _Points, gain: float, as_well: bool, weights: Sequence[Tensor], settings: ResponseSettings
+) -> bool:
+    """Whether light that differs between the views may be why other weights explain alpha better: a small
+    gain explains it as well, or no sensor has such weights."""
+    rec601, usual = Response.rec601().weights, points.x.new_tensor(settings.usual)
+    unlike_sensors = (gain - 1) * float(((usual - rec601) @ points.x) @ points.counts) < 0
+    no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in weights)
+    small = as_well and abs(math.log(gain)) < settings.light[unlike_sensors]
+    return small or (unlike_sensors and no_sensor)
+
+
+def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseSettings) -> tuple[Tensor, float]:
+    """1/3 of each band if they explain alpha about as well, with the gain that fits best unless that is 1."""
+    equal = torch.full_like(weights, 1 / 3)
+
+    def best(weights: Tensor) -> tuple[float, float]:
+        shade = weights @ points.x
+        if gain == 1:
+            return points.misfit(shade), gain
+        misfit, (factor,) = points.explained(points.y, shade[None], points.x.new_zeros(1, 1))
+        return misfit, float(factor)
+
+    (misfit, _), (of_equal, its_gain) = best(weights), best(equal)
+    return (weights, gain) if of_equal > misfit + settings.equal_weights else (equal, its_gain)
+
+
+class SpectralMix(NamedTuple):
+    """The combination of C bands that is most like alpha, for each of a batch: offset + sum of weights times
+    bands.
+
+    slopes: (B, C), by how much each band rises where the combination rises by 1 from one pixel to the next;
+        less if that explains alpha badly.
+    gain: (B), 0 to 1: how far what alpha has beyond the combination is the bands' error, and not another
+        spectrum. 0 for one band, where that cannot be known.
+    """
+
+    weights: Float[Tensor, "b c"]
+    offset: Float[Tensor, " b"]
+    slopes: Float[Tensor, "b c"]
+    gain: Float[Tensor, " b"]
+
+    @classmethod
+    def equal(cls, bands: Float[Tensor, "b c _ _"]) -> SpectralMix:
+        """The mean of the bands."""
+        ones = torch.ones(bands.shape[:2], dtype=torch.float64, device=bands.device)
+        return cls(ones / bands.shape[1], 0 * ones[:, 0], ones, 0 * ones[:, 0])
+
+    @classmethod
+    def fitted(
+        cls, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+    ) -> SpectralMix:
+        """The one most like alpha by weighted least squares, around each pixel's surroundings; twice, the
+        second time without outliers."""
+        parts = [_mix(*part) for part in zip(bands.double(), alpha.double(), weight.double())]
+        return cls(*(torch.stack(part) for part in zip(*parts)))
+
+    def of(self, bands: Float[Tensor, "b c h w"]) -> Float[Tensor, "b 1 h w"]:
+        """The combination of these bands."""
+        products = self.weights[:, :, None, None] * bands.double()
+        total = products.sort(1).values.sum(1, keepdim=True) + self.offset[:, None, None, None]
+        return total.to(bands)
+
+    def rises(self, like: Tensor) -> Float[Tensor, "b c 1 1"]:
+        """The slopes."""
+        return self.slopes[:, :, None, None].to(like)
+
+    def reconciled(self, bands: Float[Tensor, "b c h w"], alpha: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b c h w"]:
+        """The bands corrected so that their combination is nearer to alpha, by as much as it is reliable."""
+        step = self.gain[:, None, None, None].to(bands) * self.rises(bands)
+        return bands + step * (alpha - self.of(bands))
+
+
+def _mix(bands: Tensor, alpha: Tensor, weight: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Weights, offset, slopes and gain for bands (C, h, w) and alpha (1, h, w)."""
+    order = bands.flatten(1).sum(1).argsort()
+    weight = weight + 1e-6
+    x, y = (_beyond_local_mean(planes, weight).flatten(1) for planes in (bands[order], alpha))
+    weights, rest, share = _combination(x, y[0], weight.flatten())
+    unexplained = weight.flatten() @ rest.square() / (weight.flatten() @ y[0].square()).clamp(min=1e-12)
+    explained = (1 - unexplained).clamp(min=0)
+    weights = weights / explained.clamp(min=MIX_SETTINGS.diluted).sqrt()
+    detail = _detail(bands[order]).flatten(1)
+    combined = weights @ detail
+    slopes = explained * (detail @ (share * combined)) / (share @ combined.square()).clamp(min=1e-12)
+    misfit = _smooth_misfit(rest.view_as(alpha), share.view_as(alpha))
+    gain = explained / (1 + (misfit / MIX_SETTINGS.misfit) ** 6)
+    offset = share @ (alpha.flatten() - weights @ bands[order].flatten(1))
+    if max(abs(weights.sum() + offset - 1), abs(offset)) < MIX_SETTINGS.alike:
+        weights, offset, slopes = weights / weights.sum(), 0 * offset, slopes * weights.sum()
+    back = order.argsort()
+    return weights[back], offset, slopes[back], gain
+
+
+def _combination(x: Tensor, y: Tensor, weight: Tensor) -> RobustFit:
+    """Weights (C) with which bands x (C, n) make y (n), both about 0; drawn to equal ones. The second time
+    without outliers."""
+    share, mean = weight / weight.sum(), x.mean(0)
+    scale = (share @ y.square()).sqrt() / (share @ mean.square()).sqrt().clamp(min=1e-3)
+    equal = scale.expand(len(x)) / len(x)
+    ridge = MIX_SETTINGS.equal * (share @ x.square().mean(0)) + 1e-12
+    precision, beyond = ridge * torch.eye(len(x)).to(x), y - equal @ x
+
+    def weigh(rest: Tensor) -> Tensor:
+        robust = weight * gaussian(rest, MIX_SETTINGS.outlier)
+        return robust / robust.sum()
+
+    start = least_squares(x, beyond, share, precision)
+    found = robust_least_squares(x, beyond, start, weigh, precision=precision, steps=1)
+    return found._replace(coefficients=equal + found.coefficients)
+
+
+def _beyond_local_mean(planes: Tensor, weight: Tensor) -> Tensor:
+    """Planes (c, h, w) less their weighted mean in wide squares: light and lenses differ between views,
+    slowly."""
+    radius = max(planes.shape[-2:]) // MIX_SETTINGS.wide
+    return planes - (box_mean((planes * weight)[None], radius) / box_mean(weight[None], radius))[0]
+
+
+def _detail(planes: Tensor) -> Tensor:
+    """What pixels of (c, h, w) have beyond the mean of those around: how materials differ does not count."""
+    return planes - avg_pool2d(planes[None], 3, 1, 1, count_include_pad=False)[0]
+
+
+def _smooth_misfit(rest: Tensor, share: Tensor) -> Tensor:
+    """Root mean square of the rest (1, h, w) averaged around each pixel: errors of matches, at edges, average
+    out."""
+    radius = MIX_SETTINGS.smooth
+
+    def mean(plane: Tensor) -> Tensor:
+        return avg_pool2d(plane[None], 2 * radius + 1, 1, radius, count_include_pad=False)[0]
+
+    smooth = mean(share * rest) / mean(share).clamp(min=1e-12)
+    return (share * smooth.square()).sum().sqrt()

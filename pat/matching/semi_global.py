@@ -1,16 +1,18 @@
 """Semi-global matching along the search segments, before attention samples around the matches.
 
 Attention decides for each alpha pixel alone. Where a surface has little texture that is not enough: there,
-semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its labels
-are positions along each pixel's own segment, so it works for any rig with straight fields, rectified or not. Here it
-is computed on images of half the size; `matching` goes on from there to the full size. Without gradients.
+semi-global matching (Hirschmüller 2008) asks for depths that change little from one pixel to the next. Its
+labels are positions along each pixel's own segment, so it works for any rig with straight fields, rectified
+or not: all labels of a segment at half the size, and at full size those of a window around what that found.
+Without gradients.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from functools import partial
+from dataclasses import dataclass
+from functools import partial, reduce
 from typing import NamedTuple
 
 import cv2
@@ -27,60 +29,48 @@ from arraygeom.fields.protocol import compilable
 from arraygeom.sampling import on_image
 from arraygeom.threads import in_parallel
 
-from ..media.colour import to_bytes
 from ..support.memory import how_many_fit
+from ..support.settings import size, tuned
 from . import semi_global_numba as kernels
+from .cost import planes_of
+from .normalisation import ComparedViews, Normalisation
 
 FINE = 2
 """Matching is done on images this many times smaller."""
-BLOCK = 320
-"""Sides of what is processed at a time, in pixels of the reduced images."""
-LONG_BLOCK = 640
-"""The longer side of the blocks of large images, along the segments."""
-MARGIN = 64
-"""What is matched around a block."""
-PIXEL_BYTES, LABEL_BYTES = 128, 3
-"""What a block takes for each pixel, and for each label of each pixel: cost, and sum of costs."""
-MOST_COSTS = 2**25
-"""Costs up to which a block is as high as the image: without margins above and below there is less to compute."""
-CONSISTENT = 0.2
-"""A match is consistent if matching back from beta ends less than this (times 8 pixels) from it."""
-DISPARITY_FILL = (50.0, 4.0)
-"""Strength, and 8-bit difference that counts as an edge, of the smoothing that fills (Min et al. 2014)."""
-BLURS = (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0)
-"""Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other."""
 
 
-class SemiGlobalMatches(NamedTuple):
-    """The matches of images of H x W.
+@dataclass(frozen=True)
+class SemiGlobalSettings:
+    """The numbers of a run of semi-global matching."""
 
-    disparity: (B, 1, H, W), how far from its segment's end the match is, pixels of beta; where the match is not
-        consistent, diffused from where it is.
-    facts: (B, 3, H / 2, W / 2), how far matching back from beta disagrees, by how much the match is better than
-        others, and its cost; each 0 to 1.
-    matched: (B, C, H, W), beta's bands minus alpha at the match, with the detail that alpha has and beta has not.
-    colour: (B, fills, C, H, W), the same diffused from pixels of high weight to the others.
-    """
+    step: float = tuned(
+        12.0, "Source not recorded: penalty of neighbours whose labels differ by one, in the unit of `cost`"
+    )
+    jump: float = tuned(100.0, "Source not recorded: penalty of those that differ by more, where alpha shows no edge")
+    margin: int = size(64, "What is matched around a block, pixels")
+    block: int = size(320, "Sides of a block, pixels")
+    long_block: int = size(640, "The longer side of the blocks of large images, along the segments")
+    most_costs: int = size(2**25, "Costs up to which a block is as high as the image, which saves margins")
+    pixel_bytes: int = size(128, "What a block takes for each pixel")
+    label_bytes: int = size(3, "What it takes for each label of each pixel: cost, and sum of costs")
+    consistent: float = tuned(
+        0.2,
+        "Source not recorded: a match is consistent if matching back from beta ends less than this (times 8 "
+        "pixels) from it",
+    )
+    fill: tuple[float, float] = tuned(
+        (50.0, 4.0),
+        "Source not recorded: strength, and 8-bit difference that is an edge, of the smoothing that fills "
+        "(Min et al. 2014)",
+    )
 
-    disparity: Tensor
-    facts: Tensor
-    matched: Tensor
-    colour: Tensor
 
-    def cut(self, box: Box) -> SemiGlobalMatches:
-        """The part at alpha's (top, bottom, left, right), all even."""
-        top, bottom, left, right = box
-        half = (..., slice(top // FINE, bottom // FINE), slice(left // FINE, right // FINE))
-        whole = (..., slice(top, bottom), slice(left, right))
-        return SemiGlobalMatches(self.disparity[whole], self.facts[half], self.matched[whole], self.colour[whole])
-
-    def stored(self) -> SemiGlobalMatches:
-        """The same with colours as float16; differences from alpha are rounded by 1e-4 at most."""
-        return self._replace(matched=self.matched.half(), colour=self.colour.half())
+HALF_SIZE = SemiGlobalSettings()
+CONSISTENT, DISPARITY_FILL = HALF_SIZE.consistent, HALF_SIZE.fill
 
 
 class HalfSizeMatches(NamedTuple):
-    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `SemiGlobalMatches`."""
+    """Matches at half the size: `disparity` (B, 1, H / 2, W / 2) in pixels of beta; facts as of `BetaMatches`."""
 
     disparity: Tensor
     facts: Tensor
@@ -91,47 +81,24 @@ class HalfSizeMatches(NamedTuple):
         return HalfSizeMatches(*(part[..., top:bottom, left:right] for part in self))
 
 
-class Normalisation(NamedTuple):
-    """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
+class Windows(NamedTuple):
+    """The labels of each pixel: one or two runs of `labels` labels, from `first` (B, h, w, runs), int32. Two
+    runs of at most 5, which do not overlap."""
 
-    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
-    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
-    """
-
-    level: Tensor
-    blurs: tuple[list[float], list[float]]
+    first: NDArray[np.int32]
+    labels: int
 
     @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
-        """What makes the means and standard deviations the same, and then the sharpness."""
-        (deviation, mean), (wanted, middle) = (torch.std_mean(p, (1, 2, 3), keepdim=True) for p in (beta, alpha))
-        level = torch.stack([mean, (wanted / deviation.clamp(min=1e-3)).clamp(max=4), middle])
-        return cls(level, equalising_blurs(alpha, _normalised(beta, level)))
+    def all(cls, geometry: _Geometry) -> Windows:
+        """All labels of the longest segment, and one more."""
+        first = np.broadcast_to(np.int32(0), (*geometry.length.shape, 1))
+        return cls(first, int(max(geometry.length.max(), 0)) + 2)
 
-    def normalised(self, beta: Tensor) -> Tensor:
-        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
-        return _normalised(beta, self.level)
-
-    def softened(self, alpha: Tensor) -> Tensor:
-        """Alpha (or a part of it), no sharper than beta."""
-        return blurred(alpha, self.blurs[0])
-
-    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
-        """Both (or parts of them), the sharper one blurred."""
-        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
-        return own, other
-
-
-class Normalisations(NamedTuple):
-    """Those of images, and of the same at half the size."""
-
-    whole: Normalisation
-    half: Normalisation
-
-    @classmethod
-    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
-        """Of alpha and beta's brightness; all sides are even."""
-        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, FINE), avg_pool2d(beta, FINE)))
+    @property
+    def lanes(self) -> tuple[int, int]:
+        """How many runs there are, and in how many lanes each is computed."""
+        runs = self.first.shape[-1]
+        return runs, kernels.NARROW if runs == 2 else -(-self.labels // kernels.LANES) * kernels.LANES
 
 
 class _Geometry(NamedTuple):
@@ -147,24 +114,22 @@ class _Geometry(NamedTuple):
 
 
 def matched_at_half_size(
-    alpha: Float[Tensor, "b 1 h w"], guide: Float[Tensor, "b 1 hb wb"], blocks: Segments, normalisation: Normalisation
+    alpha: Float[Tensor, "b 1 h w"],
+    guide: Float[Tensor, "b 1 hb wb"],
+    blocks: Segments,
+    normalisation: Normalisation,
 ) -> HalfSizeMatches:
     """Matches of images at half the size; `normalisation` is that of half the size."""
-    own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
-    own, other = normalisation.equally_sharp(own, normalisation.normalised(other))
+    views = normalisation.views(avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE))
     geometry = geometry_of(blocks, len(alpha), (guide.shape[-2], guide.shape[-1]))
     del guide, blocks
-    found, measured = _matched_blocks(numpy_of(own[:, 0]), numpy_of(other[:, 0]), geometry)
-    consistent = (measured[..., 0] < CONSISTENT).astype(np.float32)
-    planes = zip(found, consistent, to_bytes(avg_pool2d(alpha, FINE)[:, 0]))
-    dense = np.stack([filled(r[None], c + 1e-5, g, DISPARITY_FILL)[0] for r, c, g in planes])
-    smooth = np.stack([cv2.medianBlur(r, 5) for r in np.where(consistent > 0, found, dense)])
-    disparity = FINE * torch.from_numpy(smooth)[:, None].to(alpha)
-    return HalfSizeMatches(disparity, torch.from_numpy(measured).movedim(-1, 1).to(alpha))
+    disparity, facts = matched_by_labels(views, geometry, Windows.all(geometry), HALF_SIZE)
+    return HalfSizeMatches(FINE * disparity[:, None].to(alpha), facts.movedim(-1, 1).to(alpha))
 
 
 def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int = FINE) -> _Geometry:
-    """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no pixel.
+    """In pixels of a beta that is so many times smaller. An invalid segment's length is negative: it has no
+    pixel.
 
     Segments that start within a pixel of beta's edge may have been cut there.
     """
@@ -176,40 +141,98 @@ def geometry_of(segments: Segments, batch: int, hw: tuple[int, int], factor: int
     return _Geometry(*planes)
 
 
-def _matched_blocks(own: NDArray, other: NDArray, geometry: _Geometry) -> tuple[NDArray, NDArray]:
-    """Reach (B, h, w) in pixels of the reduced beta, and facts (B, h, w, 3)."""
-    labels = int(max(geometry.length.max(), 0)) + 2
-    disparity = np.zeros(own.shape, np.float32)
-    facts = np.ones((*own.shape, 3), np.float32)
-    bits = [np.empty(x.shape, np.uint64) for x in (own, other)]
-    in_parallel([partial(kernels.census, p, o) for x, out in zip((own, other), bits) for p, o in zip(x, out)])
-    tasks, nbytes = [], 1.0
-    label, place = np.empty((2, *own.shape), np.int32)
-    claims: list[list[NDArray[np.int32]]] = [[] for _ in own]
-    for i, (a, b) in enumerate(zip(own, other)):
-        views = a, bits[0][i], b, bits[1][i], *(g[i] for g in geometry)
-        small = a.shape[0] * (BLOCK + 2 * MARGIN) * labels <= MOST_COSTS
-        across = np.abs(geometry.along[i]).max((0, 1))
-        large = (BLOCK, LONG_BLOCK) if across[0] > across[1] else (LONG_BLOCK, BLOCK)
-        boxes = list(inner_and_outer(a.shape, MARGIN, *((a.shape[0], BLOCK) if small else large)))
-        found = disparity[i], facts[i], label[i], place[i]
-        tasks += [partial(_block, views, box, labels, claims[i], found) for box in boxes]
-        largest = max(_pixels_in(outer, a.shape) for _, outer in boxes)
-        nbytes = max(nbytes, largest * (PIXEL_BYTES + LABEL_BYTES * labels))
+def matched_by_labels(
+    views: ComparedViews,
+    geometry: _Geometry,
+    windows: Windows,
+    settings: SemiGlobalSettings,
+    facts: int = 3,
+) -> tuple[Float[Tensor, "b h w"], Float[Tensor, "b h w facts"]]:
+    """Semi-global matching of the labels in each pixel's window: disparity, and the first so many of the
+    facts of `BetaMatches` (1 or 3).
+
+    Where matching back from beta disagrees, disparity is diffused from where it does not, within what is
+    connected in alpha.
+    """
+    own, other = (numpy_of(image[:, 0]) for image in (views.alpha, views.beta))
+    found, measured = _matched_blocks(own, other, geometry, windows, settings, facts)
+    consistent = (measured[..., 0] < settings.consistent).astype(np.float32)
+    dense = (filled(d[None], c + 1e-5, g, settings.fill)[0] for d, c, g in zip(found, consistent, views.guides))
+    smooth = [cv2.medianBlur(np.where(c > 0, d, fill), 5) for d, c, fill in zip(found, consistent, dense)]
+    return torch.from_numpy(np.stack(smooth)), torch.from_numpy(measured)
+
+
+class _Image(NamedTuple):
+    """What the blocks of one image are matched by, and where what they find goes.
+
+    `views` are planes of alpha's size: brightness, first labels, geometry, and what `cost` compares; `other`
+    are the flat planes that it compares them with, of a beta of `hw`. `found`: disparity, facts, and pixels
+    of beta. `claims` are tables of `winners`.
+    """
+
+    views: tuple[NDArray, ...]
+    other: tuple[NDArray, ...]
+    hw: tuple[int, int]
+    found: tuple[NDArray, ...]
+    claims: list[NDArray[np.int32]]
+
+
+def _matched_blocks(
+    own: NDArray,
+    other: NDArray,
+    geometry: _Geometry,
+    windows: Windows,
+    settings: SemiGlobalSettings,
+    facts: int,
+) -> tuple[NDArray, NDArray]:
+    """Disparity (B, h, w) in pixels of the beta given, and so many facts (B, h, w, facts)."""
+    (_, *hw), (_, rows, columns) = own.shape, other.shape
+    disparity, place = np.empty(own.shape, np.float32), np.empty(own.shape, np.int32)
+    measured = np.empty((*own.shape, facts), np.float32)
+    planes: list[tuple[NDArray, ...]] = [()] * (2 * len(own))
+    in_parallel([partial(_prepare, planes, i, image) for i, image in enumerate((*own, *other))])
+    images, tasks, nbytes = [], [], 1.0
+    for i, (mine, its) in enumerate(zip(planes[: len(own)], planes[len(own) :])):
+        views = own[i], windows.first[i], *(g[i] for g in geometry), *mine
+        images.append(_Image(views, _flat(its), (rows, columns), (disparity[i], measured[i], place[i]), []))
+        boxes = _boxes(hw, geometry.along[i], windows.first.shape[-1] * windows.labels, settings)
+        tasks += [partial(_block, images[-1], box, windows, settings) for box in boxes]
+        largest = max(_pixels_in(outer, hw) for _, outer in boxes)
+        nbytes = max(nbytes, largest * (settings.pixel_bytes + settings.label_bytes * math.prod(windows.lanes)))
     in_parallel(tasks, most=how_many_fit(nbytes))
-    for unlike, tables, own_label, its in zip(facts[..., 0], claims, label, place):
-        claimed = np.minimum.reduce(tables)[its] & 0xFFFF
-        apart = np.abs(claimed - own_label) / kernels.FARTHEST
-        np.minimum(apart, 1, out=unlike, where=its < other[0].size)
-    return disparity, facts
+    for image, fact, its in zip(images, measured[..., 0], place):
+        label = (reduce(np.minimum, image.claims)[its] & 0xFFFF).astype(np.float32)
+        apart = np.minimum(np.abs(label - fact) / kernels.FARTHEST, 1)
+        fact[:] = np.where(its < rows * columns, apart, 1)
+    return disparity, measured
 
 
-def _pixels_in(box: tuple[slice, slice], hw: tuple[int, ...]) -> int:
+def _prepare(planes: list[tuple[NDArray, ...]], i: int, image: NDArray) -> None:
+    planes[i] = planes_of(image)
+
+
+def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+    """Planes (h, w, ...) as lists of pixels."""
+    return tuple(plane.reshape(-1, *plane.shape[2:]) for plane in planes)
+
+
+def _boxes(hw: Sequence[int], along: NDArray, labels: int, settings: SemiGlobalSettings) -> list[tuple]:
+    """Blocks with their margins: as high as an image with few costs, else longer along the segments than
+    across."""
+    side, margin = settings.block, settings.margin
+    if hw[0] * (side + 2 * margin) * labels <= settings.most_costs:
+        return list(inner_and_outer(hw, margin, hw[0], side))
+    across, down = np.abs(along).max((0, 1))
+    sides = (side, settings.long_block) if across > down else (settings.long_block, side)
+    return list(inner_and_outer(hw, margin, *sides))
+
+
+def _pixels_in(box: tuple[slice, slice], hw: Sequence[int]) -> int:
     return math.prod(min(s.stop, n) - s.start for s, n in zip(box, hw))
 
 
 def inner_and_outer(
-    hw: tuple[int, ...], margin: int, rows: int = BLOCK, columns: int = BLOCK
+    hw: Sequence[int], margin: int, rows: int, columns: int
 ) -> Iterator[tuple[tuple[slice, slice], tuple[slice, slice]]]:
     """Inner and outer blocks of so many rows and columns: the result, and what is computed for it."""
     for top in range(0, hw[0], rows):
@@ -218,62 +241,27 @@ def inner_and_outer(
             yield inner, tuple(slice(max(s.start - margin, 0), s.stop + margin) for s in inner)
 
 
-def _block(views: tuple, box: tuple, labels: int, claims: list[NDArray[np.int32]], found: Sequence[NDArray]) -> None:
-    """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is of one
-    thread at a time; what all claim is the least of them."""
-    own, own_bits, other, other_bits, end, along, length, cut = views
+def _block(image: _Image, box: tuple, windows: Windows, settings: SemiGlobalSettings) -> None:
+    """What is found of a block. What its pixels claim of beta goes into one of the tables, of which each is
+    of one thread at a time; what all claim is the least of them."""
     inner, outer = box
-    planes = (own, own_bits, end, along, length, cut)
-    a, a_bits, e, u, n, c = (np.ascontiguousarray(x[outer]) for x in planes)
-    cost = np.empty((*a.shape, labels), np.uint8)
-    kernels.costs(a, a_bits, other, other_bits, e, u, n, c, cost)
+    guide, first, end, along, length, cut, *own = (np.ascontiguousarray(x[outer]) for x in image.views)
+    labels, segments = (first, windows.labels), (end, along, length, cut)
+    cost = np.empty((*length.shape, *windows.lanes), np.uint8)
+    kernels.costs(_flat(own), image.other, *labels, *segments, *image.hw, cost)
     total = np.empty(cost.shape, np.int16)
-    kernels.aggregate(cost, a, total)
+    step, jump = np.float32(settings.step), np.float32(settings.jump)
+    kernels.aggregate(cost, guide, *labels, step, jump, total)
     try:
-        table = claims.pop()
+        claims = image.claims.pop()
     except IndexError:
-        table = np.full(other.size + 1, 2**31 - 1, np.int32)
-    parts = [np.ascontiguousarray(plane[inner]) for plane in found]
+        claims = np.full(math.prod(image.hw) + 1, 2**31 - 1, np.int32)
+    parts = [np.ascontiguousarray(plane[inner]) for plane in image.found]
     corner = (i.start - o.start for i, o in zip(inner, outer))
-    kernels.winners(total, e, u, n, c, *other.shape, *corner, table, *parts)
-    claims.append(table)
-    for plane, part in zip(found, parts):
+    kernels.winners(total, *labels, *segments, *image.hw, *corner, jump, claims, *parts)
+    image.claims.append(claims)
+    for plane, part in zip(image.found, parts):
         plane[inner] = part
-
-
-def _normalised(image: Tensor, level: Tensor) -> Tensor:
-    mean, factor, middle = level.to(image)
-    return (image - mean) * factor + middle
-
-
-def equalising_blurs(
-    image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
-) -> tuple[list[float], list[float]]:
-    """Standard deviations to blur either with until it is no sharper: detail that only one has cannot be matched.
-
-    Sharpness is the mean difference of neighbouring pixels. 0 for an image that has hardly more than the other.
-    """
-    own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
-    return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
-
-
-def _least_blur(image: Tensor, contrast: float) -> float:
-    """The least of `BLURS` after which there is no more contrast than that."""
-    enough = (b for b in (0.0, *BLURS) if float(_contrast(blurred(image[None], [b])[0])) <= 1.05 * contrast)
-    return next(enough, BLURS[-1])
-
-
-def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
-    """Each blurred with its standard deviation in pixels; 0: as it is."""
-
-    def one(image: Tensor, blur: float) -> Tensor:
-        return torch.from_numpy(cv2.GaussianBlur(numpy_of(image), (0, 0), blur)).to(image) if blur else image
-
-    return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
-
-
-def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
-    return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
 
 
 def matches(
@@ -283,10 +271,11 @@ def matches(
     beyond_edge: bool = False,
     extent: Extent | None = None,
 ) -> Float[Tensor, "b h w 2"]:
-    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's pixels.
+    """Where the alpha pixels of segments (B or 1, H, W) have their matches `disparity` from the ends, beta's
+    pixels.
 
-    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is the
-    segments', if it is known.
+    Disparity may be at half the size. Not beyond the segments' near ends, unless `beyond_edge`. `extent` is
+    the segments', if it is known.
     """
     length, towards = extent or Extent.of(segments)
     if disparity.shape[-2:] != length.shape[-2:]:
@@ -309,7 +298,8 @@ class Extent(NamedTuple):
 
 
 def length_of(segments: Segments) -> Float[Tensor, "*n"]:
-    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the same."""
+    """The segments' lengths in pixels; of plain numbers in half the time of `Segments.length`, which is the
+    same."""
     step = segments.end - segments.start
     if step.requires_grad or not compilable(step):
         return segments.length
@@ -318,7 +308,8 @@ def length_of(segments: Segments) -> Float[Tensor, "*n"]:
 
 
 def along(segments: Segments, length: Tensor | None = None) -> Float[Tensor, "*n 2"]:
-    """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is known."""
+    """Unit vectors from end to start; zero where a segment is a point. `length` is the segments', if it is
+    known."""
     length = length_of(segments) if length is None else length
     step, divisor = segments.start - segments.end, torch.where(length > 0, length, 1.0)
     if step.requires_grad or not compilable(step):
@@ -347,8 +338,8 @@ def filled(planes: NDArray, weight: NDArray, guide: NDArray, how: tuple[float, f
 
 
 def smoothed(planes: Sequence[NDArray], guide: NDArray[np.uint8], how: tuple[float, float]) -> list[NDArray]:
-    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several threads, but
-    has its own."""
+    """Planes smoothed where the guide shows no edge. One after the other: the smoother is not for several
+    threads, but has its own."""
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, *how)
     return [smoother.filter(np.ascontiguousarray(plane, np.float32)) for plane in planes]
 

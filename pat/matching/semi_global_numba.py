@@ -1,21 +1,30 @@
-"""The compiled loops of `pat.matching.semi_global`, each on one image, in one thread and without Python's lock."""
+"""The compiled loops of `pat.matching.semi_global`, each on one image, in one thread and without Python's
+lock.
+
+Each pixel has one or two *runs* of `count` consecutive labels, which begin at `first` (h, w, runs) and do not
+overlap. Costs and sums of a run are in lanes, of which those after the last label mean nothing: a single run
+has as many as it needs, a multiple of 16; of two, each has 8, of which at most 5 are labels.
+"""
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
 
-from pat.attention.kernels import compiled, separate_cache
+from arraygeom.compiled import renew_with
+from pat.attention.kernels import SOURCES
+from pat.attention.kernels.emit import LANES, NARROW, Vector, compiled, instruction, separate_cache
+from pat.attention.kernels.layout import pointers
+from pat.attention.kernels.vectors import from_index
 
-NOWHERE = np.uint8(80)
-"""Cost of a label that is not on beta: more than any other can have."""
-UNSEEN = np.uint8(24)
-"""Cost of a label beyond beta's edge, where the point may well be: about that of a mismatch."""
-MOST = np.float32(1e9)
-LEVELS = np.float32(30.0)
-"""Cost of a difference of 1 in (normalised) brightness, which counts up to `TRUNCATED`."""
-TRUNCATED = np.float32(20.0)
-SMALL, LARGE = np.float32(12.0), np.float32(100.0)
-"""Penalties of neighbours whose labels differ by one, and by more (the latter where alpha shows no edge)."""
+from .cost import NOWHERE, UNSEEN, dissimilarity, pixel_of
+
+NO_LABEL = np.uint8(255)
+"""Cost of a lane without a label: so much more than `NOWHERE` and a jump that no path ever comes from one."""
 EDGE = np.float32(4 / 255)
 """Difference of alpha's neighbours that halves the larger penalty."""
 FARTHEST = np.float32(8)
@@ -25,96 +34,357 @@ MOST_BEYOND = np.float32(0.3)
 ONE = np.float32(1.0)
 HALF = np.float32(0.5)
 PARTS = 16
-"""Sums of costs are whole numbers of a 16th, of 16 bits: twice as many as floats go through memory in the same time."""
-STEP = np.int16(SMALL * PARTS)
+"""Sums of costs are whole numbers of a 16th, of 16 bits: twice as many as floats go through memory in the
+same time."""
 WALL = np.int16(30000)
-"""More than a sum of costs along a path can be."""
+"""More than a sum of costs along a path can be, in parts."""
+
+
+@compiled(inline="always")
+def _halves(first, runs, lane):
+    """The first labels of both halves of the vector of a pixel's lanes that begins at `lane`."""
+    return (first[0] + lane, first[0] + lane + NARROW) if runs == 1 else (first[0], first[1])
+
+
+@compiled(inline="always")
+def _places(end, along, low, high, last, rows, columns, out):
+    """Where a vector of labels, whose halves begin at `low` and `high`, is in beta, pixels counted row by
+    row; -1 for those that are not on it or beyond the last."""
+    for k in range(LANES):
+        label = np.float32(low + k if k < NARROW else high + k - NARROW)
+        column = np.int32(np.floor(end[0] + label * along[0] + HALF))
+        row = np.int32(np.floor(end[1] + label * along[1] + HALF))
+        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows) & (label <= last)
+        out[k] = np.int32(row * columns + column) if inside else np.int32(-1)
+
+
+@compiled(inline="always")
+def _count_within(length, first, count):
+    """How many labels of a run are on a segment."""
+    return min(max(int(np.floor(length + HALF)) + 1 - first, 0), count)
 
 
 @compiled(nogil=True, cache=True)
-def census(image, out):
-    """One bit for each of the 48 pixels around: whether it is darker (Zabih and Woodfill 1994)."""
-    height, width = image.shape
-    # A row around at a time, continued by three pixels to either side: then the loop along it is of vectors.
-    row = np.empty(width + 6, image.dtype)
-    for y in range(height):
-        centre, bits = image[y], out[y]
-        bits[:] = 0
-        for dy in range(-3, 4):
-            above = image[min(max(y + dy, 0), height - 1)]
-            for x in range(3):
-                row[x], row[width + 3 + x] = above[0], above[width - 1]
-            for x in range(width):
-                row[x + 3] = above[x]
-            for dx in range(7):
-                if dx != 3 or dy != 0:
-                    for x in range(width):
-                        bits[x] = (bits[x] << np.uint64(1)) | np.uint64(row[x + dx] < centre[x])
+def costs(own, other, first, count, end, along, length, cut, rows, columns, out):
+    """Cost of alpha's pixel and beta's at each label: out (h, w, runs, lanes). `own` and `other` are flat
+    planes of `cost`.
 
-
-@compiled(inline="always")
-def _count(bits):
-    """Ones among 64 bits."""
-    bits = bits - ((bits >> np.uint64(1)) & np.uint64(0x5555555555555555))
-    bits = (bits & np.uint64(0x3333333333333333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return (bits * np.uint64(0x0101010101010101)) >> np.uint64(56)
-
-
-@compiled(inline="always")
-def _pixel(end, along, label):
-    """Column and row of beta's pixel at a label: so many pixels from `end`."""
-    disparity = np.float32(label)
-    return int(np.floor(end[0] + disparity * along[0] + HALF)), int(np.floor(end[1] + disparity * along[1] + HALF))
-
-
-@compiled(inline="always")
-def dissimilarity(own, own_bits, other, other_bits):
-    """Of two pixels, by brightness and census."""
-    return np.uint8(_count(own_bits ^ other_bits)) + np.uint8(min(abs(own - other) * LEVELS, TRUNCATED))
-
-
-@compiled(inline="always")
-def _places(end, along, count, rows, columns, out):
-    """Where the first labels are in beta, pixels counted row by row; -1 for those that are not on it."""
-    for label in range(count):
-        disparity = np.float32(label)
-        column = np.int32(np.floor(end[0] + disparity * along[0] + HALF))
-        row = np.int32(np.floor(end[1] + disparity * along[1] + HALF))
-        inside = (column >= 0) & (row >= 0) & (column < columns) & (row < rows)
-        out[label] = np.int32(row * columns + column) if inside else np.int32(-1)
-
-
-@compiled(inline="always")
-def _count_within(length, labels):
-    """How many labels are on a segment."""
-    return min(max(int(np.floor(length + HALF)) + 1, 0), labels)
-
-
-@compiled(nogil=True, cache=True)
-def costs(own, own_bits, other, other_bits, end, along, length, cut, out):
-    """Dissimilarity of alpha's pixel (own) and beta's (other) at each label: out (h, w, labels).
-
-    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere, or, where
-    it is beta's edge that cuts the segment, not seen.
+    The label l lies l pixels from `end` along the unit vectors `along`; those beyond `length` are nowhere,
+    or, where it is beta's edge that cuts the segment, not seen.
     """
-    height, width, labels = out.shape
-    rows, columns = other.shape
-    values, bits = other.ravel(), other_bits.ravel()
-    places = np.empty(labels, np.int32)
+    height, width, runs, lanes = out.shape
+    size, places, found = runs * lanes, np.empty(runs * lanes, np.int32), np.empty(lanes, np.uint8)
     for y in range(height):
         for x in range(width):
-            count, found = _count_within(length[y, x], labels), out[y, x]
-            _places(end[y, x], along[y, x], count, rows, columns, places)
-            for label in range(count):
-                at = max(places[label], 0)
-                cost = dissimilarity(own[y, x], own_bits[y, x], values[at], bits[at])
-                found[label] = cost if places[label] >= 0 else NOWHERE
-            found[count:] = UNSEEN if cut[y, x] else NOWHERE
+            last, pixel = length[y, x] + HALF, pixel_of(own, y * width + x)
+            for lane in range(0, size, LANES):
+                low, high = _halves(first[y, x], runs, lane)
+                _places(end[y, x], along[y, x], low, high, last, rows, columns, places[lane:])
+            beyond = UNSEEN if cut[y, x] else NOWHERE
+            for run in range(runs):
+                within = _count_within(length[y, x], first[y, x, run], count)
+                at, costs = places[run * lanes :], out[y, x, run]
+                for k in range(within):
+                    found[k] = dissimilarity(pixel, pixel_of(other, max(at[k], 0)))
+                for k in range(lanes):
+                    cost = found[k] if at[k] >= 0 else NOWHERE
+                    cost = cost if k < within else beyond
+                    costs[k] = cost if k < count else NO_LABEL
+
+
+@instruction(lambda cost, i: Vector(types.int16))
+def _costs_at(code, cost, i: index):
+    """The costs of a pixel's lanes from an index on, in parts."""
+    stored = code.get(code.kinds[0], cost, i)
+    wide = code.zext(stored, ir.VectorType(ir.IntType(16), LANES))
+    return code.mul(wide, wide.type([PARTS] * LANES))
+
+
+@instruction(lambda path, i: Vector(types.int16))
+def _load(code, path, i: index):
+    """The vector at an index."""
+    return code.get(code.kinds[0], path, i)
+
+
+@instruction(lambda path, i, j: Vector(types.int16))
+def _load_halves(code, path, i: index, j: index):
+    """Half a vector from either index."""
+    low, high = (code.get(code.kinds[0], path, at, NARROW) for at in (i, j))
+    return code.shuffle(low, high, [*range(LANES)])
+
+
+@instruction(lambda *_: types.void)
+def _store(code, path, i: index, vector):
+    """Stores a vector at an index."""
+    code.put(code.kinds[0], path, i, vector)
+
+
+@instruction(lambda *_: types.void)
+def _store_halves(code, path, i: index, j: index, vector):
+    """Stores half a vector at either index."""
+    for at, lanes in ((i, range(NARROW)), (j, range(NARROW, LANES))):
+        code.put(code.kinds[0], path, at, code.shuffle(vector, None, [*lanes]))
+
+
+@instruction(lambda number: Vector(number))
+def _repeat(code, number):
+    """A vector of one number repeated."""
+    return code.repeat(number)
+
+
+def _lesser(code, a, b):
+    return code.select(code.icmp_unsigned("<", a, b), a, b)
+
+
+@instruction(lambda a, b: a)
+def _less(code, a, b):
+    """The lesser of two, lane by lane; of what is not negative."""
+    return _lesser(code, a, b)
+
+
+@instruction(lambda a, b: a)
+def _add(code, a, b):
+    """The sum, lane by lane."""
+    return code.add(a, b)
+
+
+@instruction(lambda a, b: a)
+def _subtract(code, a, b):
+    """The difference, lane by lane."""
+    return code.sub(a, b)
+
+
+@instruction(lambda path, small: path)
+def _spread(code, path, small):
+    """Of two runs, each in half a vector: what their labels, and those beside them, cost a neighbour that has
+    not a penalty for a jump. One lane farther on, so that lane 0 is of the label before the run."""
+    back = [[half + (k - n) % NARROW for half in (0, NARROW) for k in range(NARROW)] for n in (1, 2)]
+    own, before = (code.shuffle(path, None, lanes) for lanes in back)
+    return _lesser(code, own, code.add(_lesser(code, before, path), small))
+
+
+@instruction(lambda *_: types.UniTuple(types.int64, 4))
+def _shifts(code, here, there, reach: index):
+    """From the neighbour's first labels to a pixel's, or so far that they have no labels in common, not even
+    beside them: to the first and second from the first and second, and from the second and first."""
+    a, b = (code.get(kind, at, ir.IntType(64)(0), 2) for kind, at in zip(code.kinds, (here, there)))
+    a, b = code.shuffle(a, None, [0, 1, 0, 1]), code.shuffle(b, None, [0, 1, 1, 0])
+    most = code.repeat(code.trunc(reach, ir.IntType(32)), 4)
+    least, shift = code.neg(most), code.sub(a, b)
+    shift = code.select(code.icmp_signed("<", shift, most), shift, most)
+    shift = code.select(code.icmp_signed(">", shift, least), shift, least)
+    wide = code.sext(shift, ir.VectorType(ir.IntType(64), 4))
+    return code.pack([code.extract_element(wide, ir.IntType(32)(k)) for k in range(4)])
+
+
+@instruction(lambda path: path.scalar)
+def _least(code, path):
+    """The least of a vector's lanes."""
+    kind = ir.FunctionType(path.type.element, [path.type])
+    name = f"llvm.vector.reduce.umin.v{LANES}i16"
+    return code.call(cgutils.get_or_insert_function(code.module, kind, name), [path])
 
 
 @compiled(inline="always")
-def _least(costs, first, last):
+def _jumps(own, other, small, large, out):
+    """The penalties of labels that differ by more than one, between pixels of alpha's brightness; in
+    parts."""
+    for i in range(len(own)):
+        out[i] = np.int16(max(small + ONE, large / (ONE + abs(own[i] - other[i]) / EDGE)) * PARTS + HALF)
+
+
+@compiled(nogil=True, cache=True)
+def aggregate(cost, guide, first, count, small, large, total):
+    """The sum over eight paths of semi-global matching (Hirschmüller 2008), in parts: total (h, w, runs,
+    lanes), int16.
+
+    Penalties of neighbours whose labels differ by one (small), and by more (large, where alpha shows no
+    edge).
+    """
+    height, width, runs, lanes = cost.shape
+    reach = count + 1
+    pad = (reach + NARROW) // NARROW * NARROW
+    # Three rows of paths that the next row reads, two along the row, and one of zeros, from which the first go on.
+    slots, stride = 3 * width + 4 * height + 7, runs * (lanes + pad)
+    paths, fewest = np.full(slots * stride + lanes + 2 * pad, WALL, np.int16), np.zeros(slots, np.int16)
+    for run in range(runs):
+        begin = (slots - 1) * stride + run * (lanes + pad) + pad
+        paths[begin : begin + lanes] = 0
+    planes, jumps = (cost.reshape(-1), first.reshape(-1), total.reshape(-1)), np.zeros((4, width), np.int16)
+    for way in range(2):
+        _sweep(way, cost.shape, planes, guide, reach, pad, small, large, paths, fewest, jumps)
+
+
+@compiled(error_model="numpy")
+def _sweep(way, shape, planes, guide, reach, pad, small, large, paths, fewest, jumps):
+    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the
+    row, and from three of the row before. With `way` 1 rows and columns are taken from the last.
+
+    Paths lie where those of pixels were that are no longer needed: in each row 0, 1, or 2 slots before where
+    they lay in the one before, so that what a pixel reads is one slot from what it writes.
+    """
+    height, width, runs, lanes = shape
+    cost, first, total = pointers(planes)
+    paths, fewest, ahead, above, behind, beside = pointers((paths, fewest, jumps[0], jumps[1], jumps[2], jumps[3]))
+    known = cost, first, total, paths, fewest, runs, lanes, pad, reach, _repeat(np.int16(small * PARTS))
+    side, none = 3 * width + 4 * height + 4, 3 * width + 4 * height + 6
+    step = 1 - 2 * way
+    for row in range(height):
+        y = row if way == 0 else height - 1 - row
+        for k in range(4):
+            dx, dy = ((1 - k) * step, -step) if k < 3 else (-step, 0)
+            if row > 0 or k == 3:
+                left, right = max(-dx, 0), width - max(dx, 0)
+                _jumps(
+                    guide[y, left:right],
+                    guide[y + dy, left + dx : right + dx],
+                    small,
+                    large,
+                    jumps[k, left:right],
+                )
+        from_above, from_behind = width + 2 * height + 1 - row, 2 * (width + 2 * height + 1 - row)
+        for i in range(width):
+            x = i if way == 0 else width - 1 - i
+            p = y * width + x
+            q = p - step * width
+            before = i + 1 if row > 0 and i < width - 1 else none
+            _advance(known, p, p if before == none else q + step, before, i, ahead[x], way == 0)
+            now = from_above + i
+            _advance(known, p, q if row > 0 else p, now + 1 if row > 0 else none, now, above[x], False)
+            now = from_behind + i
+            before = now + 1 if row > 0 and i > 0 else none
+            _advance(known, p, p if before == none else q - step, before, now, behind[x], False)
+            now, before = side + i % 2, side + (i + 1) % 2 if i > 0 else none
+            _advance(known, p, p if before == none else p - step, before, now, beside[x], False)
+
+
+@compiled(inline="always")
+def _advance(known, p, q, before, now, jump, is_first):
+    """A path from pixel q, in slot `before`, to pixel p, in slot `now`, and its costs to the sums."""
+    cost, first, total, paths, fewest, runs, lanes, pad, reach, penalty = known
+    base, leap, lowest = _repeat(fewest[before]), _repeat(np.int16(fewest[before] + jump)), _repeat(WALL)
+    stride = lanes + pad
+    start, end = pad + before * runs * stride, pad + now * runs * stride
+    for lane in range(0, runs * lanes, LANES):
+        at = p * runs * lanes + lane
+        stay = _reached(
+            paths,
+            start + lane,
+            from_index(first, runs * p),
+            from_index(first, runs * q),
+            reach,
+            stride,
+            runs,
+            penalty,
+        )
+        path = _add(_costs_at(cost, at), _subtract(_less(stay, leap), base))
+        _keep(paths, end + lane, stride, runs, penalty, path)
+        lowest = _less(lowest, path)
+        _store(total, at, path if is_first else _add(path, _load(total, at)))
+    fewest[now] = _least(lowest)
+
+
+@compiled(inline="always")
+def _reached(paths, start, ours, theirs, reach, stride, runs, penalty):
+    """What a vector of a pixel's labels cost if they come from a neighbour's without a jump; the path of the
+    neighbour begins at `start`, its runs `stride` apart. `ours` and `theirs` are the first labels of both.
+
+    Around a path are walls, so that what is read for labels that the neighbour has not is more than any jump.
+    """
+    if runs == 1:
+        here = start + min(max(ours[0] - theirs[0], -reach), reach)
+        beside = _less(_load(paths, here - 1), _load(paths, here + 1))
+        return _less(_load(paths, here), _add(beside, penalty))
+    shifts, low = _shifts(ours, theirs, reach), start + 1
+    high = low + stride
+    same = _load_halves(paths, low + shifts[0], high + shifts[1])
+    return _less(same, _load_halves(paths, high + shifts[2], low + shifts[3]))
+
+
+@compiled(inline="always")
+def _keep(paths, start, stride, runs, penalty, path):
+    """Keep a vector of a path for `_reached`. Of two runs, what labels beside cost is known here already:
+    then a pixel after it reads 4 half vectors instead of 12, which takes half the time."""
+    if runs == 1:
+        _store(paths, start, path)
+    else:
+        _store_halves(paths, start, start + stride, _spread(path, penalty))
+
+
+@compiled(nogil=True, cache=True)
+def winners(
+    total,
+    first,
+    count,
+    end,
+    along,
+    length,
+    cut,
+    rows,
+    columns,
+    top,
+    left,
+    large,
+    claims,
+    disparity,
+    facts,
+    positions,
+):
+    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity); facts
+    (h, w, 1 or 3): the whole label, its margin to the second best, and its cost; where it is in beta, pixels
+    counted row by row (positions; rows * columns: not on it). `total` is in parts, the larger penalty `large`
+    the unit of the facts.
+
+    `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it,
+    and that pixel's label: 16 bits of either.
+    """
+    height, width, measured = facts.shape[0], facts.shape[1], facts.shape[2] > 1
+    _, _, runs, lanes = total.shape
+    nowhere, most = rows * columns, np.float32(8 * PARTS) * large
+    places = np.empty(runs * lanes, np.int32)
+    for y in range(height):
+        for x in range(width):
+            here = y + top, x + left
+            starts, far = first[here], length[here]
+            for lane in range(0, runs * lanes, LANES):
+                low, high = _halves(starts, runs, lane)
+                _places(end[here], along[here], low, high, far + HALF, rows, columns, places[lane:])
+            best = np.int32(WALL) << 16
+            for run in range(runs):
+                sums, start, at = total[here][run], starts[run], places[run * lanes :]
+                within = _count_within(far, start, count)
+                for k in range(within):
+                    claim, place = (
+                        np.int32(sums[k]) << 16 | np.int32(start + k),
+                        at[k] if at[k] >= 0 else nowhere,
+                    )
+                    claims[place] = min(claims[place], claim)
+                    best = min(best, claim)
+                # The very first label is taken if there is no other.
+                for k in range(within, count if cut[here] else 1 - run):
+                    best = min(best, np.int32(sums[k]) << 16 | np.int32(start + k))
+            label, least = best & 0xFFFF, best >> 16
+            of_best = 0 if label < starts[0] + count else 1
+            sums, k = total[here][of_best], label - starts[of_best]
+            last = count if cut[here] else _count_within(far, starts[of_best], count)
+            shift = _rounding(end[here], along[here], np.float32(label))
+            disparity[y, x] = np.float32(label) + shift + _between(sums, k, last - 1)
+            place = places[of_best * lanes + k]
+            positions[y, x] = place if place >= 0 else nowhere
+            facts[y, x, 0] = np.float32(label)
+            if measured:
+                second = WALL
+                for run in range(runs):
+                    sums, start = total[here][run], starts[run]
+                    last = count if cut[here] else _count_within(far, start, count)
+                    second = min(second, _lowest(sums, 0, min(label - 1 - start, last)))
+                    second = min(second, _lowest(sums, max(label + 2 - start, 0), last))
+                facts[y, x, 1] = min(np.float32(second - least) / most, ONE)
+                facts[y, x, 2] = np.float32(least) / most
+
+
+@compiled(inline="always")
+def _lowest(costs, first, last):
     """The least of costs from `first` to before `last`."""
     least = WALL
     for i in range(first, last):
@@ -123,116 +393,20 @@ def _least(costs, first, last):
 
 
 @compiled(inline="always")
-def _advance(before, least, jump, cost, now):
-    """One step of a path: its costs `now`, from index 1, a wall at both ends; the least. All in parts."""
-    leap, fewest = np.int16(least + jump), WALL
-    for i in range(len(cost)):
-        step = np.int16(min(before[i], before[i + 2]) + STEP)
-        stay = min(before[i + 1], leap)
-        path = np.int16(np.int16(cost[i] * PARTS) + np.int16(min(step, stay) - least))
-        now[i + 1], fewest = path, min(fewest, path)
-    return fewest
+def _rounding(end, along, label):
+    """How far along its segment a label's pixel of beta, to which its position is rounded, is from that position."""
+    x, y = end[0] + label * along[0], end[1] + label * along[1]
+    return (np.floor(x + HALF) - x) * along[0] + (np.floor(y + HALF) - y) * along[1]
 
 
 @compiled(inline="always")
-def jump_between(a, b, small, large):
-    """The penalty of labels that differ by more than one, between pixels of alpha's brightness a and b."""
-    return max(small + ONE, large / (ONE + abs(a - b) / EDGE))
-
-
-@compiled(inline="always")
-def _jump_in_parts(a, b):
-    return np.int16(jump_between(a, b, SMALL, LARGE) * PARTS + HALF)
-
-
-@compiled(nogil=True, cache=True)
-def aggregate(cost, guide, total):
-    """The sum over eight paths of semi-global matching (Hirschmüller 2008), in parts: total (h, w, labels), int16."""
-    for way in range(2):
-        _sweep(cost, guide, total, way)
-
-
-@compiled
-def _sweep(cost, guide, total, way):
-    """Four paths at once, so that costs and sums go through memory twice in all: from the pixel before in the row, and
-    from three of the row before. With `way` 1 rows and columns are taken from the last.
-
-    Paths are kept where the next row reads them, by the column that will.
-    """
-    height, width, labels = cost.shape
-    above, ahead, behind = np.zeros((3, width + 1, labels + 2), np.int16)
-    side, next_side, next_above, pending, next_behind = np.zeros((5, labels + 2), np.int16)
-    for kept in (above, ahead, behind):
-        kept[:, 0], kept[:, -1] = WALL, WALL
-    for kept in (side, next_side, next_above, pending, next_behind):
-        kept[0], kept[-1] = WALL, WALL
-    fewest = np.zeros((3, width + 1), np.int16)
-    step = 1 - 2 * way
-    for row in range(height):
-        y = row if way == 0 else height - 1 - row
-        side[1:-1] = 0
-        pending[1:-1] = 0
-        of_side, of_pending = np.int16(0), np.int16(0)
-        for i in range(width):
-            x = i if way == 0 else width - 1 - i
-            here, values, sums = guide[y, x], cost[y, x], total[y, x]
-            jump = _jump_in_parts(here, guide[y, x - step]) if i > 0 else STEP
-            of_side = _advance(side, of_side, jump, values, next_side)
-            jump = _jump_in_parts(here, guide[y - step, x]) if row > 0 else STEP
-            of_above = _advance(above[i], fewest[0, i], jump, values, next_above)
-            jump = _jump_in_parts(here, guide[y - step, x + step]) if row > 0 and i < width - 1 else STEP
-            fewest[1, i] = _advance(ahead[i + 1], fewest[1, i + 1], jump, values, ahead[i])
-            jump = _jump_in_parts(here, guide[y - step, x - step]) if row > 0 and i > 0 else STEP
-            of_behind = _advance(behind[i], fewest[2, i], jump, values, next_behind)
-            _add(sums, next_side, next_above, ahead[i], next_behind, way == 0)
-            _copy(next_above, above[i])
-            _copy(pending, behind[i])
-            fewest[0, i], fewest[2, i] = of_above, of_pending
-            pending, next_behind, of_pending = next_behind, pending, of_behind
-            side, next_side = next_side, side
-
-
-@compiled(inline="always")
-def _copy(path, out):
-    for k in range(1, len(path) - 1):
-        out[k] = path[k]
-
-
-@compiled(inline="always")
-def _add(total, a, b, c, d, first):
-    """Sums of four paths, written or added."""
-    for k in range(len(total)):
-        four = np.int16(np.int16(a[k + 1] + b[k + 1]) + np.int16(c[k + 1] + d[k + 1]))
-        total[k] = four if first else np.int16(total[k] + four)
-
-
-@compiled(nogil=True, cache=True)
-def winners(total, end, along, length, cut, rows, columns, top, left, claims, disparity, facts, labels, positions):
-    """Of each pixel of a part that begins at `top`, `left`: the best label, to a fraction (disparity) and whole
-    (labels); where it is in beta, pixels counted row by row (positions; rows * columns: not on it); its margin to the
-    second best, and its cost (the last of facts (h, w, 3)). `total` is in parts.
-
-    `claims`, of each pixel of beta and one more, keeps the least cost with which a pixel of alpha matches it, and that
-    pixel's label: 16 bits of either.
-    """
-    height, width, _ = facts.shape
-    nowhere, most = rows * columns, total.shape[2]
-    at = np.empty(most, np.int32)
-    for y in range(height):
-        for x in range(width):
-            here = y + top, x + left
-            sums, count = total[here], _count_within(length[here], most)
-            _places(end[here], along[here], count, rows, columns, at)
-            for label in range(count):
-                place = at[label] if at[label] >= 0 else nowhere
-                claims[place] = min(claims[place], np.int32(sums[label]) << 16 | np.int32(label))
-            last = most - 1 if cut[here] else min(most - 1, int(length[here] + HALF))
-            best, second = _two_best(sums, last)
-            lowest = sums[best]
-            disparity[y, x] = np.float32(best) + _between(sums, best, last)
-            labels[y, x], positions[y, x] = best, at[best] if best < count and at[best] >= 0 else nowhere
-            facts[y, x, 1] = min(np.float32(second - lowest) / (8 * PARTS * LARGE), ONE)
-            facts[y, x, 2] = np.float32(lowest) / (8 * PARTS * LARGE)
+def _between(total, best, last):
+    """How far the best is from the label, by the two lines of equal slope through it and its neighbours."""
+    if not 0 < best < last:
+        return np.float32(0)
+    before, after = np.float32(total[best - 1]), np.float32(total[best + 1])
+    deepest = max(before, after) - np.float32(total[best])
+    return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)
 
 
 @compiled(nogil=True, cache=True)
@@ -250,24 +424,6 @@ def regression(brightness, total, first, second, colour, product, floor, along, 
             along[y, x], mean_colour[y, x] = middle + slope * beyond, middle
 
 
-@compiled(inline="always")
-def _two_best(total, last):
-    """The best of the labels to `last`, and what the best does that is not beside it."""
-    best, least = 0, _least(total, 0, last + 1)
-    while total[best] > least:
-        best += 1
-    return best, min(_least(total, 0, best - 1), _least(total, best + 2, last + 1))
-
-
-@compiled(inline="always")
-def _between(total, best, last):
-    """How far the best is from the label, by the two lines of equal slope through it and its neighbours."""
-    if not 0 < best < last:
-        return np.float32(0)
-    before, after = np.float32(total[best - 1]), np.float32(total[best + 1])
-    deepest = max(before, after) - np.float32(total[best])
-    return HALF * (before - after) / deepest if deepest > 0 else np.float32(0)
-
-
-for _entry in (census, costs, aggregate, winners, regression):
+for _entry in (costs, aggregate, winners, regression):
+    renew_with(_entry, [Path(__file__), Path(__file__).with_name("cost.py"), *SOURCES])
     separate_cache(_entry)

@@ -9,6 +9,7 @@ then is the pixel's search segment, in pixels of arc from its last position, and
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -28,11 +29,12 @@ from arraygeom.pixels import HW, pixel_grid
 
 from ..media.colour import to_bytes
 from . import semi_global_numba as kernels
+from .cost import planes_of
 from .positions_numba import costs_at
 from .semi_global import (
     DISPARITY_FILL,
     FINE,
-    MARGIN,
+    HALF_SIZE,
     Normalisation,
     filled,
     inner_and_outer,
@@ -135,32 +137,39 @@ class Chosen(NamedTuple):
     valid: Tensor
 
 
-def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray[np.float32]:
+def _labels(alpha: Tensor, guide: Tensor, grid: _BlockCentres, *, ordered: bool) -> NDArray:
     """The label of each block of alpha."""
     own, other = avg_pool2d(alpha, FINE), avg_pool2d(guide, FINE)
     level = Normalisation.of(own, other)
     a, b = (numpy_of(p[0, 0]) for p in level.equally_sharp(own, level.normalised(other)))
-    bits = [np.empty(p.shape, np.uint64) for p in (a, b)]
-    for image, out in zip((a, b), bits):
-        kernels.census(image, out)
+    planes, other_planes = planes_of(a), _flat(planes_of(b))
     label, margin = np.zeros((2, *a.shape), np.float32)
     rows = [(rows, slice(0, a.shape[1])) for rows in grid.by_rows()]
-    for inner, outer in inner_and_outer(a.shape, MARGIN) if ordered else zip(rows, rows):
+    sides = (HALF_SIZE.margin, HALF_SIZE.block, HALF_SIZE.block)
+    for inner, outer in inner_and_outer(a.shape, *sides) if ordered else zip(rows, rows):
         places = _places(grid, outer, b.shape)
-        cost = np.empty(places.shape, np.uint8)
-        part, part_bits = (np.ascontiguousarray(p[outer]) for p in (a, bits[0]))
-        costs_at(part, part_bits, b, bits[1], places, cost)
+        lanes = -(-places.shape[-1] // kernels.LANES) * kernels.LANES
+        cost = np.empty((*places.shape[:2], 1, lanes), np.uint8)
+        parts = [np.ascontiguousarray(p[outer]) for p in planes]
+        costs_at(_flat(parts), other_planes, places, cost)
         total = cost.astype(np.int16)
         if ordered:
-            kernels.aggregate(cost, part, total)
+            first = np.zeros((*places.shape[:2], 1), np.int32)
+            penalties = np.float32(HALF_SIZE.step), np.float32(HALF_SIZE.jump)
+            kernels.aggregate(cost, parts[0], first, places.shape[-1], *penalties, total)
         corner = tuple(slice(i.start - o.start, i.stop - o.start) for i, o in zip(inner, outer))
-        label[inner], margin[inner] = _best(total[corner])
+        label[inner], margin[inner] = _best(total[corner][:, :, 0, : places.shape[-1]])
     if not ordered:
         return label
-    scale = np.float32(8 * kernels.PARTS * kernels.LARGE)
+    scale = np.float32(8 * kernels.PARTS * HALF_SIZE.jump)
     weight = np.minimum(margin / scale, 1)
     dense = filled(label[None], weight + np.float32(1e-5), to_bytes(own[:, 0])[0], DISPARITY_FILL)[0]
     return cv2.medianBlur(np.where(weight > LEAST_MARGIN, label, dense).astype(np.float32), 5)
+
+
+def _flat(planes: Sequence[NDArray]) -> tuple[NDArray, ...]:
+    """Planes (h, w) as lists of pixels."""
+    return tuple(plane.ravel() for plane in planes)
 
 
 def _places(grid: _BlockCentres, box: tuple[slice, ...], hw: tuple[int, ...]) -> NDArray[np.int32]:

@@ -6,13 +6,13 @@ import re
 import struct
 from typing import NamedTuple
 
+from arraygeom.image_bytes import PNG, TIFF, png_chunks, tiff_entries
+
 HW = tuple[int, int]
 
 RAW_SUFFIXES = {".dng", ".nef", ".cr2", ".cr3", ".arw", ".raf", ".orf", ".rw2", ".pef"}
 """Of cameras' raw files."""
 
-_SIZES = {1: "B", 3: "H", 4: "I", 16: "Q"}
-"""Codes of TIFF's unsigned types."""
 _WIDTH, _HEIGHT, _BITS, _ORIENTATION = 256, 257, 258, 274
 
 
@@ -36,11 +36,11 @@ class ImageHeader(NamedTuple):
 def image_header(content: bytes) -> ImageHeader | None:
     """The header of a PNG, TIFF, JPEG, PNM, BMP or WebP file; None for other and for damaged files."""
     try:
-        if content.startswith(b"\x89PNG\r\n\x1a\n"):
+        if content.startswith(PNG):
             return _png(content)
         if content.startswith(b"\xff\xd8"):
             return _jpeg(content)
-        if content[:4] in (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"):
+        if content[:4] in TIFF:
             return _tiff(content)
         if content.startswith(b"RIFF") and content[8:12] == b"WEBP":
             return _webp(content)
@@ -51,12 +51,10 @@ def image_header(content: bytes) -> ImageHeader | None:
 
 def _png(content: bytes) -> ImageHeader:
     width, height = struct.unpack_from(">II", content, 16)
-    at, orientation = 8, 1
-    while at + 8 <= len(content):
-        length, kind = struct.unpack_from(">I4s", content, at)
+    orientation = 1
+    for kind, start, end in png_chunks(content):
         if kind == b"eXIf":
-            orientation = _exif_orientation(content[at + 8 : at + 8 + length])
-        at += 12 + length
+            orientation = _exif_orientation(content[start + 8 : end - 4])
     return ImageHeader((height, width), orientation)
 
 
@@ -108,39 +106,20 @@ def _pnm(content: bytes) -> ImageHeader | None:
 
 
 def _tiff(content: bytes) -> ImageHeader:
-    entries = _entries(content)
+    entries = tiff_entries(content)
     tag = entries.get(_ORIENTATION)
-    bits = entries[_BITS][0] if _BITS in entries else 1
-    size = entries[_HEIGHT][0], entries[_WIDTH][0]
-    return ImageHeader(size, _known(tag[0]) if tag else 1, bits, tag[1:] if tag else None)
+    bits = entries[_BITS].value if _BITS in entries else 1
+    size = entries[_HEIGHT].value, entries[_WIDTH].value
+    return ImageHeader(size, _known(tag.value) if tag else 1, bits, (tag.place, tag.form) if tag else None)
 
 
 def _exif_orientation(exif: bytes) -> int:
     """Of an Exif block, which is a TIFF file without an image; 1 if it is damaged."""
     try:
-        return _known(_entries(exif).get(_ORIENTATION, (1,))[0])
+        return _known(tiff_entries(exif).get(_ORIENTATION, (1,))[0])
     except (struct.error, IndexError, ValueError):
         return 1
 
 
 def _known(orientation: int) -> int:
     return orientation if 1 <= orientation <= 8 else 1
-
-
-def _entries(content: bytes) -> dict[int, tuple[int, int, str]]:
-    """The first directory of a TIFF file: tag -> (first value, its byte offset, its struct format); integers only."""
-    order = "<" if content.startswith(b"II") else ">"
-    big = struct.unpack_from(order + "H", content, 2)[0] == 43
-    word, count, head, length = ("Q", "Q", 8, 20) if big else ("I", "H", 4, 12)
-    start = struct.unpack_from(order + word, content, head)[0]
-    entries = {}
-    for i in range(min(struct.unpack_from(order + count, content, start)[0], 1000)):
-        at = start + struct.calcsize("=" + count) + i * length
-        tag, kind, values = struct.unpack_from(order + "HH" + word, content, at)
-        if kind not in _SIZES or values < 1:
-            continue
-        form, place = order + _SIZES[kind], at + 4 + struct.calcsize("=" + word)
-        if values * struct.calcsize(form) > struct.calcsize("=" + word):
-            place = struct.unpack_from(order + word, content, place)[0]
-        entries[tag] = (struct.unpack_from(form, content, place)[0], place, form)
-    return entries

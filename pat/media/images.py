@@ -21,6 +21,7 @@ from torch import Tensor
 
 from arraygeom.atomic import write_atomically
 from arraygeom.chunks import ROWS, spans
+from arraygeom.image_bytes import decodable
 
 from .headers import HW, RAW_SUFFIXES, ImageHeader, image_header
 from .profiles import in_srgb, with_srgb_profile
@@ -69,8 +70,29 @@ def read_image(
     Raises FileNotFoundError for a missing file, ValueError for one that is not a usable image, has another size than
     expected, or is larger than `MOST_PIXELS` where no size is.
     """
-    path = Path(path)
     label = f"{name}: {path}" if name else f"{path}"
+    planes, packed = _planes(Path(path), label, hw, orientation)
+    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
+
+
+def read_recorded(
+    path: str | Path,
+    *,
+    name: str | None = None,
+    hw: HW | None = None,
+    orientation: Literal["apply", "ignore"] = "apply",
+) -> NDArray[Any]:
+    """The values (C, H, W) of an image file in its own type and counts; else, and in what it raises, as `read_image`.
+
+    Those that a TIFF file packs into less than 16 bits are as its camera counted them.
+    """
+    label = f"{name}: {path}" if name else f"{path}"
+    planes, packed = _planes(Path(path), label, hw, orientation)
+    return np.ascontiguousarray(planes >> (16 - packed) if packed else planes)
+
+
+def _planes(path: Path, label: str, hw: HW | None, orientation: Literal["apply", "ignore"]) -> tuple[NDArray, int]:
+    """The values (C, H, W) as OpenCV reads them, upright, and the bits of packed ones (else 0)."""
     if not path.is_file():
         raise FileNotFoundError(f"{label}: no such image: check the path")
     content = _png_of_raw(path, label) if path.suffix.lower() in RAW_SUFFIXES else path.read_bytes()
@@ -85,8 +107,7 @@ def read_image(
     values = _opaque(_upright(values, applied), label)
     if orientation == "apply":
         values = in_srgb(values, content, label)
-    planes = values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)
-    return torch.from_numpy(np.ascontiguousarray(_unit_range(planes, label, bits, packed)))
+    return (values[None] if values.ndim == 2 else values[..., ::-1].transpose(2, 0, 1)), packed
 
 
 def write_image(
@@ -230,9 +251,9 @@ def _log_level(level: int) -> int:
 
 def decoded(content: bytes, flags: int = cv2.IMREAD_UNCHANGED) -> NDArray | None:
     """What OpenCV makes of a file's bytes, without its own messages; None for a damaged file."""
-    level = _log_level(0)
+    level, checked = _log_level(0), decodable(content)
     try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+        return None if checked is None else cv2.imdecode(np.frombuffer(checked, np.uint8), flags)
     except cv2.error:
         return None
     finally:
@@ -296,15 +317,21 @@ def _counts(planes: NDArray, label: str, bits: int | None, packed: int) -> NDArr
     return planes.astype(np.float32) / np.float32(white)
 
 
-def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
-    if bits != 32:
-        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+def exr_writer(path: Path) -> Any:
+    """The package OpenEXR, to write to `path`. Raises ValueError where it is not installed."""
     try:
         import OpenEXR
     except ImportError:
         raise ValueError(
             f"{path}: writing EXR needs the package OpenEXR: pip install 'arraygeom-pat[synthesis]'"
         ) from None
+    return OpenEXR
+
+
+def _write_exr(path: Path, planes: NDArray, bits: int) -> None:
+    if bits != 32:
+        raise ValueError(f"{path}: EXR holds 32-bit floats here, not {bits} bits: write .png or .tif")
+    OpenEXR = exr_writer(path)
     names = {1: "Y", 3: "RGB", 4: "RGBA"}[len(planes)]
     channels = {name: np.ascontiguousarray(plane, np.float32) for name, plane in zip(names, planes)}
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}

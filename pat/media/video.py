@@ -48,9 +48,12 @@ def write_video(path: str | Path, frames: Iterable[Float[Tensor, "c h w"]], *, r
 
 
 class Video(NamedTuple):
-    """The frames of a video file, (3, H, W), 0..1, read as they are asked for, and how many there are a second."""
+    """The frames of a video file, 0..1, read as they are asked for, and how many there are a second.
 
-    frames: Iterator[Float[Tensor, "3 h w"]]
+    They are RGB (3, H, W), or grey (1, H, W) if the first is (`is_grey`).
+    """
+
+    frames: Iterator[Float[Tensor, "c h w"]]
     rate: float
 
 
@@ -66,9 +69,25 @@ def read_video(path: str | Path) -> Video:
     return Video(_frames(video), rate)
 
 
-def _frames(video: cv2.VideoCapture) -> Iterator[Float[Tensor, "3 h w"]]:
+GREY_ROUNDED = 4 / 255
+"""Codecs round the colour of grey to this: MPEG-4 in OpenCV's conversion to 3 counts of 255."""
+CONTRAST = 10.0
+"""A picture shows that it is grey if its brightness differs by this many times more: a black one does not."""
+
+
+def is_grey(image: Float[Tensor, "3 h w"]) -> bool:
+    """Whether a decoded picture of any contrast has no colour but a codec's rounding."""
+    differences = image.amax(0) - image.amin(0)
+    low, high = image[1].aminmax()
+    return float(differences.max()) <= min(GREY_ROUNDED, float(high - low) / CONTRAST)
+
+
+def _frames(video: cv2.VideoCapture) -> Iterator[Float[Tensor, "c h w"]]:
+    grey = None
     done, frame = video.read()
     while done:
-        yield torch.from_numpy(np.ascontiguousarray(frame[..., ::-1].transpose(2, 0, 1))).float() / 255
+        image = torch.from_numpy(np.ascontiguousarray(frame[..., ::-1].transpose(2, 0, 1))).float() / 255
+        grey = is_grey(image) if grey is None else grey
+        yield image[1:2] if grey else image
         done, frame = video.read()
     video.release()

@@ -18,10 +18,10 @@ from .unshuffle_numba import unshuffle
 class ResidualBlock(nn.Module):
     """x + conv(leaky(conv(x))), both 3x3."""
 
-    def __init__(self, dim: int, *, dilation: int = 1) -> None:
+    def __init__(self, dim: int, *, dilation: int = 1, bias: bool = True) -> None:
         super().__init__()
-        self.first = nn.Conv2d(dim, dim, 3, padding=dilation, dilation=dilation)
-        self.second = nn.Conv2d(dim, dim, 3, padding=1)
+        self.first = nn.Conv2d(dim, dim, 3, padding=dilation, dilation=dilation, bias=bias)
+        self.second = nn.Conv2d(dim, dim, 3, padding=1, bias=bias)
         self.act = nn.LeakyReLU(0.1, inplace=True)
 
     def forward(self, x: Float[Tensor, "b d h w"]) -> Float[Tensor, "b d h w"]:

@@ -8,6 +8,7 @@ are kept if they are large (first pass), or weighted by how strong they are in a
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -19,23 +20,38 @@ from arraygeom.threads import in_parallel
 
 from ..attention.kernels import compiled, separate_cache
 from ..media.colour import luminance
+from ..support.settings import size, tuned
 from .denoiser import opponent, opponent_deviation, over_flips, rgb_of_opponent
 
-SIDE, STEP, ALIKE = 8, 4, 16
-"""Side of a block and steps between blocks, pixels; blocks in a group."""
+
+@dataclass(frozen=True)
+class CollaborativeSettings:
+    """Of the filter of alike blocks (Dabov et al. 2007)."""
+
+    side: int = size(8, "Side of a block, pixels")
+    step: int = size(4, "Steps between blocks, pixels")
+    alike: int = size(16, "Blocks in a group")
+    radius: int = size(16, "How far away alike blocks are looked for, pixels")
+    rows: int = size(16, "Rows of blocks that a thread works on at once")
+    threshold: float = tuned(
+        2.9,
+        "Middlebury, tune half: coefficients of so many standard deviations of the noise are kept in the first pass",
+    )
+    as_recorded: float = tuned(
+        0.5,
+        "Middlebury, tune half: later passes look for alike blocks in an estimate with so much of the noise left: "
+        "where an image is flat the noise makes blocks alike that lie apart, as is needed",
+    )
+    kept: float = tuned(
+        0.5, "Middlebury, tune half: share of the network's brightness that is kept: its errors are others"
+    )
+
+
+SETTINGS = CollaborativeSettings()
+SIDE, STEP, ALIKE, RADIUS, ROWS = SETTINGS.side, SETTINGS.step, SETTINGS.alike, SETTINGS.radius, SETTINGS.rows
+"""For the compiled loops, which read no attributes."""
+THRESHOLD, AS_RECORDED, KEPT = SETTINGS.threshold, SETTINGS.as_recorded, SETTINGS.kept
 CELLS = SIDE // STEP
-RADIUS = 16
-"""How far away alike blocks are looked for, pixels."""
-ROWS = 16
-"""Rows of blocks that a thread works on at once."""
-THRESHOLD = 2.9
-"""Coefficients of so many standard deviations of the noise are kept in the first pass."""
-AS_RECORDED = 0.5
-"""Later passes look for alike blocks in an estimate with so much of the noise left: where an image is flat the noise
-makes blocks alike that lie apart, as is needed. This, `THRESHOLD` and `KEPT` were chosen on Middlebury's pairs of the
-tune half."""
-KEPT = 0.5
-"""Share of the network's brightness that is kept: its errors are others."""
 
 
 def without_noise(

@@ -11,17 +11,29 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, pad, pixel_shuffle, pixel_unshuffle
 
+from ..support.settings import size, tuned
 from .guided import UNet
 
-MULTIPLE = 8
-"""Images are padded to multiples of this."""
-SCALE = 4.0
-"""Deviations and differences are given to networks this many times larger: then they are about as large as values."""
+
+@dataclass(frozen=True)
+class DenoiserSettings:
+    """Of what the denoisers are given."""
+
+    multiple: int = size(8, "Images are padded to multiples of this")
+    scale: float = size(
+        4.0,
+        "Deviations and differences are given to networks this many times larger: then they are "
+        "about as large as values",
+    )
+    blur: int = tuned(2, "Source not recorded: radius of the blur of colour differences, pixels")
+    colour_noise: float = tuned(0.02, "Source not recorded: the deviation at which half of that blur is taken")
+
+
+SETTINGS = DenoiserSettings()
+
 
 OPPONENT = ((3**-0.5, 3**-0.5, 3**-0.5), (2**-0.5, 0.0, -(2**-0.5)), (6**-0.5, -2 * 6**-0.5, 6**-0.5))
 """Brightness and two colour differences, orthogonal and of unit length, of red, green and blue."""
-BLUR, COLOUR_NOISE = 2, 0.02
-"""Radius of the blur of colour differences, pixels, and the deviation at which half of it is taken."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +71,8 @@ class Denoising(nn.Module):
     ) -> Float[Tensor, "b c h w"]:
         """Of any size; `further` are other images of the same pixels."""
         h, w = image.shape[-2:]
-        given = torch.cat([image - 0.5, SCALE * deviation, *further], 1)
-        given = pad(given, (0, -w % MULTIPLE, 0, -h % MULTIPLE), mode="replicate")
+        given = torch.cat([image - 0.5, SETTINGS.scale * deviation, *further], 1)
+        given = pad(given, (0, -w % SETTINGS.multiple, 0, -h % SETTINGS.multiple), mode="replicate")
         noise = pixel_shuffle(self.network(pixel_unshuffle(given, 2)).float(), 2)[..., :h, :w]
         return image - deviation * noise
 
@@ -81,14 +93,14 @@ class ColourDenoising(nn.Module):
     def forward(self, image: Float[Tensor, "b 3 h w"], deviation: Float[Tensor, "b 3 h w"]) -> Float[Tensor, "b 3 h w"]:
         """Of any size."""
         h, w = image.shape[-2:]
-        enough = (0, -w % MULTIPLE, 0, -h % MULTIPLE)
+        enough = (0, -w % SETTINGS.multiple, 0, -h % SETTINGS.multiple)
         bands = pad(opponent(image - 0.5), enough, mode="replicate")
         noise = pad(opponent_deviation(deviation), enough, mode="replicate")
-        blurred = avg_pool2d(pad(bands, (BLUR,) * 4, mode="replicate"), 2 * BLUR + 1, 1)
-        share = noise.square() / (noise.square() + COLOUR_NOISE**2)
+        blurred = avg_pool2d(pad(bands, (SETTINGS.blur,) * 4, mode="replicate"), 2 * SETTINGS.blur + 1, 1)
+        share = noise.square() / (noise.square() + SETTINGS.colour_noise**2)
         share = torch.cat([torch.zeros_like(share[:, :1]), share[:, 1:]], 1)
         base = torch.lerp(bands, blurred, share)
-        given = [pixel_unshuffle(bands, 2), SCALE * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)]
+        given = [pixel_unshuffle(bands, 2), SETTINGS.scale * avg_pool2d(noise, 2), avg_pool2d(bands[:, 1:], 2)]
         found = pixel_shuffle(self.network(torch.cat(given, 1)).float(), 2)
         return 0.5 + rgb_of_opponent(base - noise * found)[..., :h, :w]
 
@@ -128,7 +140,7 @@ class LowLightNetwork(nn.Module):
         gain = _gain(beta.denoised, image, confidence)
         difference, removed = gain * beta.denoised - image, gain * beta.removed
         deviation = (alpha.deviation + gain * beta.deviation) / 2
-        seen = [SCALE * x for x in (alpha.removed, alpha.deviation, difference, removed)]
+        seen = [SETTINGS.scale * x for x in (alpha.removed, alpha.deviation, difference, removed)]
         return self.fused(image, deviation, *seen, confidence)
 
 

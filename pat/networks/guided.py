@@ -9,6 +9,7 @@ to the others, and adds it to alpha.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
@@ -28,27 +29,44 @@ from ..matching.semi_global import (
     matches,
 )
 from ..media.colour import luminance
+from ..support.settings import size, tuned
 from .blocks import ResidualBlock, channels_last, conv, enlarge, stacked
 from .configs import GuidedPATConfig
 from .protocol import FusionOutput, JoinsBands, required
 
-COARSE = 4
-"""Context is computed at a quarter of the size."""
-LEAST_WEIGHT = 1e-3
-"""The least weight of a pixel in propagation."""
-CONFIDENCE_OFFSETS = 0.2, 2.0
-"""Added to the logit of the confidence where colour is blended: where beta's brightness is unlike alpha's, and where
-it is the same. Matches are better than when the weights were trained. Chosen on Middlebury's pairs of the tune half."""
-EXACT_OFFSET = 1.0
-"""Added to the logit of taking the semi-global match's colour instead of the attended one, for the same reason."""
-HEAD_SHARE = 0.5
-"""How much of what the head adds is added: it was trained to mend more than is left to be mended."""
-LIKENESS = 0.06
-"""Difference of brightness at which likeness falls to 1 / e."""
-LIKEST = 3.0
-"""How much more a beta's colour counts, as a logit, where it is as bright as alpha than where it is unlike it."""
-NOWHERE = -10.0
-"""The logit of the confidence where there is no valid segment."""
+
+@dataclass(frozen=True)
+class GuidedSettings:
+    """What is added to trained logits, as matches are better than when the weights were trained."""
+
+    coarse: int = size(4, "Context is computed at this part of the size")
+    least_weight: float = size(1e-3, "The least weight of a pixel in propagation")
+    confidence_offsets: tuple[float, float] = tuned(
+        (0.2, 2.0),
+        "Middlebury, tune half: goes with the next training: added to the logit of the confidence "
+        "where colour is blended: where beta's brightness is unlike alpha's, and where it is the "
+        "same",
+    )
+    exact_offset: float = tuned(
+        1.0,
+        "Middlebury, tune half: goes with the next training: added to the logit of taking the "
+        "semi-global match's colour instead of the attended one",
+    )
+    head_share: float = tuned(
+        0.5,
+        "Middlebury, tune half: goes with the next training: how much of what the head adds is "
+        "added: it was trained to mend more than is left to be mended",
+    )
+    likeness: float = tuned(0.06, "Source not recorded: difference of brightness at which likeness falls to 1 / e")
+    likest: float = tuned(
+        3.0,
+        "Source not recorded: how much more a beta's colour counts, as a logit, where it is as "
+        "bright as alpha than where it is unlike it",
+    )
+    nowhere: float = size(-10.0, "The logit of the confidence where there is no valid segment")
+
+
+SETTINGS = GuidedSettings()
 
 
 class BetaEstimate(NamedTuple):
@@ -83,7 +101,7 @@ class BetaEstimate(NamedTuple):
     @property
     def blending(self) -> Float[Tensor, "b 1 h w"]:
         """The weight of `colour` in the image, 0 to 1."""
-        unlike, alike = CONFIDENCE_OFFSETS
+        unlike, alike = SETTINGS.confidence_offsets
         return (self.logit + unlike + (alike - unlike) * self.likeness).sigmoid()
 
     def beyond(self, base: Float[Tensor, "b c h w"], band: int) -> BetaEstimate:
@@ -171,19 +189,19 @@ class GuidedPAT(nn.Module):
         blend = torch.lerp(_joined([self._unseen(own, s) for s in estimates]), colour, confidence)
         if not self.config.head_dim:
             return blend
-        rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), COARSE)
+        rough = avg_pool2d(torch.cat([colour * confidence, confidence], 1), SETTINGS.coarse)
         context = self.propagate(stacked(own.quarter, rough))
-        return blend + HEAD_SHARE * self.head(alpha, blend, colour, confidence, own.half, enlarge(context))
+        return blend + SETTINGS.head_share * self.head(alpha, blend, colour, confidence, own.half, enlarge(context))
 
     def _unseen(self, own: Encoded, estimate: BetaEstimate) -> Tensor:
         """Colour for where beta does not see the point: propagated at 1/4 of the size to pixels that are similar in
         alpha, or diffused."""
         confidence = estimate.logit.sigmoid()
-        weight = avg_pool2d(confidence, COARSE)
-        colour = avg_pool2d(estimate.colour * confidence, COARSE) / (weight + LEAST_WEIGHT)
+        weight = avg_pool2d(confidence, SETTINGS.coarse)
+        colour = avg_pool2d(estimate.colour * confidence, SETTINGS.coarse) / (weight + SETTINGS.least_weight)
         for step in self.propagation:
             colour, weight = step(own.quarter, colour, weight)
-        choices = enlarge(colour, COARSE), *estimate.diffused.to(colour).unbind(1)
+        choices = enlarge(colour, SETTINGS.coarse), *estimate.diffused.to(colour).unbind(1)
         return torch.stack([w * c for w, c in zip(estimate.choice.softmax(1).split(1, 1), choices)]).sum(0)
 
     def estimate(self, own: Encoded, alpha: Tensor, beta: Beta, found: BetaMatches) -> BetaEstimate:
@@ -203,16 +221,16 @@ class GuidedPAT(nn.Module):
         facts = [of(value) - alpha, peak[:, None], deviation[:, None]]
         judged = self._judged(own, found, torch.cat(facts, 1), segments.valid[:, None])
         logit, choice, exact = judged.split([1, 1 + FILLS, 1], 1)
-        logit = torch.where(peak[:, None] > 0, logit, NOWHERE)
-        colour = torch.lerp(value - alpha, bands.to(value), (exact + EXACT_OFFSET).sigmoid())
-        alike = likeness(facts[0], LIKENESS)
+        logit = torch.where(peak[:, None] > 0, logit, SETTINGS.nowhere)
+        colour = torch.lerp(value - alpha, bands.to(value), (exact + SETTINGS.exact_offset).sigmoid())
+        alike = likeness(facts[0], SETTINGS.likeness)
         return BetaEstimate(attended, deviation, peak, colour, diffused, logit, choice, position, alike, found.prior)
 
     def _judged(self, own: Encoded, found: BetaMatches, facts: Tensor, valid: Tensor) -> Tensor:
         """Logits (B, 3 + fills, H, W): of the confidence, of the choices, of taking the semi-global match."""
         matched = torch.cat([avg_pool2d(found.disparity, FINE) / 64, found.facts], 1)
         samples = torch.cat([facts, facts[:, :1].abs(), valid.expand(len(facts), -1, -1, -1).to(facts)], 1)
-        rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, COARSE)], 1)
+        rough = torch.cat([avg_pool2d(matched, 2), avg_pool2d(samples, SETTINGS.coarse)], 1)
         context = self.judge(stacked(own.quarter, rough))
         return self.confidence(stacked(enlarge(context), own.half, matched, facts))
 
@@ -247,7 +265,7 @@ def combined(estimates: Sequence[BetaEstimate]) -> BetaEstimate:
     if len(estimates) == 1:
         return estimates[0]
     logits = torch.stack([e.logit for e in estimates])
-    weights = torch.stack([e.logit + LIKEST * e.likeness + e.prior for e in estimates]).softmax(0)
+    weights = torch.stack([e.logit + SETTINGS.likest * e.likeness + e.prior for e in estimates]).softmax(0)
 
     def mean(parts: Sequence[Tensor]) -> Tensor:
         return sum(w * p for w, p in zip(weights, parts)) + torch.zeros_like(parts[0])
@@ -297,7 +315,7 @@ class Propagation(nn.Module):
     ) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 1 h w"]]:
         """Colour and weight after one round."""
         query = torch.cat([self.query(features), torch.ones_like(weight)], 1)
-        key = torch.cat([self.key(features), (weight + LEAST_WEIGHT).log()], 1)
+        key = torch.cat([self.key(features), (weight + SETTINGS.least_weight).log()], 1)
         value = torch.cat([colour, weight], 1)
         found = attend(query, key, value, self.field, interpolation="nearest")
         return found[:, :-1], found[:, -1:]

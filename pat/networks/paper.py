@@ -7,20 +7,25 @@ configuration is the paper's; variants are configuration.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from pathlib import Path
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
 
 from arraygeom import Segments
 from arraygeom.fields.grid import FieldOnGrid
 
-from ..attention import Attended, attend_with_statistics
+from ..attention.scores import Compared
 from ..matching.inputs import Inputs
 from ..matching.matches import Matches
+from .authors import read_authors
 from .blocks import ResidualASPP, ResidualBlock
 from .configs import PATConfig
 from .protocol import FusionOutput, JoinsBands
+
+SURROUNDINGS, FLOOR = 9, 0.01
+"""Side of the windows that `normalised` takes means over, pixels, and the contrast below which it adds none."""
 
 
 class PAT(nn.Module):
@@ -34,34 +39,45 @@ class PAT(nn.Module):
     """Features reach 59 pixels and post-fusion 10; the sum, rounded up."""
     beta_halo = 64
     multiple = 1
-    equal_resolution = False
     joins_bands: JoinsBands = "no"
     bands: int | None = None
     uses_matches = keeps_luminance = False
 
     def __init__(self, config: PATConfig = PATConfig()) -> None:
         super().__init__()
-        self.config = config
-        c, d = config, config.dim
-        self.features = Features(c.in_channels, d)
-        self.engine = AttentionEngine(c.betas, d, c.interpolation)
-        self.post = PostFusion((c.betas + 1) * d, d, c.out_channels, c.scale)
+        self.config, self.equal_resolution = config, config.equal_resolution
+        self.features = Features(config)
+        self.engine = AttentionEngine(config)
+        self.post = PostFusion(config)
+
+    @classmethod
+    def from_authors(cls, path: str | Path) -> PAT:
+        """The network of one of the authors' checkpoints (best.pth.tar), ready for use; see `read_authors`."""
+        read = read_authors(path)
+        network = cls(read.config)
+        network.load_state_dict(read.state)
+        return network.eval().requires_grad_(False)
 
     def forward(self, inputs: Inputs, matches: Matches | None = None) -> FusionOutput:
         """Fuse alpha with the betas, in the order the network was made for; matches are not used.
 
         Raises ValueError for another number of betas than configured, or channels that do not fit.
         """
+        return self.compare(inputs)[0]
+
+    def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
+        """The fused image, and what attention compares in each beta. Raises as `forward`."""
         if len(inputs.betas) != self.config.betas:
             raise ValueError(f"this PAT is made for {self.config.betas} betas, got {len(inputs.betas)}")
         own = self.features(self._channels(inputs.alpha))
         others = [self.features(self._channels(beta.image)) for beta in inputs.betas]
-        attended = self.engine(own, others, [beta.field for beta in inputs.betas])
+        compared = self.engine.compare(own, others, [beta.field for beta in inputs.betas])
+        attended = [c.attended() for c in compared]
         image = self.post(torch.cat([own, *(a.value for a in attended)], 1))
         if self.config.residual:
             image = image + self._enlarged(inputs.alpha)
-        _, position, deviation, confidence = (list(part) for part in zip(*attended))
-        return FusionOutput(image, position, deviation, confidence)
+        position, deviation, confidence = (list(part) for part in list(zip(*attended))[1:])
+        return FusionOutput(image, position, deviation, confidence), compared
 
     def working_bytes(self, alpha: int, betas: Sequence[int]) -> float:
         """Features of all views, measured."""
@@ -71,7 +87,8 @@ class PAT(nn.Module):
         wanted = self.config.in_channels
         if image.shape[1] not in (1, wanted):
             raise ValueError(f"images must have 1 or {wanted} channels for this network, got {image.shape[1]}")
-        return image.expand(-1, wanted, -1, -1)
+        image = image.expand(-1, wanted, -1, -1)
+        return torch.cat([image, normalised(image.mean(1, keepdim=True))], 1) if self.config.normalised else image
 
     def _enlarged(self, alpha: Tensor) -> Tensor:
         alpha = alpha.expand(-1, self.config.out_channels, -1, -1)
@@ -80,46 +97,56 @@ class PAT(nn.Module):
         return nn.functional.interpolate(alpha, scale_factor=self.config.scale, mode="bicubic", align_corners=False)
 
 
+def normalised(image: Float[Tensor, "b 1 h w"]) -> Float[Tensor, "b 1 h w"]:
+    """The image less its mean in windows of 9x9 pixels, over its standard deviation there, with a floor of .01."""
+    mean, squares = (
+        nn.functional.avg_pool2d(x, SURROUNDINGS, 1, SURROUNDINGS // 2, count_include_pad=False)
+        for x in (image, image * image)
+    )
+    return (image - mean) / ((squares - mean * mean).clamp(min=0) + FLOOR**2).sqrt()
+
+
 class Features(nn.Sequential):
     """Residual-ASPP features, the same weights for every view (paper, section 3.1)."""
 
-    def __init__(self, channels: int, dim: int) -> None:
+    def __init__(self, config: PATConfig) -> None:
+        dim, bias = config.dim, config.block_bias
         super().__init__(
-            nn.Conv2d(channels, dim, 3, padding=1, bias=False),
+            nn.Conv2d(config.in_channels + config.normalised, dim, 3, padding=1, bias=False),
             nn.LeakyReLU(0.1, inplace=True),
-            ResidualBlock(dim),
+            ResidualBlock(dim, bias=bias),
             ResidualASPP(dim),
-            ResidualBlock(dim),
+            ResidualBlock(dim, bias=bias),
             ResidualASPP(dim),
-            ResidualBlock(dim),
+            ResidualBlock(dim, bias=bias),
         )
 
 
 class AttentionEngine(nn.Module):
     """Queries of alpha, keys and values of each beta, C3 over each field."""
 
-    def __init__(self, betas: int, dim: int, interpolation: Literal["nearest", "bilinear"]) -> None:
+    def __init__(self, config: PATConfig) -> None:
         super().__init__()
-        self.interpolation = interpolation
-        self.before = ResidualBlock(dim)
+        betas, dim = config.betas, config.dim
+        self.interpolation, self.values_after_block = config.interpolation, config.values_after_block
+        self.before = ResidualBlock(dim, bias=config.block_bias)
         self.query = nn.Conv2d(dim, dim, 1)
         self.key = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
         self.value = nn.ModuleList(nn.Conv2d(dim, dim, 1) for _ in range(betas))
+        for key in self.key:
+            # Equal features score high from the first step on: drawn apart, keys and queries have to find each other.
+            key.load_state_dict(self.query.state_dict())
 
-    def forward(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Attended]:
-        """For each beta, its values seen from alpha, and where they were."""
-        query = self.query(self.before(own))
-        return [
-            attend_with_statistics(
-                query,
-                key(self.before(f)),
-                value(f),
-                field.at if field.pixels is None else _segments(field.pixels, query),
-                samples=field.samples,
-                interpolation=self.interpolation,
-            )
-            for f, key, value, field in zip(others, self.key, self.value, fields)
-        ]
+    def compare(self, own: Tensor, others: Sequence[Tensor], fields: Sequence[FieldOnGrid]) -> list[Compared]:
+        """The query, each beta's key and value, and where they are compared."""
+        query, how = self.query(self.before(own)), self.interpolation
+        found = []
+        for f, to_key, to_value, field in zip(others, self.key, self.value, fields):
+            after = self.before(f)
+            value = to_value(after if self.values_after_block else f)
+            locations = field.at if field.pixels is None else _segments(field.pixels, query)
+            found.append(Compared(query, to_key(after), value, locations, field.samples, how))
+        return found
 
 
 def _segments(segments: Segments, like: Tensor) -> Segments:
@@ -130,10 +157,11 @@ def _segments(segments: Segments, like: Tensor) -> Segments:
 class PostFusion(nn.Sequential):
     """1x1 fusion of alpha's and the attended features, four residual blocks, pixel shuffle."""
 
-    def __init__(self, inputs: int, dim: int, outputs: int, scale: int) -> None:
+    def __init__(self, config: PATConfig) -> None:
+        dim, outputs, scale = config.dim, config.out_channels, config.scale
         super().__init__(
-            nn.Conv2d(inputs, dim, 1, bias=False),
-            *(ResidualBlock(dim) for _ in range(4)),
+            nn.Conv2d((config.betas + 1) * dim, dim, 1, bias=config.fusion_bias),
+            *(ResidualBlock(dim, bias=config.block_bias) for _ in range(4)),
             nn.Conv2d(dim, dim * scale**2, 1, bias=False),
             nn.PixelShuffle(scale),
             nn.Conv2d(dim, outputs, 3, padding=1, bias=False),

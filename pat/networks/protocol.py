@@ -10,6 +10,7 @@ from torch import Tensor
 
 from arraygeom.chunks import Box
 
+from ..attention.scores import Compared
 from ..matching.inputs import Inputs
 from ..matching.match import match
 from ..matching.matches import Matches
@@ -83,6 +84,15 @@ class Explaining(Protocol):
 
     def explain(self, inputs: Inputs, matches: Any) -> tuple[FusionOutput, list[Any]]:
         """Fuse, and the estimate of each beta."""
+        ...
+
+
+@runtime_checkable
+class Comparing(Protocol):
+    """A network with C3 attention over the segments of its inputs, which training can supervise by geometry."""
+
+    def compare(self, inputs: Inputs) -> tuple[FusionOutput, list[Compared]]:
+        """Fuse, and what attention compares in each beta."""
         ...
 
 

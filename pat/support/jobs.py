@@ -30,11 +30,15 @@ OnError = Literal["stop", "skip"]
 
 
 class Task(NamedTuple):
-    """Work that writes the file `makes` (and others before it); `run(*given)` must be fit to be pickled."""
+    """Work that writes the file `makes` (and others before it); `run(*given)` must be fit to be pickled.
+
+    Messages name `about`, or else the file that is made.
+    """
 
     makes: Path
     run: Callable[..., None]
     given: tuple[object, ...] = ()
+    about: str = ""
 
 
 class TaskOutcome(NamedTuple):
@@ -54,13 +58,13 @@ class JobReport:
     failed: dict[Path, str] = field(default_factory=dict)
     warned: dict[str, list[Path]] = field(default_factory=dict)
 
-    def warn(self, outcome: TaskOutcome) -> None:
+    def warn(self, outcome: TaskOutcome, about: str) -> None:
         """Pass on the warnings of a task, one of each kind: texts that differ in numbers alone are of one kind."""
         for warning in outcome.warnings:
             kind = re.sub(r"[\d.]+", "", f"{type(warning).__name__}: {warning}")
             files = self.warned.setdefault(kind, [])
             if not files:
-                warnings.warn(f"{outcome.makes.name}: {warning}", type(warning), stacklevel=3)
+                warnings.warn(f"{about}: {warning}", type(warning), stacklevel=3)
             if outcome.makes not in files:
                 files.append(outcome.makes)
 
@@ -161,19 +165,20 @@ def run_tasks(
             task.makes.unlink(missing_ok=True)
     report = JobReport(kept=[t.makes for t in tasks if t.makes.exists()])
     there = set(report.kept)
+    named = {t.makes: t.about or t.makes.name for t in tasks}
     left = [t for t in tasks if t.makes not in there]
     console = console or Console(stderr=True)
     run = _in_this_process if workers.count == 1 and workers.scheduler is None else _on_dask
     for outcome in followed(run(left, workers), title=title, total=len(tasks), done=len(there), console=console):
         if outcome.error is None:
             report.made.append(outcome.makes)
-            report.warn(outcome)
+            report.warn(outcome, named[outcome.makes])
             continue
         report.failed[outcome.makes] = outcome.error
         if on_error == "stop":
-            text = f"{outcome.makes.name}: {outcome.error} ({report}; begin again with --resume)"
+            text = f"{named[outcome.makes]}: {outcome.error} ({report}; begin again with --resume)"
             raise JobError(text) from next(iter(outcome.warnings[::-1]), None)
-        console.print(f"skipped {outcome.makes.name}: {outcome.error}", style="yellow", markup=False)
+        console.print(f"skipped {named[outcome.makes]}: {outcome.error}", style="yellow", markup=False)
     return report
 
 

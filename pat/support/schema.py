@@ -11,6 +11,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from arraygeom.text import short
+
 T = TypeVar("T")
 
 
@@ -82,7 +84,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
         return _read_dataclass(kind, value, entry)
     if origin is typing.Literal:
         if value not in arguments:
-            raise ValueError(f"{entry}: is {value!r}{near(value, arguments)}")
+            raise ValueError(f"{entry}: is {short(value)}{near(value, arguments)}")
         return value
     if origin is tuple:
         return _read_tuple(arguments, value, entry)
@@ -95,7 +97,7 @@ def _read(kind: Any, value: Any, entry: str) -> Any:
 
 def _read_dataclass(kind: Any, value: Any, entry: str) -> Any:
     if not isinstance(value, dict):
-        raise ValueError(f"{entry or kind.__name__}: is {value!r}; wanted a mapping")
+        raise ValueError(f"{entry or kind.__name__}: is {short(value)}; wanted a mapping")
     fields = {f.name: f for f in dataclasses.fields(kind) if f.init}
     for key in value:
         if key not in fields:
@@ -116,7 +118,7 @@ def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any
     if isinstance(value, str) and arguments[1:] == (...,):
         value = [value]
     if not isinstance(value, list | tuple):
-        raise ValueError(f"{entry}: is {value!r}; wanted a list")
+        raise ValueError(f"{entry}: is {short(value)}; wanted a list")
     kinds = (arguments[0],) * len(value) if arguments[1:] == (...,) else arguments
     if len(kinds) != len(value):
         raise ValueError(f"{entry}: has {len(value)} entries; wanted {len(kinds)}")
@@ -125,7 +127,7 @@ def _read_tuple(arguments: tuple[Any, ...], value: Any, entry: str) -> tuple[Any
 
 def _read_mapping(arguments: tuple[Any, ...], value: Any, entry: str) -> dict[Any, Any]:
     if not isinstance(value, dict):
-        raise ValueError(f"{entry}: is {value!r}; wanted a mapping")
+        raise ValueError(f"{entry}: is {short(value)}; wanted a mapping")
     return {k: _read(arguments[1], v, _below(entry, k)) for k, v in value.items()}
 
 
@@ -156,7 +158,7 @@ def _read_plain(kind: Any, value: Any, entry: str) -> Any:
     if kind is Path and isinstance(value, str):
         return Path(value).expanduser()
     if not isinstance(value, kind) or (kind is int and isinstance(value, bool)):
-        raise ValueError(f"{entry}: is {value!r}; wanted {_PLAIN.get(kind, kind.__name__)}")
+        raise ValueError(f"{entry}: is {short(value)}; wanted {_PLAIN.get(kind, kind.__name__)}")
     return value
 
 

@@ -7,7 +7,9 @@ worth speaking of; *tuned*: chosen on images, which are named.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import Field, field, fields
+from dataclasses import Field, field, fields, is_dataclass
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Any, Literal, NamedTuple
 
 Kind = Literal["physics", "size", "tuned"]
@@ -32,7 +34,7 @@ def _entry(kind: Kind, value: Any, why: str) -> Any:
     return field(default=value, metadata={"kind": kind, "why": why})
 
 
-class Setting(NamedTuple):
+class SettingEntry(NamedTuple):
     """One entry of an algorithm's settings: its name, value, kind, and why it is so."""
 
     algorithm: str
@@ -47,11 +49,11 @@ class Setting(NamedTuple):
         return len(self.value) if isinstance(self.value, tuple) else 1
 
 
-def listed(settings: Any) -> Iterator[Setting]:
+def listed(settings: Any) -> Iterator[SettingEntry]:
     """The entries of an algorithm's settings, in their order. Raises ValueError for one without a kind."""
     name = type(settings).__name__
     for entry in fields(settings):
-        yield Setting(name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"])
+        yield SettingEntry(name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"])
 
 
 def _kind(algorithm: str, entry: Field[Any]) -> Kind:
@@ -59,3 +61,13 @@ def _kind(algorithm: str, entry: Field[Any]) -> Kind:
     if kind is None:
         raise ValueError(f"{algorithm}.{entry.name} is not said to be physics, size or tuned")
     return kind
+
+
+def all_settings(*rooms: str) -> list[SettingEntry]:
+    """The entries of all settings of these packages, such as "pat.matching", in the order of their modules."""
+    found: dict[str, Any] = {}
+    for room in rooms:
+        for module in iter_modules(import_module(room).__path__, f"{room}."):
+            values = vars(import_module(module.name)).values()
+            found |= {type(v).__name__: v for v in values if is_dataclass(v) and type(v).__name__.endswith("Settings")}
+    return [entry for settings in found.values() for entry in listed(settings)]

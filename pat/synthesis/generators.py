@@ -20,6 +20,7 @@ from arraygeom.rig import Rig
 
 from ..media.colour import linear_from_srgb
 from ..media.images import decoded_photograph
+from ..support.folders import files_below
 from .furnish import Setting, furnished, seeded, vec
 from .landscape import landscape
 from .scene import BoardObject, Key, Light, Material, Motion, Object, Paint, Scene, Texture, TextureKind, Vec3, World
@@ -133,7 +134,7 @@ def _near_infrared(rng: Generator, rgb: Vec3) -> float:
 
 @lru_cache(maxsize=8)
 def _images(folder: Path) -> tuple[str, ...]:
-    found = sorted(str(p.resolve()) for p in folder.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES)
+    found = sorted(str(p.resolve()) for p in files_below(folder) if p.suffix.lower() in IMAGE_SUFFIXES)
     if not found:
         raise ValueError(f"{folder}: no images ({', '.join(sorted(IMAGE_SUFFIXES))}) under this folder")
     return tuple(found)

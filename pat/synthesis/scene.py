@@ -19,6 +19,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from arraygeom.atomic import write_text
+from arraygeom.safe_yaml import load_json
 
 from ..support.schema import from_document, parse_yaml, to_document
 
@@ -235,8 +236,8 @@ class Scene:
     def from_yaml(cls, text: str, source: str = "scene") -> Scene:
         """The scene of a file's text (YAML or JSON). Raises ValueError naming `source` and the entry."""
         try:
-            document = json.loads(text) if text.lstrip().startswith("{") else parse_yaml(text, source)
-        except (json.JSONDecodeError, RecursionError) as error:
+            document = load_json(text) if text.lstrip().startswith("{") else parse_yaml(text, source)
+        except json.JSONDecodeError as error:
             raise ValueError(f"{source}: not valid JSON: {error}") from None
         if not isinstance(document, dict) or document.pop("format", None) != FORMAT:
             raise ValueError(f"{source}: not a scene file: its first line must be 'format: {FORMAT}'")

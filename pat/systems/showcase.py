@@ -25,7 +25,8 @@ from ..evaluation.protocols import BASELINES, rectified_fusion
 from ..evaluation.stereo import StereoRow, evaluate_sets, markdown, sets_markdown, structure_kept
 from ..evaluation.tables import markdown_table
 from ..fusion.fuse import fuse
-from ..fusion.steps import normalised, resolution_ratio
+from ..fusion.steps import resolution_ratio
+from ..matching.normalisation import normalised
 from ..media.colour import luminance_of, srgb_image
 from ..media.figures import colour_depth, save_panels
 from ..media.images import read_image

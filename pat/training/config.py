@@ -75,6 +75,8 @@ class TrainConfig:
     """Height and width of alpha in the scenes."""
     loss: Literal["psnr", "psnr-ssim", "mse"] = "psnr-ssim"
     """On the image: minus the mean PSNR, with or without SSIM, or the mean squared error."""
+    attention: float = 0.0
+    """Weight of the cross-entropy of PAT's attention against the true position, beside the loss on the image."""
     rate: float = 8e-4
     """Learning rate of Adam."""
     momenta: tuple[float, float] = (0.9, 0.99)
@@ -107,6 +109,10 @@ class TrainConfig:
     """Share of the batches made of stereo pairs."""
     pairs_from: tuple[Path, ...] = ()
     """Folders of rectified stereo pairs in colour."""
+    measured: float = 0.0
+    """Share of the batches made of stereo pairs with true disparity."""
+    measured_from: tuple[Path, ...] = ()
+    """Folders of Middlebury's stereo pairs, with the true disparity of both images."""
     recording: RecordingConfig = RecordingConfig()
     field: FieldName = "epipolar"
     """The receptive field, by name."""
@@ -129,6 +135,8 @@ class TrainConfig:
         for name in ("steps", "batch", "groups", "average", "validate", "save", "held_out"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.attention >= 0:
+            raise ValueError(f"attention must be 0 or more, got {self.attention:g}")
         for name in ("minutes", "rate", "reuse", "clip"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} must be more than 0, got {getattr(self, name):g}")
@@ -137,15 +145,16 @@ class TrainConfig:
         self._check_sources()
 
     def _check_sources(self) -> None:
-        for name in ("rendered", "pairs"):
+        for name in ("rendered", "pairs", "measured"):
             share, folders = getattr(self, name), getattr(self, f"{name}_from")
             if not 0 <= share <= 1:
                 raise ValueError(f"{name} is a share of the batches, 0 to 1, got {share:g}")
             if bool(share) != bool(folders):
                 found = "there is no folder" if share else f"{folders[0]} is given"
                 raise ValueError(f"{name} is {share:g} and {found}: give both `{name}` and `{name}_from`, or neither")
-        if self.rendered + self.pairs > 1:
-            raise ValueError(f"rendered and pairs are shares of the batches, {self.rendered + self.pairs:g} in all")
+        total = self.rendered + self.pairs + self.measured
+        if total > 1:
+            raise ValueError(f"rendered, pairs and measured are shares of the batches, {total:g} in all")
 
 
 def recipes() -> tuple[str, ...]:

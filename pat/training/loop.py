@@ -89,7 +89,7 @@ class Run:
                 in_bfloat16(part)
             if config.compile:
                 part.compile()
-        self.objective = here.together(Objective(self.network, config.loss))
+        self.objective = here.together(Objective(self.network, config.loss, attention=config.attention))
         self.loss, self.ticked = math.nan, time.monotonic()
 
     @property
@@ -179,7 +179,7 @@ class Run:
 
     def _offence(self, given: list[Sample]) -> str:
         """Save the groups of a failed step; the error message names the samples."""
-        objective = Objective(self.network, self.config.loss)
+        objective = Objective(self.network, self.config.loss, attention=self.config.attention)
         found = []
         for group, part in zip(self.groups, given):
             bad = [i for i in range(len(part.alpha)) if not finite(objective, alone(part, i))]

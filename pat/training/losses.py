@@ -9,10 +9,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, binary_cross_entropy_with_logits, mse_loss
 
+from pat.attention.scores import Compared, peak_position
 from pat.networks.guided import BetaEstimate
-from pat.networks.protocol import Explaining, FusionNetwork, FusionOutput, fused_at_once, matched_for
+from pat.networks.protocol import Comparing, Explaining, FusionNetwork, FusionOutput, fused_at_once, matched_for
 from pat.networks.weights import Network
 
+from .attention_loss import attention_loss
 from .samples import Sample
 
 
@@ -44,13 +46,20 @@ IMAGE_LOSSES: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
 class Objective(nn.Module):
     """A network and its loss in one module, so that DistributedDataParallel sees one forward."""
 
-    def __init__(self, network: Network, loss: str) -> None:
+    def __init__(self, network: Network, loss: str, *, attention: float = 0.0) -> None:
         super().__init__()
+        if attention and not isinstance(network, Comparing):
+            raise ValueError(f"attention: {type(network).__name__} has no attention to supervise: leave it at 0")
         self.network = network
         self.image_loss = IMAGE_LOSSES[loss]
+        self.attention = attention
 
     def forward(self, given: Sample) -> Tensor:
         """The loss of a group of samples."""
+        if self.attention and isinstance(self.network, Comparing):
+            fused, compared = self.network.compare(given.inputs)
+            where = attention_loss(compared, given.position, given.visible)
+            return self.image_loss(fused.image, given.ground_truth) + self.attention * where
         fused, seen = explained(self.network, given)
         loss = self.image_loss(fused.image, given.ground_truth)
         return loss + match_loss(seen, given) if seen else loss
@@ -76,14 +85,28 @@ def match_loss(seen: list[BetaEstimate], given: Sample) -> Tensor:
 
 @torch.no_grad()
 def validation(network: FusionNetwork, samples: list[Sample]) -> dict[str, float]:
-    """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth)."""
-    psnr, near = [], []
+    """Mean PSNR, and the share of visible pixels matched within 1.5 pixels (NaN without ground truth).
+
+    Of networks that are `Comparing` also `peaks`, the share of them where the largest weight is within a pixel of the
+    true position.
+    """
+    psnr, near, peaks = [], [], []
     for given in samples:
-        fused = fused_at_once(network, given.inputs)
+        fused, compared = _compared(network, given)
         error = (fused.image.clamp(0, 1) - given.ground_truth).square().flatten(1).mean(1)
         psnr.append(-10 * error.clamp(min=1e-8).log10().mean())
         for where, visible in list(zip(given.position, given.visible))[:1]:
             off = (fused.position[0] - where.movedim(-1, 1)).norm(dim=1)
             near.append((off[visible] < 1.5).float().mean())
+            for one in compared[:1]:
+                off = (peak_position(one) - where.movedim(-1, 1)).norm(dim=1)
+                peaks.append((off[visible] <= 1).float().mean())
     matched = float(torch.stack(near).nanmean()) if near else math.nan
-    return {"psnr": float(torch.stack(psnr).mean()), "matched": matched}
+    found = {"peaks": float(torch.stack(peaks).nanmean())} if peaks else {}
+    return {"psnr": float(torch.stack(psnr).mean()), "matched": matched} | found
+
+
+def _compared(network: FusionNetwork, given: Sample) -> tuple[FusionOutput, list[Compared]]:
+    if isinstance(network, Comparing) and given.fields[0].pixels is not None:
+        return network.compare(given.inputs)
+    return fused_at_once(network, given.inputs), []

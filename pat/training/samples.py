@@ -37,6 +37,7 @@ from pat.synthesis.rigs import below
 
 from .config import RecordingConfig, TrainConfig
 from .lenses import LOST, through_lenses
+from .measured import MeasuredPairs
 from .scenes import RenderedCrops
 from .spectra import MOST, Spectra
 from .stereo import PairCrops
@@ -95,10 +96,14 @@ def plan(config: TrainConfig, seed: int) -> Iterator[Planned]:
 
 def _source(config: TrainConfig, draw: random.Random) -> str | None:
     """The source of scenes, if not photographs. Draws only where there is a choice."""
-    if not (config.rendered or config.pairs):
+    if not (config.rendered or config.pairs or config.measured):
         return None
     drawn = draw.random()
-    return "rendered" if drawn < config.rendered else "pairs" if drawn < config.rendered + config.pairs else None
+    for kind in ("rendered", "pairs", "measured"):
+        drawn -= getattr(config, kind)
+        if drawn < 0:
+            return kind
+    return None
 
 
 class SampleSource:
@@ -176,7 +181,7 @@ def scenes(
     config: TrainConfig, *, field: ReceptiveField | None = None, device: str = "cpu"
 ) -> tuple[SampleSource, SampleSource]:
     """Sources of samples to learn from and to validate on, from different photographs, scenes and pairs."""
-    layered = config.rendered + config.pairs < 1
+    layered = config.rendered + config.pairs + config.measured < 1
     bank, unseen = photographs(config) if layered else (None, None)
     look, n = field or FIELDS[config.field](), config.held_out
     learn, validate = config.seed + 1, config.seed + 2
@@ -202,6 +207,9 @@ def crops(
     if config.pairs_from:
         rigs = config.rectified_rigs
         found["pairs"] = PairCrops(config.pairs_from, resolutions=rigs.resolutions, **common)
+    if config.measured_from:
+        rigs = config.rectified_rigs
+        found["measured"] = MeasuredPairs(config.measured_from, resolutions=rigs.resolutions, **common)
     return found
 
 

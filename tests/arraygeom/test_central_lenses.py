@@ -80,6 +80,13 @@ def scaramuzza(X, b2, b3, b4):
     return points, seen
 
 
+def polynomial_fisheye(X, k2, k3, k4):
+    rho, angle = np.hypot(X[:, 0], X[:, 1]), np.arctan2(np.hypot(X[:, 0], X[:, 1]), X[:, 2])
+    r = np.polyval([k4, k3, k2, 1, 0], angle)
+    rising = [np.polyval([4 * k4, 3 * k3, 2 * k2, 1], np.linspace(0, a, 200)).min() > 0 for a in angle]
+    return X[:, :2] / rho[:, None] * r[:, None], np.array(rising)
+
+
 FORMULAS = {
     "double-sphere": (double_sphere, [(-0.2, 0.57), (0.3, 0.4), (-0.6, 0.9), (0.0, 0.0)]),
     "extended-unified": (extended_unified, [(0.6, 1.1), (0.4, 0.9), (1.0, 1.0), (0.0, 2.0)]),
@@ -89,10 +96,11 @@ FORMULAS = {
         thin_prism_fisheye,
         [(0.05, -0.01, 1e-3, -2e-3, 3e-3, -5e-4, 1e-3, -7e-4), (-0.03, 0, 0, 0, 0, 0.002, 0, 0), (0.0,) * 8],
     ),
+    "polynomial-fisheye": (polynomial_fisheye, [(0.006, -0.056, 0.0), (-0.1, 0.02, 0.004), (0.0, 0.0, 0.0)]),
     "scaramuzza": (scaramuzza, [(-0.3, 0.02, -0.01), (-0.2, 0.0, 0.0), (0.05, -0.1, -0.02), (0.0, 0.0, 0.0)]),
 }
 CASES = [(model, c) for model, (_, sets) in FORMULAS.items() for c in sets]
-BEHIND = ("double-sphere", "extended-unified", "unified", "scaramuzza")
+BEHIND = ("double-sphere", "extended-unified", "unified", "polynomial-fisheye", "scaramuzza")
 
 
 def lens(model: str, c, dtype=torch.float64) -> Distortion:

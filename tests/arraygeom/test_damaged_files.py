@@ -1,6 +1,9 @@
 """Files that crash the parsers underneath (OpenCV's, scipy's): refused before these see them."""
 
+import json
+import os
 import random
+import time
 from pathlib import Path
 
 import numpy as np
@@ -83,3 +86,66 @@ def test_models_that_are_not_read_say_what_to_do(tmp_path):
     (tmp_path / "a.yaml").write_text("cam0:\n  camera_model: tele\n  intrinsics: [1]\n  resolution: [4, 4]\n")
     with pytest.raises(RigFileError, match="pinhole-radtan"):
         Rig.load(tmp_path / "a.yaml")
+
+
+FRAME = {"file_path": "a", "w": 640, "h": 480, "fl_x": 500.0, "transform_matrix": np.eye(4).tolist()}
+
+
+def nerfstudio(folder: Path, frame: dict, **top: object) -> Path:
+    (folder / "transforms.json").write_text(json.dumps({**top, "frames": [frame]}))
+    return folder / "transforms.json"
+
+
+def native(folder: Path, camera: str) -> Path:
+    (folder / "rig.yaml").write_text(f"format: arraygeom-rig 1\ncameras:\n  a: {{{camera}}}\n")
+    return folder / "rig.yaml"
+
+
+@pytest.mark.parametrize("camera", ["size: [true, 480]", "size: [640, 480], focal: true", "size: true"])
+def test_true_is_no_number(camera, tmp_path):
+    with pytest.raises(RigFileError, match="True"):
+        Rig.load(native(tmp_path, camera))
+
+
+@pytest.mark.parametrize("entry", ["w", "fl_x"])
+def test_true_is_no_number_in_json(entry, tmp_path):
+    assert read_rig(nerfstudio(tmp_path, FRAME)).names == ("a",)
+    with pytest.raises(RigFileError, match="True"):
+        read_rig(nerfstudio(tmp_path, FRAME | {entry: True}))
+
+
+def test_half_a_character_is_refused(tmp_path):
+    """A name with one cannot be printed."""
+    with pytest.raises(RigFileError, match="half a character") as caught:
+        read_rig(nerfstudio(tmp_path, FRAME | {"file_path": "a\ud800"}))
+    str(caught.value).encode()
+    assert read_rig(nerfstudio(tmp_path, FRAME | {"file_path": "\U0001f4f7"})).names == ("\U0001f4f7",)
+
+
+def test_a_megabyte_of_repeated_entries_is_refused_at_once(tmp_path):
+    """It took over a minute: every name was counted in the list of all."""
+    names = ", ".join(f'"{i:05d}": 1' for i in range(70_000))
+    (tmp_path / "t.json").write_text(f'{{{names}, {names}, "frames": [{{"transform_matrix": 1}}]}}')
+    begin = time.process_time()
+    with pytest.raises(RigFileError, match="'00000' occurs twice"):
+        read_rig(tmp_path / "t.json", format="nerfstudio")
+    assert time.process_time() - begin < 5
+
+
+@pytest.mark.parametrize(
+    "camera", [f"size: [640, 480], K: {[[1 / 3] * 3, [2 / 3] * 3, ['x'] * 3]}", f"size: {[1 / 3] * 3 + ['x'] * 900}"]
+)
+def test_a_message_shows_a_value_in_short(camera, tmp_path):
+    with pytest.raises(RigFileError) as caught:
+        Rig.load(native(tmp_path, camera))
+    message = str(caught.value).replace(str(tmp_path), "")
+    assert "0.3333, 0.3333" in message
+    assert len(message) < 200
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no pipes in folders")
+def test_a_pipe_is_no_rig(tmp_path):
+    """Reading one waits for ever."""
+    os.mkfifo(tmp_path / "rig.yaml")
+    with pytest.raises(RigFileError, match="neither a file nor a folder"):
+        read_rig(tmp_path / "rig.yaml", format="native")

@@ -29,14 +29,13 @@ from arraygeom import (
     stack,
     triangulate,
 )
-from arraygeom.pose import rotation_vector
+from arraygeom.pose import cross_matrix, rotation_vector
 from tests.arraygeom.rigs import random_rig, scene_points
 
 F64 = torch.float64
 RIG = random_rig(3)
 ALPHA, BETA = RIG["alpha"], RIG["beta"]
 PAIR = RIG.pair("alpha", "beta")
-H = PAIR.homography
 IMAGE = torch.rand(1, 2, 48, 64, dtype=F64, generator=torch.Generator().manual_seed(0))
 LENS = torch.tensor([-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003], dtype=F64)
 
@@ -58,48 +57,52 @@ def up_to_scale(F: Tensor) -> Tensor:
     return F / F.norm() * F[2, 2].sign()
 
 
-def lens_view(c: Tensor) -> LensView:
-    return LensView(hw=ALPHA.hw, K=ALPHA.K, distortion=Distortion("brown-conrady", c))
-
-
-def cases(points: int) -> dict[str, Parity]:
+def cases(points: int, dtype: torch.dtype = F64) -> dict[str, Parity]:
     """What both libraries have, for some points that both cameras of RIG see."""
     X = scene_points(RIG, points)
-    x_alpha, x_beta = ALPHA.project(X).x, BETA.project(X).x
-    vectors = torch.randn(points, 3, dtype=F64, generator=torch.Generator().manual_seed(1))
+    x_alpha, x_beta, X = (v.to(dtype) for v in (ALPHA.project(X).x, BETA.project(X).x, X))
+    vectors = torch.randn(points, 3, dtype=F64, generator=torch.Generator().manual_seed(1)).to(dtype)
+    rig = RIG.to(dtype)
+    alpha, beta, pair = rig["alpha"], rig["beta"], rig.pair("alpha", "beta")
+    F, H, image = PAIR.fundamental.to(dtype), PAIR.homography.to(dtype), IMAGE.to(dtype)
+
+    def lens_view(c: Tensor) -> LensView:
+        return LensView(hw=alpha.hw, K=alpha.K, distortion=Distortion("brown-conrady", c))
+
     return {
         "epipolar lines": Parity(
             lambda F: epipolar_lines(F, x_alpha),
             lambda F: epipolar.compute_correspond_epilines(x_alpha[None], F[None])[0],
-            PAIR.fundamental,
+            F,
         ),
         "epipolar distance": Parity(
             lambda F: epipolar_distance(F, x_alpha, x_beta + 1).abs(),
             lambda F: epipolar.left_to_right_epipolar_distance(x_alpha[None], x_beta[None] + 1, F[None])[0],
-            PAIR.fundamental,
+            F,
         ),
         "essential matrix": Parity(
-            lambda t: essential_matrix(PAIR.beta_from_alpha.replace(t=t)),
-            lambda t: epipolar.cross_product_matrix(t) @ PAIR.beta_from_alpha.R,
-            PAIR.beta_from_alpha.t,
+            lambda t: essential_matrix(pair.beta_from_alpha.replace(t=t)),
+            lambda t: epipolar.cross_product_matrix(t) @ pair.beta_from_alpha.R,
+            pair.beta_from_alpha.t,
         ),
         "fundamental matrix": Parity(
-            lambda K: up_to_scale(fundamental_matrix(K, BETA.K, PAIR.beta_from_alpha)),
+            lambda K: up_to_scale(fundamental_matrix(K, beta.K, pair.beta_from_alpha)),
             lambda K: up_to_scale(
-                epipolar.fundamental_from_projections(projection(ALPHA.replace(K=K))[None], projection(BETA)[None])[0]
+                epipolar.fundamental_from_projections(projection(alpha.replace(K=K))[None], projection(beta)[None])[0]
             ),
-            ALPHA.K,
+            alpha.K,
             1e-7,
         ),
+        "cross product matrix": Parity(cross_matrix, epipolar.cross_product_matrix, vectors),
         "homography of points": Parity(
             lambda H: apply_homography(H, x_alpha).x, lambda H: transform_points(H[None], x_alpha[None])[0], H
         ),
         "projection": Parity(
-            lambda X: ALPHA.project_local(X).x, lambda X: project_points(X, ALPHA.K), ALPHA.cam_from_world.apply(X)
+            lambda X: alpha.project_local(X).x, lambda X: project_points(X, alpha.K), alpha.cam_from_world.apply(X)
         ),
         "unprojection": Parity(
-            lambda x: torch.cat(ALPHA.rays(x)[:1]) * 2.0,
-            lambda x: unproject_points(x, torch.full((len(x), 1), 2.0, dtype=F64), ALPHA.K.expand(len(x), 3, 3)),
+            lambda x: torch.cat(alpha.rays(x)[:1]) * 2.0,
+            lambda x: unproject_points(x, torch.full((len(x), 1), 2.0, dtype=dtype), alpha.K.expand(len(x), 3, 3)),
             x_alpha,
         ),
         "exp of a rotation": Parity(rotation_from_vector, lambda w: So3.exp(w).matrix(), vectors),
@@ -107,40 +110,42 @@ def cases(points: int) -> dict[str, Parity]:
             lambda w: rotation_vector(rotation_from_vector(w)), lambda w: So3.exp(w).log(), vectors, 1e-7
         ),
         "inverse pose": Parity(
-            lambda w: ALPHA.cam_from_world.perturbed(w).inverse().t,
-            lambda w: Se3(So3.from_matrix(rotation_from_vector(w) @ ALPHA.R), ALPHA.t).inverse().matrix()[:3, 3],
+            lambda w: alpha.cam_from_world.perturbed(w).inverse().t,
+            lambda w: Se3(So3.from_matrix(rotation_from_vector(w) @ alpha.R), alpha.t).inverse().matrix()[:3, 3],
             0.1 * vectors[0],
             1e-8,
         ),
         "composed poses": Parity(
-            lambda t: (BETA.cam_from_world @ ALPHA.cam_from_world.replace(t=t).inverse()).t,
-            lambda t: (matrix4(BETA.R, BETA.t) @ inverse_transformation(matrix4(ALPHA.R, t)))[:3, 3],
-            ALPHA.t,
+            lambda t: (beta.cam_from_world @ alpha.cam_from_world.replace(t=t).inverse()).t,
+            lambda t: (matrix4(beta.R, beta.t) @ inverse_transformation(matrix4(alpha.R, t)))[:3, 3],
+            alpha.t,
         ),
         "triangulation": Parity(
-            lambda x: triangulate([ALPHA, BETA], torch.stack([x_alpha, x])).X,
-            lambda x: epipolar.triangulate_points(projection(ALPHA), projection(BETA), x_alpha, x),
+            lambda x: triangulate([alpha, beta], torch.stack([x_alpha, x]), deviation=0.01).X,
+            lambda x: epipolar.triangulate_points(projection(alpha), projection(beta), x_alpha, x),
             x_beta,
             2e-6,
         ),
         "distortion": Parity(
             lambda c: lens_view(c).distort(x_alpha)[0],
-            lambda c: calibration.distort_points(x_alpha[None], ALPHA.K[None], c[None])[0],
-            LENS,
+            lambda c: calibration.distort_points(x_alpha[None], alpha.K[None], c[None])[0],
+            LENS.to(dtype),
         ),
         "undistortion": Parity(
             lambda c: lens_view(c).undistort(x_alpha)[0],
-            lambda c: calibration.undistort_points(x_alpha[None], ALPHA.K[None], c[None], num_iters=60)[0],
-            LENS,
+            lambda c: calibration.undistort_points(x_alpha[None], alpha.K[None], c[None], num_iters=60)[0],
+            LENS.to(dtype),
             1e-6,
         ),
         "sampling": Parity(
-            lambda x: sample(IMAGE, x[None]).values[0],
-            lambda x: remap(IMAGE, x[None, None, :, 0], x[None, None, :, 1], align_corners=True)[0, :, 0],
+            lambda x: sample(image, x[None]).values[0],
+            lambda x: remap(image, x[None, None, :, 0], x[None, None, :, 1], align_corners=True)[0, :, 0],
             x_alpha.clamp(1.3, 46.3),
         ),
         "pixel grid": Parity(
-            lambda s: s * pixel_grid((3, 5), dtype=F64), lambda s: s * created_grid(3, 5), torch.ones((), dtype=F64)
+            lambda s: s * pixel_grid((3, 5), dtype=dtype),
+            lambda s: s * created_grid(3, 5, dtype),
+            torch.ones((), dtype=dtype),
         ),
     }
 
@@ -151,14 +156,14 @@ CASES = cases(40)
 
 
 def matrix4(R: Tensor, t: Tensor) -> Tensor:
-    last = torch.tensor([[0.0, 0, 0, 1]], dtype=F64)
+    last = R.new_tensor([[0.0, 0, 0, 1]])
     return torch.cat([torch.cat([R, t[:, None]], -1), last])
 
 
-def created_grid(h: int, w: int) -> Tensor:
+def created_grid(h: int, w: int, dtype: torch.dtype) -> Tensor:
     from kornia.geometry.grid import create_meshgrid
 
-    return create_meshgrid(h, w, normalized_coordinates=False, dtype=F64)[0]
+    return create_meshgrid(h, w, normalized_coordinates=False, dtype=dtype)[0]
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -219,3 +224,22 @@ def test_our_tensors_go_through_kornia_and_back():
     found = epipolar.triangulate_points(projection(ALPHA), projection(BETA), X_ALPHA, X_BETA)
     torch.testing.assert_close(BETA.project(found).x, X_BETA)
     assert Camera.from_kornia(ALPHA.replace(K=K).to_kornia()).K.equal(K)
+
+
+def test_rigs_go_there_and_back():
+    for rig in (RIG, stack([RIG, RIG.perturbed({"alpha.focal": torch.tensor([1.0, 2.0], dtype=F64)})])):
+        assert Rig.from_kornia(rig.to_kornia(), depth=rig.depth) == rig
+    one = stack([RIG])
+    assert Rig.from_kornia(one.to_kornia(), batched=True, depth=one.depth) == one
+    shared = Rig({"alpha": ALPHA, "beta": stack([BETA, BETA])})
+    assert {camera.batch_size for camera in shared.to_kornia().values()} == {2}
+
+
+def test_unequal_batches_and_lenses_are_refused():
+    with pytest.raises(ValueError, match=r"batches of one length, got {'a': 2, 'b': 3}"):
+        Rig.from_kornia({"a": pinhole(2), "b": pinhole(3)})
+    bent = RIG.with_camera("beta", BETA.replace(distortion=Distortion("brown-conrady", LENS)))
+    with pytest.raises(ValueError, match="no lens model"):
+        bent.to_kornia()
+    with pytest.raises(ValueError, match="kornia has no camera without a calibration: b"):
+        Rig({"a": ALPHA, "b": LensView(hw=(4, 4), K=ALPHA.K)}).to_kornia()

@@ -90,3 +90,37 @@ def test_rotation_error_shows_reflections_and_scales():
     assert rotation_error(R) < 1e-12
     assert rotation_error(1.01 * R) == pytest.approx(0.0201, abs=1e-6)
     assert rotation_error(-R) == 2
+
+
+def test_a_camera_looks_at_its_target():
+    g = torch.Generator().manual_seed(0)
+    centre, target, down = torch.randn(3, 20, 3, generator=g, dtype=torch.float64)
+    pose = Pose.look_at(centre, target, down=down)
+    torch.testing.assert_close(pose.centre, centre)
+    there = pose.apply(target)
+    torch.testing.assert_close(there, torch.nn.functional.pad((target - centre).norm(dim=-1)[:, None], (2, 0)))
+    y = pose.apply(centre + down)
+    assert y[:, 0].abs().max() < 1e-9
+    assert (y[:, 1] > 0).all()
+    assert float(rotation_error(pose.R).max()) < 1e-12
+    level = Pose.look_at(torch.zeros(3), torch.tensor([0.0, 0.0, 5.0]))
+    assert level.R.equal(torch.eye(3))
+    with pytest.raises(ValueError, match="give another `down`"):
+        Pose.look_at(torch.zeros(3), torch.tensor([0.0, 2.0, 0.0]))
+
+
+def test_poses_go_through_matrices_quaternions_and_kornias_se3():
+    g = torch.Generator().manual_seed(1)
+    pose = Pose(rotation_from_vector(torch.randn(7, 3, generator=g, dtype=torch.float64)), torch.randn(7, 3).double())
+    X = torch.randn(7, 3, generator=g, dtype=torch.float64)
+    homogeneous = torch.cat([X, torch.ones(7, 1)], -1)
+    torch.testing.assert_close((pose.matrix @ homogeneous[..., None])[:, :3, 0], pose.apply(X))
+    assert Pose.from_matrix(pose.matrix) == pose
+    assert (pose.inverse() @ pose).matrix.sub(torch.eye(4)).abs().max() < 1e-12
+    for back in (Pose.from_quaternion(pose.quaternion, pose.t), Pose.from_kornia(pose.to_kornia())):
+        torch.testing.assert_close(back.matrix, pose.matrix)
+    torch.testing.assert_close(pose.to_kornia().matrix(), pose.matrix)
+    torch.testing.assert_close(pose[0].to_kornia().matrix().reshape(4, 4), pose[0].matrix)
+    t = pose.t.clone().requires_grad_()
+    Pose.from_kornia(pose.replace(t=t).to_kornia()).apply(X).sum().backward()
+    torch.testing.assert_close(t.grad, torch.ones_like(t))

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from arraygeom import Camera, Distortion, depth_of, triangulate
+from arraygeom import Camera, Distortion, Pair, Pose, depth_of, intrinsics, stack, triangulate
 from tests.arraygeom.rigs import random_camera, uniform
 from tests.oracles import Oracle
 
@@ -117,8 +117,6 @@ def test_wrong_numbers_of_views_are_refused():
 @pytest.mark.parametrize("model", [None, "kannala-brandt", "brown-conrady"])
 def test_depth_and_its_deviation_along_a_field(model):
     """Deviation against moving the point by a hundredth of a pixel along its curve."""
-    from arraygeom import Pair
-
     lens = None if model is None else Distortion(model, torch.tensor([0.05, -0.01, 0.001, 0.0005]).double())
     cameras = array_of(2, lens=lens)
     pair = Pair(*cameras)
@@ -131,3 +129,76 @@ def test_depth_and_its_deviation_along_a_field(model):
     ends = [cameras[1].project(cameras[0].unproject(x[0], depth + s * found.deviation)).x for s in (0.5, -0.5)]
     moved = (ends[0] - ends[1]).norm(dim=-1)
     torch.testing.assert_close(moved, sigma, rtol=1e-3, atol=0)
+
+
+def wide_pair(dtype: torch.dtype = torch.float64) -> list[Camera]:
+    """Two of 12 megapixels, 10 cm apart: 400 / depth pixels of disparity."""
+    a = Camera(K=intrinsics(4000.0, (3000, 4000)), cam_from_world=Pose.identity(), hw=(3000, 4000))
+    b = a.replace(cam_from_world=Pose(torch.eye(3, dtype=torch.float64), torch.tensor([-0.1, 0, 0]).double()))
+    return [a.to(dtype), b.to(dtype)]
+
+
+def noisy_matches(disparity: torch.Tensor, noise: float) -> tuple[torch.Tensor, torch.Tensor]:
+    g, (a, b) = torch.Generator().manual_seed(3), wide_pair()
+    x = uniform(g, 0, 1, len(disparity), 2) * torch.tensor([3999.0, 2999.0])
+    X = a.unproject(x, 400 / disparity)
+    x = torch.stack([c.project(X).x for c in (a, b)])
+    return X, x + noise * torch.randn(x.shape, generator=g, dtype=torch.float64)
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.3, 1.0])
+def test_errors_are_within_three_stated_deviations(noise):
+    """Of 100,000 float32 matches at 1 to 100 px of disparity; those said not to be known count as right."""
+    X, x = noisy_matches(uniform(torch.Generator().manual_seed(4), 1, 100, 100_000), noise)
+    found = triangulate(wide_pair(torch.float32), x.float(), deviation=noise)
+    error = (found.X - X).abs()[..., 2]
+    beyond = found.valid & (error > 3 * found.covariance[:, 2, 2].sqrt())
+    assert float(beyond.float().mean()) < 0.003
+    assert float(found.valid.float().mean()) > 0.96
+
+
+def test_float32_at_12_megapixels_is_as_good_as_its_pixels():
+    """A float32 pixel of 4000 is good to 1.2e-4 px: at 10 px of disparity to 4e-5 of the depth."""
+    X, x = noisy_matches(torch.full((2000,), 10.0, dtype=torch.float64), 0.0)
+    found = triangulate(wide_pair(torch.float32), x.float())
+    assert found.valid.all()
+    assert found.X.dtype == torch.float32
+    torch.testing.assert_close(found.X.double(), X, rtol=4e-5, atol=1e-3)
+
+
+def test_noise_does_not_draw_distant_points_to_the_cameras():
+    _, x = noisy_matches(torch.full((5000,), 2.5, dtype=torch.float64), 1.0)
+    found = triangulate(wide_pair(torch.float32), x.float())
+    assert float(found.residual[found.valid].max()) < 5
+    assert float(found.X[found.valid][:, 2].min()) > 0.25 * 160
+    outlier = triangulate(wide_pair(), x + torch.tensor([[[0.0, 20.0]], [[0.0, -20.0]]]))
+    assert not outlier.valid.any()
+
+
+def test_batched_cameras_are_a_loop():
+    cameras = array_of(3)
+    _, x = seen_points(cameras, 12, noise=0.3)
+    batch = [stack([c, c.replace(K=c.K * torch.tensor([1.1, 1.1, 1.0])[:, None])]) for c in cameras]
+    both = triangulate(batch, x.reshape(3, 2, 6, 2))
+    for i in range(2):
+        one = triangulate([c[i] for c in batch], x.reshape(3, 2, 6, 2)[:, i], residual=torch.inf)
+        torch.testing.assert_close(both.covariance[i], one.covariance)
+        torch.testing.assert_close(both.residual[i], one.residual)
+
+
+def test_two_noisy_views_are_opencvs_optimal_triangulation():
+    """`correctMatches` (Hartley & Zisserman, section 12.5), then linear; its polynomial's roots are good to 1e-4 m."""
+    cameras = array_of(2)
+    _, x = seen_points(cameras, noise=0.5)
+    pair = Pair(*cameras)
+    corrected = cv2.correctMatches(pair.fundamental.numpy(), *(v.numpy()[None] for v in x))
+    P = [(c.K @ torch.cat([c.R, c.t[:, None]], 1)).numpy() for c in cameras]
+    homogeneous = cv2.triangulatePoints(*P, *(v[0].T.copy() for v in corrected))
+    found = triangulate(cameras, x)
+    np.testing.assert_allclose(found.X.numpy(), (homogeneous[:3] / homogeneous[3]).T, atol=2e-4)
+
+    def cost(points):
+        return sum((p - there).square().sum(-1) for p, there in zip(points, x))
+
+    ours = cost([c.project(found.X).x for c in cameras])
+    assert (ours <= cost([torch.from_numpy(c[0]) for c in corrected]) + 1e-12).all()

@@ -1,34 +1,46 @@
-"""arraygeom beside kornia, for what both have: differences in value and gradient, and the ratio of times.
+"""arraygeom beside kornia, for what both have: values, gradients, low precision, and the ratio of times.
 
-Run as `python -m tests.benchmarks.bench_kornia`; it writes its table into docs/kornia.md.
+Run as `python -m tests.benchmarks.bench_kornia`; it writes its tables into docs/kornia.md.
 
 The value's difference is the largest over all entries, float64, relative to the largest entry. The gradient's error is
-each library's own, of a random cotangent, against central differences of its own values. Times are of forward and
-backward in float64 on one thread, for 20,000 points, median of several runs, kornia's divided by ours.
+each library's own, of a random cotangent, against central differences of its own values; second derivatives have to be
+finite. Under autocast to bfloat16 (float32 given) and with everything in float16 errors are against float64, relative
+to the largest entry. Times are of forward and backward in float64 on one thread, for 20,000 points, median of several
+runs, kornia's divided by ours. Kornia's functions are counted as they are called from our code, by a profiler.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import statistics
+import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from types import FrameType
 
+import kornia.geometry
 import torch
 from torch import Tensor
 
+from arraygeom import Pose, Rig, relative_pose
+from pat.fusion.fuse import fuse
+from pat.networks.guided import GuidedPAT
+from tests.arraygeom.rigs import random_rig
 from tests.arraygeom.test_kornia_parity import CASES, Parity, cases
+from tests.transformations.operators import OPERATORS
 
 PAGE = Path(__file__).parents[2] / "docs" / "kornia.md"
-MARKERS = "<!-- table: begin -->", "<!-- table: end -->"
+OUR_PACKAGES = "arraygeom", "pat", "calib"
 RUNS = 15
 STEP = 1e-6
 
 
 def value_difference(case: Parity) -> float:
     """The largest difference between the two, relative to the largest value."""
-    ours, theirs = case.ours(case.at), case.theirs(case.at)
+    ours, theirs = case.ours(case.at).detach(), case.theirs(case.at).detach()
     return float((ours - theirs).abs().max() / ours.abs().max().clamp(min=1e-300))
 
 
@@ -45,14 +57,25 @@ def gradient_error(f: Callable[[Tensor], Tensor], at: Tensor) -> float:
     return abs(float((gradient * step).sum().detach()) - expected) / max(abs(expected), 1e-12)
 
 
-def second_order(f: Callable[[Tensor], Tensor], at: Tensor) -> str:
-    """Whether the second derivative is finite, at zero for rotation vectors."""
+def second_order(f: Callable[[Tensor], Tensor], at: Tensor) -> None:
+    """Raises AssertionError where a second derivative is not finite."""
     leaf = at.clone().requires_grad_()
     (gradient,) = torch.autograd.grad(f(leaf).square().sum(), leaf, create_graph=True)
-    if not gradient.requires_grad:
-        return "none"
-    (again,) = torch.autograd.grad(gradient.square().sum(), leaf, allow_unused=True)
-    return "none" if again is None else "finite" if bool(again.isfinite().all()) else "not finite"
+    if gradient.requires_grad:
+        (again,) = torch.autograd.grad(gradient.square().sum(), leaf, allow_unused=True)
+        assert again is None or bool(again.isfinite().all())
+
+
+def low_precision(name: str, side: int, dtype: torch.dtype) -> str:
+    """The error of ours (0) or kornia's (1): under autocast for float32, else with all given in `dtype`."""
+    case, exact = cases(40, dtype)[name], CASES[name][side](CASES[name].at)
+    try:
+        with torch.autocast("cpu", torch.bfloat16, enabled=dtype == torch.float32):
+            value = case[side](case.at).double()
+    except Exception:
+        return "refused"
+    error = float((value - exact).detach().abs().max() / exact.detach().abs().max())
+    return f"{error:.0e}" if math.isfinite(error) else "not finite"
 
 
 def time_ratio(case: Parity) -> float:
@@ -71,34 +94,83 @@ def time_ratio(case: Parity) -> float:
 def table() -> str:
     """One row a case, as Markdown."""
     lines = [
-        "| what | value, relative difference | gradient error, ours | kornia's | second derivative, ours | kornia's "
-        "| time, kornia / ours |",
-        "|---|---|---|---|---|---|---|",
+        "| what | value, relative difference | gradient error, ours | kornia's | autocast, ours | kornia's "
+        "| float16, ours | kornia's | time, kornia / ours |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     large = cases(20_000)
     for name, case in CASES.items():
-        errors = [gradient_error(f, case.at) for f in case[:2]]
-        second = [second_order(f, case.at) for f in case[:2]]
+        for f in case[:2]:
+            second_order(f, case.at)
         cells = [
             name,
             f"{value_difference(case):.0e}",
-            *(f"{e:.0e}" for e in errors),
-            *second,
+            *(f"{gradient_error(f, case.at):.0e}" for f in case[:2]),
+            *(low_precision(name, side, dtype) for dtype in (torch.float32, torch.float16) for side in (0, 1)),
             f"{time_ratio(large[name]):.1f}",
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def write_page(text: str) -> None:
-    """Put the table between the page's markers."""
-    begin, end = MARKERS
+def kornia_calls(run: Callable[[], object]) -> set[str]:
+    """Kornia's functions that our packages call themselves while something runs."""
+    found = set()
+
+    def noted(frame: FrameType, event: str, _: object) -> None:
+        back = frame.f_back
+        module = frame.f_globals.get("__name__", "")
+        if event == "call" and back is not None and module.startswith("kornia."):
+            ours = back.f_globals.get("__name__", "").partition(".")[0] in OUR_PACKAGES
+            if ours and frame.f_code.co_name.isidentifier():
+                found.add(f"{module}.{frame.f_code.co_qualname}")
+
+    kornia.geometry.epipolar  # noqa: B018  (imported before: modules are not functions)
+    sys.setprofile(noted)
+    try:
+        run()
+    finally:
+        sys.setprofile(None)
+    return found
+
+
+def counts() -> str:
+    """Which of kornia's functions our operators call, and which `fuse`."""
+    calls = {name: kornia_calls(partial(o.f, o.x)) for name, o in OPERATORS.items()}
+    every = set().union(*calls.values(), kornia_calls(convert))
+    lines = [f"{sum(map(bool, calls.values()))} of {len(calls)} operators call {len(every)} of kornia's functions:", ""]
+    lines += [f"- `{name}`" for name in sorted(every)]
+    return "\n".join([*lines, "", f"`fuse` calls {len(kornia_calls(fused))} of them."])
+
+
+def convert() -> None:
+    """Rigs and poses there and back."""
+    rig = random_rig(1)
+    pose = rig["alpha"].cam_from_world
+    Rig.from_kornia(rig.to_kornia())
+    Pose.from_kornia(pose.to_kornia())
+    Pose.from_quaternion(pose.quaternion, pose.t)
+    pair = rig.pair("alpha", "beta")
+    relative_pose(pair.fundamental, pair.alpha.K, pair.beta.K, torch.rand(8, 2), torch.rand(8, 2))
+
+
+def fused() -> None:
+    """A small fusion."""
+    rig = Rig({"alpha": random_rig(1)["alpha"], "beta": random_rig(1)["beta"]}, depth=(1.5, 10.0))
+    images = {"alpha": torch.rand(1, 48, 64), "beta": torch.rand(3, 40, 60)}
+    fuse(GuidedPAT(), rig, images, alpha="alpha")
+
+
+def write_page(what: str, text: str) -> None:
+    """Put a text between the page's markers of that name."""
+    begin, end = f"<!-- {what}: begin -->", f"<!-- {what}: end -->"
     pattern = re.compile(re.escape(begin) + r".*?" + re.escape(end), re.S)
     PAGE.write_text(pattern.sub(lambda _: f"{begin}\n{text}\n{end}", PAGE.read_text()))
 
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    made = table()
-    print(made)
-    write_page(made)
+    for what, make in (("table", table), ("calls", counts)):
+        made = make()
+        print(made)
+        write_page(what, made)

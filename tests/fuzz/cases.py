@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import random
 import shutil
 import warnings
@@ -11,7 +13,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import tifffile
 import torch
+from PIL import Image
 from torch import nn
 
 from arraygeom import Distortion, Rig
@@ -19,6 +23,7 @@ from arraygeom.io import read_rig, write_rig
 from calib.boards.covariance import RigCovariance
 from pat.cli.main import main
 from pat.media.images import read_image, write_image
+from pat.media.video import read_video
 from pat.networks.configs import GuidedPATConfig
 from pat.networks.guided import GuidedPAT
 from pat.networks.weights import load_weights, save_weights
@@ -51,7 +56,7 @@ def damaged(seed: Seed, number: int, folder: Path) -> Path:
         shutil.copytree(seed.file.parent, home)
     else:
         home.mkdir(parents=True)
-    text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind != "image"
+    text = seed.file.suffix not in (".bin", ".mat", ".safetensors", ".npz") and seed.kind not in ("image", "video")
     path = home / seed.file.name
     path.write_bytes(mutated(seed.file.read_bytes(), source, text=text, suffix=seed.file.suffix))
     return home if seed.whole_folder and seed.kind == "rig" else path
@@ -169,6 +174,35 @@ def image_seeds(folder: Path) -> Iterator[Seed]:
     for name, values in (("16.png", smooth.astype(np.uint16) * 257), ("32.tif", (smooth / 255).astype(np.float32))):
         cv2.imwrite(str(folder / name), values)
         yield Seed("image", "png 16" if name.endswith("png") else "tiff 32", folder / name)
+    for name, content in more_images(smooth).items():
+        (folder / name.replace(" ", "_")).write_bytes(content)
+        yield Seed("image", name.partition(".")[0], folder / name.replace(" ", "_"))
+
+
+def more_images(values: np.ndarray) -> dict[str, bytes]:
+    """Files that OpenCV does not write: an animated PNG, planar and tiled TIFFs, a photograph with EXIF."""
+    frames = [Image.fromarray(frame) for frame in (values, values[::-1], values[:, ::-1])]
+    exif = Image.Exif()
+    exif[0x0112] = 6  # the orientation
+    files: dict[str, bytes] = {}
+    for name, options in {
+        "png animated.png": {"save_all": True, "append_images": frames[1:]},
+        "jpeg exif.jpg": {"exif": exif},
+        "png exif.png": {"exif": exif},
+    }.items():
+        file = io.BytesIO()
+        frames[0].save(file, name.rpartition(".")[2].replace("jpg", "jpeg"), **options)
+        files[name] = file.getvalue()
+    planes = values.transpose(2, 0, 1)
+    for name, image, options in (
+        ("tiff planar.tif", planes, {"planarconfig": "separate", "rowsperstrip": 7}),
+        ("tiff tiled.tif", values[..., 0].astype(np.float32) / 255, {"tile": (16, 16)}),
+        ("tiff zlib.tif", values, {"compression": "zlib", "rowsperstrip": 7}),
+    ):
+        file = io.BytesIO()
+        tifffile.imwrite(file, image, photometric="rgb" if image.ndim == 3 else "minisblack", **options)
+        files[name] = file.getvalue()
+    return files
 
 
 def read_and_write(path: Path, source: random.Random) -> str:
@@ -191,6 +225,29 @@ def with_photos(folder: Path) -> None:
     except ValueError as error:
         if "no image" not in str(error):
             raise
+
+
+# Videos -----------------------------------------------------------------------------------------------------
+
+
+def video_seeds(folder: Path) -> Iterator[Seed]:
+    """A short video; written by OpenCV, which has a codec of its own."""
+    folder.mkdir(parents=True, exist_ok=True)
+    writer = cv2.VideoWriter(str(folder / "video.mp4"), cv2.VideoWriter_fourcc(*"mp4v"), 25, (80, 60))
+    for i in range(6):
+        writer.write(np.full((60, 80, 3), 40 * i, np.uint8))
+    writer.release()
+    yield Seed("video", "mp4", folder / "video.mp4")
+
+
+def watch_video(path: Path, _: random.Random) -> str:
+    """All frames of `read_video`."""
+    try:
+        video = read_video(path)
+    except ValueError as error:
+        return "refused" if "\n" not in str(error) and str(path) in str(error) else f"message: {error}"
+    whole = all(frame.isfinite().all() for frame in itertools.islice(video.frames, 100))
+    return "read" if whole and 0 < video.rate < float("inf") else f"{video.rate} frames a second"
 
 
 # Weights, checkpoints, documents ----------------------------------------------------------------------------
@@ -260,7 +317,8 @@ def use_covariance(path: Path, _: random.Random) -> str:
 
 KINDS: dict[str, tuple[Callable[[Path], Iterator[Seed]], Check, int]] = {
     "rig": (rig_seeds, convert_and_inspect, 5000),
-    "image": (image_seeds, read_and_write, 500),
+    "image": (image_seeds, read_and_write, 1000),
+    "video": (video_seeds, watch_video, 100),
     "weights": (weight_seeds, use_weights, 200),
     "checkpoint": (checkpoint_seeds, use_checkpoint, 150),
     "covariance": (covariance_seeds, use_covariance, 150),

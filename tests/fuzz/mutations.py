@@ -11,6 +11,8 @@ from typing import Any
 
 import yaml
 
+from .pieces import PIECES, rearranged
+
 LOADER, DUMPER = (getattr(yaml, f"C{name}", getattr(yaml, name)) for name in ("SafeLoader", "SafeDumper"))
 NUMBER = re.compile(rb"(?<![\w.])-?\d+(?:\.\d*)?(?:[eE][-+]?\d+)?(?![\w.])")
 EXTREMES = (
@@ -88,6 +90,10 @@ def mutated(content: bytes, source: random.Random, *, text: bool, suffix: str = 
     kinds: list[Mutation] = list(TEXT if text else BYTES)
     if text and suffix in (".yaml", ".yml", ".json"):
         kinds += [lambda s, c: structure(s, c, suffix)] * len(kinds)
+    if suffix == ".json":
+        kinds += [repeat_keys, half_character]
+    if suffix in PIECES:
+        kinds += [lambda s, c: rearranged(s, c, suffix)] * len(kinds)
     for _ in range(source.choice([1, 1, 1, 2, 4])):
         content = source.choice(kinds)(source, content)
     return content
@@ -191,6 +197,23 @@ def deepen(source: random.Random, content: bytes) -> bytes:
         return bomb + content if source.randrange(2) else content + b"\n" + bomb
     piece = source.choice(pieces)
     return content + piece if at is None else content[: at.start()] + piece + content[at.end() :]
+
+
+def repeat_keys(source: random.Random, content: bytes) -> bytes:
+    """A key of a JSON document twice, or some thousand keys twice each."""
+    keys = list(re.finditer(rb'"[^"]*"\s*:', content))
+    if not keys:
+        return content
+    chosen = source.choice(keys)
+    some = b"".join(b'"%d": 0, ' % i for i in range(source.choice([1, 30_000])))
+    return content[: chosen.start()] + source.choice([chosen[0] + b" 0, ", some * 2]) + content[chosen.start() :]
+
+
+def half_character(source: random.Random, content: bytes) -> bytes:
+    """A lone surrogate in a text of a JSON document."""
+    quotes = [i for i, byte in enumerate(content) if byte == ord('"')]
+    at = source.choice(quotes) if quotes else len(content)
+    return content[: at + 1] + source.choice([b"\\ud800", b"\\udfff", b"\\ud83d\\ud83d"]) + content[at + 1 :]
 
 
 def structure(source: random.Random, content: bytes, suffix: str) -> bytes:

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="limits of proce
 
 
 @pytest.mark.parametrize(
-    ("kind", "count"), [("rig", 19), ("image", 14), ("weights", 4), ("checkpoint", 4), ("covariance", 4)]
+    ("kind", "count"), [("rig", 19), ("image", 20), ("video", 4), ("weights", 4), ("checkpoint", 4), ("covariance", 4)]
 )
 def test_damaged_files_are_read_or_refused(kind, count, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -163,7 +163,7 @@ def test_a_checkpoint_of_another_network_or_optimiser_is_refused(tmp_path):
             restore(checkpoint._replace(tensors=checkpoint.tensors | {name: torch.ones(3)}), *cases.training())
 
 
-@pytest.mark.parametrize("kind", ["image", "weights", "checkpoint", "covariance"])
+@pytest.mark.parametrize("kind", ["image", "video", "weights", "checkpoint", "covariance"])
 def test_what_is_damaged_was_whole(kind, tmp_path):
     make, check, _ = cases.KINDS[kind]
     for seed in make(tmp_path):

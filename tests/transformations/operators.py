@@ -90,6 +90,7 @@ def cpu(*given: Tensor, **options: object) -> Tensor:
     return attend(*given, backend="cpu", **options)  # type: ignore[arg-type]
 
 
+MATCHED = B.project(A.unproject(pixels(X), vector(2.0, 3.0))).x + 0.3
 W = vector(0.01, -0.02, 0.005, 0.03, -0.01, 0.02)
 GEOMETRY = {
     "apply_homography": Operator(lambda x: ag.apply_homography(MAP, pixels(x)).x, X),
@@ -111,7 +112,7 @@ GEOMETRY = {
     "depth_from_track": Operator(lambda x: ag.depth_from_track(_track(X), pixels(x)).depth, X + 2),
     "depth_of": Operator(lambda x: ag.depth_of(PAIR, pixels(X), pixels(x)).depth, X + 2),
     "depth_of, through lenses": Operator(lambda x: ag.depth_of(CURVED, pixels(X), pixels(x)).depth, X + 2),
-    "triangulate": Operator(lambda x: ag.triangulate([A, B], torch.stack([pixels(x), pixels(x) + 2])).X, X),
+    "triangulate": Operator(lambda x: ag.triangulate([A, B], torch.stack([pixels(x), MATCHED])).X, X),
     "fit_similarity": Operator(
         lambda x: ag.fit_similarity(pixels(EIGHT), pixels(x)), EIGHT * 1.1 + EIGHT.flip(0) * 0.1
     ),

@@ -12,10 +12,9 @@ integers: uint16 is bfloat16, int16 is float16. Arithmetic is in float64 for the
 others.
 """
 
-import hashlib
 from pathlib import Path
 
-from arraygeom.compiled import cache_file
+from arraygeom.compiled import renew_with
 
 from .backward import backward
 from .channels import scatter
@@ -27,6 +26,7 @@ from .local import ROWS, attend_rows
 __all__ = [
     "LANES",
     "ROWS",
+    "SOURCES",
     "Call",
     "Geometry",
     "Gradients",
@@ -44,14 +44,8 @@ __all__ = [
 ]
 
 
-def _watch_all_sources() -> None:
-    """numba's cache is renewed when the file of the entry point changes; here when any file of this folder does."""
-    sources = b"".join(path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py")))
-    stamp = hashlib.sha256(sources).hexdigest()
-    for entry in (forward, backward, scatter, attend_rows):
-        if (file := cache_file(entry)) is not None:
-            file._source_stamp = stamp
-        separate_cache(entry)
+SOURCES = [*Path(__file__).parent.glob("*.py")]
 
-
-_watch_all_sources()
+for _entry in (forward, backward, scatter, attend_rows):
+    renew_with(_entry, SOURCES)
+    separate_cache(_entry)

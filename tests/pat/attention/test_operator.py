@@ -47,7 +47,7 @@ def test_refuses_what_does_not_fit(change, error, text):
 )
 def test_refuses_sampling_locations_that_do_not_fit(look, samples, error, text):
     with pytest.raises(error, match=text):
-        operator._form(look, Q, samples)
+        operator.sample_positions(look, Q, samples)
 
 
 def test_refuses_a_bias_that_does_not_broadcast():
@@ -72,9 +72,9 @@ def test_an_explicit_backend_that_cannot_serve_raises(backend, monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     device = "cuda" if backend == "cpu" else "cpu"
     with pytest.raises(RuntimeError, match=backend):
-        operator._choose(backend, device)
+        operator.chosen_backend(backend, device)
 
 
 def test_positions_in_another_precision_are_cast():
     look = Positions(torch.ones(2, 3, 4, 2, dtype=torch.float64), torch.ones(2, 3, 4, dtype=torch.bool))
-    assert operator._form(look, Q, None).points.dtype == torch.float32
+    assert operator.sample_positions(look, Q, None).points.dtype == torch.float32

@@ -79,7 +79,7 @@ def test_the_version_is_printed(capsys):
 def test_commands_that_do_not_exist(capsys):
     assert fails(["fues"], capsys) == "pat: no command 'pat fues'; did you mean 'fuse'?"
     assert fails(["rig", "docter"], capsys) == "pat: no command 'pat rig docter'; did you mean 'doctor'?"
-    assert "known here: fuse, show" in fails(["--weights"], capsys)
+    assert "known here: fuse, show" in fails(["--precision"], capsys)
 
 
 @pytest.mark.parametrize(

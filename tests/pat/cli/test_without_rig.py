@@ -1,6 +1,7 @@
 """`pat fuse` of images alone: which is alpha, the rig, the page, and one line for what cannot be fused."""
 
 import shutil
+import sys
 
 import cv2
 import numpy as np
@@ -16,11 +17,12 @@ from pat.cli.from_images import camera_names
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
+from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
 
 ALL = [*(f"{n}.png" for n in ("confidence", "depth")), "depth.tif", "depth_16.png", "fused.png", "index.html"]
-ALL += ["rig.yaml", "view.yaml"]
+ALL = sorted([*ALL, "found_rig.yaml", "view.yaml"])
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +76,33 @@ def test_the_evaluation_without_a_rig_is_that_of_the_command(halved, folder):
 
 
 def test_the_rig_that_was_found_serves_the_next_command(folder):
-    rig = Rig.load(folder / "out" / "rig.yaml")
+    rig = Rig.load(folder / "out" / "found_rig.yaml")
     assert rig.names == ("mono", "colour")
     assert all(isinstance(camera, Camera) for camera in rig.cameras.values())
     images = [str(folder / f"{name}.png") for name in rig.names]
-    main(["fuse", str(folder / "out" / "rig.yaml"), *images, "--alpha", "mono", "-o", str(folder / "next")])
+    main(["fuse", str(folder / "out" / "found_rig.yaml"), *images, "--alpha", "mono", "-o", str(folder / "next")])
     again, first = (read_image(folder / out / "fused.png") for out in ("next", "out"))
     assert float((again - first).abs().max()) <= 2 / 255
     assert all(" baselines" in (folder / out / "index.html").read_text() for out in ("next", "out"))
-    assert not (folder / "next" / "rig.yaml").exists()
+    assert not (folder / "next" / "found_rig.yaml").exists()
+
+
+def test_a_rig_of_ones_own_beside_the_result_is_kept(folder, tmp_path):
+    """It was overwritten by the one that was found."""
+    (tmp_path / "rig.yaml").write_text("my own")
+    frame = Frame(torch.rand(3, 8, 8), torch.full((8, 8), 2.0), torch.ones(8, 8))
+    save_frame(frame, tmp_path, rig=Rig.load(folder / "out" / "found_rig.yaml"))
+    assert (tmp_path / "rig.yaml").read_text() == "my own"
+    assert (tmp_path / "found_rig.yaml").is_file()
+
+
+def test_exr_is_refused_before_anything_is_read(monkeypatch, capsys, tmp_path):
+    """It was refused once all was fused."""
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    given = ["fuse", "no.png", "nothing.png", "--kind", "exr", "--bits", "32", "-o", str(tmp_path / "out")]
+    with pytest.raises(SystemExit):
+        main(given)
+    assert "writing EXR needs" in capsys.readouterr().err
 
 
 def test_what_cannot_be_fused_is_one_line_and_leaves_nothing(folder, tmp_path, capsys):
@@ -133,8 +153,8 @@ def test_what_does_not_go_with_a_rig_or_with_many_frames_is_refused(folder, tmp_
         for i in range(2):
             shutil.copy(folder / f"{name}.png", tmp_path / name / f"{i}.png")
         images += ["--image", f"{name}={tmp_path / name}"]
-    given = [folder / "out" / "rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
-    rig = folder / "out" / "rig.yaml"
+    given = [folder / "out" / "found_rig.yaml", "--alpha", "mono", *images, "-o", tmp_path / "out"]
+    rig = folder / "out" / "found_rig.yaml"
     stray = [rig, "--alpha", "mono", tmp_path / "mono" / "0.png", folder / "colour.png", "-o", tmp_path / "out"]
     assert "0.png: no camera of the rig has its name: give --image NAME=" in fails(stray, capsys)
     assert "--points, --classical: of a single frame alone" in fails([*given, "--points", "--classical"], capsys)

@@ -8,7 +8,7 @@ import torch
 
 import pat.fusion.steps
 import pat.fusion.tiles
-import pat.matching.pieces
+import pat.matching.inputs
 from arraygeom import (
     Camera,
     Distortion,
@@ -33,8 +33,7 @@ from pat.fusion.inputs import FrameInputs, prepared
 from pat.fusion.steps import quarter_turns, resolution_ratio, steps_for, without_lenses
 from pat.fusion.tiles import MAX_HALO, SLACK, tiles_within, working_memory
 from pat.fusion.views import Views
-from pat.matching.inputs import Inputs
-from pat.matching.pieces import matching_pieces
+from pat.matching.inputs import Inputs, InputsSettings
 from pat.media.colour import linear_from_srgb, luminance
 from pat.media.images import read_image
 from pat.media.raw import LIGHT
@@ -110,9 +109,8 @@ def test_matching_in_pieces_is_nearly_that_of_the_whole_and_tiles_do_not_matter(
     sample, network = load_sample(), load_weights("mono-colour")
     images = {name: sample.images[name] for name in sample.rig.names}
     whole = fuse(network, sample.rig, images, alpha="mono")
-    monkeypatch.setattr(pat.matching.pieces, "MATCHED_AT_ONCE", 150_000)
-    monkeypatch.setattr(pat.matching.pieces, "MATCHING_HALO", 128)
-    assert len(matching_pieces(sample.rig["mono"].hw, network.multiple)) > 1
+    monkeypatch.setattr(pat.matching.inputs, "SETTINGS", InputsSettings(halo=128, at_once=150_000))
+    assert sample.rig["mono"].hw[0] * sample.rig["mono"].hw[1] > 150_000
     pieces = fuse(network, sample.rig, images, alpha="mono")
     ground_truth = sample.ground_truth
     assert score(pieces.image.clamp(0, 1), ground_truth).psnr > score(whole.image.clamp(0, 1), ground_truth).psnr - 0.1

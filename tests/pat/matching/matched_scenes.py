@@ -6,8 +6,9 @@ import torch
 from arraygeom import Pair, Rectified, Segments, View, lazily, pixel_grid
 from pat.matching.colour_transfer import diffused_from, matched_colours
 from pat.matching.matches import BetaMatches, Comparison
-from pat.matching.semi_global import Normalisations
-from pat.matching.subpixel import matched
+from pat.matching.normalisation import Normalisations
+from pat.matching.semi_global import FINE, matched_at_half_size
+from pat.matching.subpixel import matched_at_full_size, precise
 
 
 def blurred(image: torch.Tensor, blur: float) -> torch.Tensor:
@@ -34,6 +35,16 @@ def faint(seed: int, *, contrast: float, blur: float) -> torch.Tensor:
     """A scene with little to hold on to, 64 x 256."""
     soft = blurred(torch.rand(1, 1, 64, 256, generator=torch.Generator().manual_seed(seed)), blur)
     return (0.5 + contrast * (soft - soft.mean()) / soft.std()).clamp(0, 1)
+
+
+def matched(alpha, guide, segments, blocks, normalisations, half=None):
+    """Disparity and facts of one beta whose brightness is `guide`; without `half` both sizes are matched."""
+    rough, facts = half or matched_at_half_size(alpha, guide, blocks, normalisations.half)
+    views = normalisations.whole.views(alpha, guide)
+    disparity, unlike = matched_at_full_size(views, segments, rough)
+    near = torch.nn.functional.interpolate(rough, scale_factor=FINE, mode="bilinear")
+    found = precise(views, segments, disparity, unlike, near)
+    return found, torch.cat([torch.nn.functional.avg_pool2d(unlike, FINE), facts[:, 1:]], 1)
 
 
 def semi_global_matching(

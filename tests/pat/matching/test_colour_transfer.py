@@ -1,12 +1,15 @@
 """Beta's bands at alpha's view: detail, brightness, weight, and what is diffused."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from arraygeom import Segments, pixel_grid
 from pat.matching import colour_transfer as warped
-from pat.matching.colour_transfer import LIKENESS, _diffused, colour_noise, explained_share, match_weight
+from pat.matching.colour_transfer import SETTINGS, _diffused, colour_noise, match_weight
+from pat.matching.normalisation import explained_share
 from pat.media.colour import luminance
 from tests.pat.matching.matched_scenes import beside, blurred, faint, semi_global_matching
 
@@ -62,8 +65,8 @@ def test_of_a_beta_far_less_sharp_more_around_a_pixel_says_what_detail_it_lost(m
     ground_truth = alpha * torch.tensor([1.3, 1.0, 0.4]).view(1, 3, 1, 1)
     beta = torch.cat([blurred(band, 4.0) for band in ground_truth.split(1, 1)], 1)
     left = []
-    for factor in (warped.RADIUS_OF_BLUR, 0.0):
-        monkeypatch.setattr(warped, "RADIUS_OF_BLUR", factor)
+    for factor in (SETTINGS.radius_of_blur, 0.0):
+        monkeypatch.setattr(warped, "SETTINGS", replace(SETTINGS, radius_of_blur=factor))
         left.append(chroma_errors(alpha, beta, ground_truth, in_place((96, 128)))[0][..., 8:-8, 8:-8].abs().mean())
     assert left[0] < 0.9 * left[1]
 
@@ -74,7 +77,7 @@ def test_each_of_a_batch_has_the_window_of_its_own_blur():
     both = warped._each_detailed(colour, brightness, alpha, [2, 6])
     for i, radius in enumerate((2, 6)):
         one = (x[i : i + 1] for x in (colour, brightness, alpha))
-        assert torch.equal(warped._detailed(*one, warped.SATURATED, radius), both[i : i + 1])
+        assert torch.equal(warped._detailed(*one, radius), both[i : i + 1])
     assert not torch.equal(both, warped._each_detailed(colour, brightness, alpha, [2, 2]))
 
 
@@ -105,7 +108,7 @@ def test_colour_at_matches_does_not_hang_on_what_the_other_image_shows_elsewhere
 
 def test_a_match_of_other_brightness_has_less_weight():
     unlike = torch.zeros(1, 1, 5, 12)
-    unlike[..., 6:] = -LIKENESS
+    unlike[..., 6:] = -SETTINGS.likeness
     weight = match_weight(unlike, torch.ones_like(unlike), torch.ones_like(unlike, dtype=torch.bool))
     torch.testing.assert_close(weight[..., :5], torch.full((1, 1, 5, 5), 1.0001))
     torch.testing.assert_close(weight[..., 7:], torch.full((1, 1, 5, 5), float(np.exp(-1)) + 1e-4))

@@ -13,10 +13,10 @@ from pat.evaluation.metrics import score
 from pat.fusion.fuse import fuse
 from pat.fusion.inputs import frame_inputs
 from pat.fusion.views import Views
+from pat.matching import inputs as inputs_module
 from pat.matching import multiview as several
-from pat.matching import pieces
 from pat.matching.match import located, match
-from pat.matching.multiview import SUPPORT, MatchedBeta, can_agree
+from pat.matching.multiview import SETTINGS, MatchedBeta
 from pat.media.colour import luminance
 from pat.networks.guided import BetaEstimate, combined
 from pat.networks.weights import load_weights
@@ -133,9 +133,8 @@ def test_strips_change_nothing_and_pieces_little(network, scene, monkeypatch):
     whole = fuse(network, rig, images, alpha="mono").image
     monkeypatch.setattr(several, "STRIP", 10 * W)
     assert (fuse(network, rig, images, alpha="mono").image - whole).abs().max() < 1e-6
-    monkeypatch.setattr(pieces, "MATCHED_AT_ONCE", 15_000)
-    monkeypatch.setattr(pieces, "MATCHING_HALO", 32)
-    assert len(pieces.matching_pieces((H, W), network.multiple)) > 1
+    monkeypatch.setattr(inputs_module, "SETTINGS", inputs_module.InputsSettings(halo=32, at_once=15_000))
+    assert len(frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs.pieces) > 1
     found = fuse(network, rig, images, alpha="mono").image
     assert ((found - whole).abs().amax(0) > 0.02).float().mean() < 0.05
 
@@ -144,7 +143,7 @@ def test_a_part_of_the_inputs_has_the_tracks_of_the_whole(network, scene):
     rig, images, _ = scene
     inputs = frame_inputs(network, Views.of(rig, images, alpha="mono")).inputs
     part = inputs.cut((16, 64, 48, 144))
-    assert can_agree(part)
+    assert part.can_agree
     x = torch.tensor([[3.0, 5.0], [60.0, 20.0]], dtype=torch.float64)
     depths = torch.tensor([1 / NEAR, 1 / FAR], dtype=torch.float64)
     for own, of_part in zip(inputs.betas, part.betas):
@@ -207,7 +206,7 @@ def test_the_depth_buffer_finds_what_is_hidden():
     column = (track.at(depths)[1, 7, 0] + 0.5).div(2).floor()
     same = ((track.at(depths)[1, :, 0] + 0.5).div(2).floor() == column) & (depths[1] < 0.4)
     assert same.sum() <= 1
-    assert (found[1][same] > SUPPORT).all()
+    assert (found[1][same] > SETTINGS.support).all()
     assert (found[torch.tensor([0, 2, 3])] == 0).all()
     assert replace(segments, valid=~segments.valid).valid.sum() == 0
 

@@ -1,6 +1,7 @@
 """Alpha's response: stated or fitted, applied to beta, and taken back from the result."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -56,7 +57,7 @@ def test_a_sensor_without_filters_is_preferred_to_weights_that_explain_alpha_har
     x = torch.rand(3, 1, generator=g) * 0.5 + 0.4 * torch.rand(3, 4000, generator=g) ** 2 + 0.05
     light = 1 + 0.015 * (x[0] - x[0].mean()) / x[0].std()
     noise = 0.01 * torch.randn(4000, generator=g)
-    freely = SETTINGS._replace(equal_weights=(-math.inf, 1.0))
+    freely = replace(SETTINGS, equal_weights=-math.inf)
     alpha = light * x.mean(0) + noise
     assert (fit(x, alpha, settings=freely).weights - 1 / 3).abs().max() > 0.01
     assert fit(x, alpha).weights.tolist() == [1 / 3] * 3
@@ -123,7 +124,7 @@ def test_leaves_lit_more_brightly_are_not_taken_for_a_sensor_of_green_alone():
     )
     alpha = luminance(x[:, None])[0, 0] * light[material] + 0.005 * torch.randn(4000, generator=g)
     assert fit(x, alpha).is_rec601
-    assert fit(x, alpha, settings=SETTINGS._replace(greenest=1.0)).weights[1] > 0.65
+    assert fit(x, alpha, settings=replace(SETTINGS, greenest=1.0)).weights[1] > 0.65
 
 
 def test_a_gamma_needs_a_range_of_brightness():

@@ -1,13 +1,15 @@
-"""Consensus: a slow twin of its aggregation, true depths of a scene found again, the same bits by any road."""
+"""Semi-global matching: true depths of a scene found again, the same bits by any road."""
 
 import threading
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 import pat.matching.semi_global
+import pat.matching.subpixel
 from arraygeom import (
     Camera,
     Epipolar,
@@ -19,11 +21,9 @@ from arraygeom import (
     pixel_grid,
     rotation_from_vector,
 )
-from pat.matching import semi_global_numba as kernels
-from pat.matching.matches import BetaMatches
+from pat.matching.matches import BetaMatches, Comparison
+from pat.matching.normalisation import Normalisation, Normalisations, equalising_blurs
 from pat.matching.semi_global import (
-    Normalisation,
-    equalising_blurs,
     length_of,
     matched_at_half_size,
     matches,
@@ -36,37 +36,6 @@ HW = (64, 96)
 PARTS = ("disparity", "facts", "bands", "diffused")
 
 
-def slow_aggregate(cost: np.ndarray, guide: np.ndarray) -> np.ndarray:
-    """Semi-global matching as it is written down: one path at a time, from each pixel's predecessor."""
-    height, width, _ = cost.shape
-    total = np.zeros(cost.shape)
-    for dx, dy in ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)):
-        path = np.zeros(cost.shape)
-        rows = range(height) if dy >= 0 else range(height - 1, -1, -1)
-        columns = range(width) if dx >= 0 else range(width - 1, -1, -1)
-        for y in rows:
-            for x in columns:
-                path[y, x] = cost[y, x]
-                y0, x0 = y - dy, x - dx
-                if 0 <= y0 < height and 0 <= x0 < width:
-                    before = path[y0, x0]
-                    jump = max(kernels.SMALL + 1, kernels.LARGE / (1 + abs(guide[y, x] - guide[y0, x0]) / kernels.EDGE))
-                    up, down = np.append(before[1:], np.inf), np.append(np.inf, before[:-1])
-                    best = np.minimum.reduce([before, up + kernels.SMALL, down + kernels.SMALL])
-                    path[y, x] += np.minimum(best, before.min() + jump) - before.min()
-        total += path
-    return total
-
-
-def test_aggregation_is_that_of_its_slow_twin():
-    rng = np.random.default_rng(0)
-    cost = rng.integers(0, 68, (7, 9, 6)).astype(np.uint8)
-    guide = rng.random((7, 9)).astype(np.float32)
-    total = np.empty(cost.shape, np.int16)
-    kernels.aggregate(cost, guide, total)
-    assert np.abs(total / kernels.PARTS - slow_aggregate(cost, guide)).max() < 8 / kernels.PARTS
-
-
 def test_lengths_of_plain_numbers_are_those_of_the_segments():
     start, end = 100 * torch.rand(2, 1, 50, 60, 2, generator=torch.Generator().manual_seed(0))
     end[0, 0] = start[0, 0]
@@ -75,16 +44,6 @@ def test_lengths_of_plain_numbers_are_those_of_the_segments():
     freed = Segments(start.requires_grad_(), end, segments.valid)
     (gradient,) = torch.autograd.grad(length_of(freed).sum(), start)
     assert bool(gradient.isfinite().all())
-
-
-def test_census_is_which_of_48_neighbours_are_darker():
-    image = np.random.default_rng(1).random((9, 11)).astype(np.float32)
-    bits = np.empty(image.shape, np.uint64)
-    kernels.census(image, bits)
-    y, x = 4, 5
-    window = image[y - 3 : y + 4, x - 3 : x + 4].ravel()
-    darker = np.delete(window, 24) < image[y, x]
-    assert f"{int(bits[y, x]):048b}" == "".join(str(int(d)) for d in darker)
 
 
 def pair_of(turn: float) -> Pair:
@@ -148,6 +107,12 @@ def test_a_plane_is_found_again_by_unrectified_cameras(turn):
         assert (colour - wanted)[:, seen].abs().mean() < 0.03
 
 
+def in_blocks_of(monkeypatch, **sizes: int) -> None:
+    """Cut every image into small blocks, at half and at full size."""
+    for module, name in ((pat.matching.semi_global, "HALF_SIZE"), (pat.matching.subpixel, "FULL_SIZE")):
+        monkeypatch.setattr(module, name, replace(getattr(module, name), most_costs=0, **sizes))
+
+
 def test_threads_and_blocks_change_nothing(monkeypatch):
     pair = pair_of(0.1)
     alpha, beta, _ = plane_seen(pair, 2.0)
@@ -160,8 +125,7 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
     finally:
         torch.set_num_threads(threads)
     assert all(torch.equal(getattr(whole, part), getattr(again, part)) for part in PARTS)
-    monkeypatch.setattr(pat.matching.semi_global, "BLOCK", 16)
-    monkeypatch.setattr(pat.matching.semi_global, "MOST_COSTS", 0)
+    in_blocks_of(monkeypatch, block=16)
     pieces = semi_global_matching(*call)
     assert (pieces.disparity - whole.disparity).abs().median() < 1e-3
 
@@ -170,12 +134,12 @@ def test_threads_and_blocks_change_nothing(monkeypatch):
 def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
     running, most, lock = [], [], threading.Lock()
 
-    def block(views, box, labels, claims, found):
+    def block(image, box, windows, settings):
         with lock:
             running.append(box)
             most.append(len(running))
-        claims.append(np.zeros(1, np.int32))
-        found[3][:] = 0
+        image.claims.append(np.zeros(1, np.int32))
+        image.found[2][:] = 0
         time.sleep(0.05)
         running.remove(box)
 
@@ -183,9 +147,7 @@ def test_no_more_blocks_at_once_than_memory_holds(monkeypatch, limit, at_once):
     alpha, beta, _ = plane_seen(pair, 2.0)
     normalisation = Normalisation.of(alpha, beta)
     monkeypatch.setattr(pat.matching.semi_global, "_block", block)
-    monkeypatch.setattr(pat.matching.semi_global, "BLOCK", 8)
-    monkeypatch.setattr(pat.matching.semi_global, "LONG_BLOCK", 8)
-    monkeypatch.setattr(pat.matching.semi_global, "MOST_COSTS", 0)
+    in_blocks_of(monkeypatch, block=8, long_block=8)
     monkeypatch.setattr(torch, "get_num_threads", lambda: 4)
     with limited(limit):
         matched_at_half_size(alpha, beta, sampled_at(pair, 2), normalisation)
@@ -200,8 +162,7 @@ def test_blocks_know_what_others_claim(monkeypatch, threads):
     alpha, beta, _ = plane_seen(pair, 2.0)
     given = alpha, beta, sampled_at(pair, 2), Normalisation.of(alpha, beta)
     whole = matched_at_half_size(*given)
-    for name, value in {"BLOCK": 12, "LONG_BLOCK": 20, "MARGIN": 1000, "MOST_COSTS": 0}.items():
-        monkeypatch.setattr(pat.matching.semi_global, name, value)
+    in_blocks_of(monkeypatch, block=12, long_block=20, margin=1000)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     blocks = matched_at_half_size(*given)
     assert (whole.facts[:, 0] > pat.matching.semi_global.CONSISTENT).any()
@@ -230,7 +191,9 @@ def test_no_segment_is_nothing_found():
 
 def test_a_cut_is_where_it_says():
     half, whole = torch.arange(48.0).view(1, 1, 6, 8), torch.arange(192.0).view(1, 1, 12, 16)
-    cut = BetaMatches(whole - 1, half, None, whole + 1, whole).cut((4, 10, 2, 16))
+    cut = BetaMatches(whole - 1, half, Comparison(None, Normalisations.of(whole, whole)), whole + 1, whole).cut(
+        (4, 10, 2, 16)
+    )
     assert torch.equal(cut.disparity, whole[..., 4:10, 2:16] - 1)
     assert torch.equal(cut.facts, half[..., 2:5, 1:8])
     assert torch.equal(cut.diffused, whole[..., 4:10, 2:16])
@@ -272,23 +235,3 @@ def test_what_lies_beyond_the_edge_of_beta_is_not_sought_within_it():
     found = semi_global_matching(alpha + noise[0], beta + noise[1], beta + noise[1], *segments)
     assert ((found.disparity[..., 48:72] - 40).abs() < 2).float().mean() > 0.98
     assert (found.facts[:, 0, :, :17] > pat.matching.semi_global.CONSISTENT).float().mean() > 0.845
-
-
-@pytest.mark.parametrize(("cut", "beyond"), [(1.0, kernels.UNSEEN), (0.0, kernels.NOWHERE)])
-def test_labels_beyond_a_segment_are_unseen_where_beta_ends_and_nowhere_else(cut, beyond):
-    own, bits = np.zeros((1, 1), np.float32), np.zeros((1, 1), np.uint64)
-    other, its = np.ones((1, 9), np.float32), np.full((1, 9), 2**48 - 1, np.uint64)
-    ends, along = np.array([[[2.0, 0.0]]], np.float32), np.array([[[-1.0, 0.0]]], np.float32)
-    length, edge = np.full((1, 1), 2, np.float32), np.full((1, 1), cut, np.float32)
-    cost = np.empty((1, 1, 5), np.uint8)
-    kernels.costs(own, bits, other, its, ends, along, length, edge, cost)
-    unlike = 48 + int(kernels.TRUNCATED)
-    assert cost.ravel().tolist() == [unlike] * 3 + [beyond] * 2
-    disparity, facts = np.empty((1, 1), np.float32), np.empty((1, 1, 3), np.float32)
-    claims, (label, place) = np.full(10, 2**31 - 1, np.int32), np.empty((2, 1, 1), np.int32)
-    total, at = kernels.PARTS * cost.astype(np.int16), (1, 9, 0, 0)
-    kernels.winners(total, ends, along, length, edge, *at, claims, disparity, facts, label, place)
-    assert (disparity[0, 0] > 2) == (cut == 1)
-    assert (place[0, 0] == 9) == (cut == 1)
-    assert claims[[0, 1, 2]].tolist() == [(unlike * kernels.PARTS << 16) + label for label in (2, 1, 0)]
-    assert (claims[3:] == 2**31 - 1).all()

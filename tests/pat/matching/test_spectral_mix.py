@@ -6,8 +6,9 @@ from torch.nn.functional import interpolate
 
 from arraygeom import Pair, Rectified, View
 from arraygeom.fields.grid import FieldOnGrid
-from pat.matching.colour_transfer import box_mean
-from pat.matching.spectral_mix import SpectralMix, coarse_mix
+from pat.matching.colour_transfer import coarse_mix
+from pat.matching.normalisation import box_mean
+from pat.matching.radiometry import SpectralMix
 
 WEIGHTS = torch.tensor([0.3, 0.6, 0.1])
 

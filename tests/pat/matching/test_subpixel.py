@@ -6,78 +6,23 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from arraygeom import Segments, pixel_grid
-from pat.matching import semi_global_numba as semi_global_kernels
-from pat.matching import window_numba as band_kernels
-from pat.matching.semi_global import Normalisations, matched_at_half_size
-from pat.matching.subpixel import PENALTIES, _runs, _surfaces, matched
-from pat.matching.window_numba import HIGH, LANES, RUN
-from tests.pat.matching.matched_scenes import beside, blurred
+from pat.matching.normalisation import Normalisations
+from pat.matching.semi_global import matched_at_half_size
+from pat.matching.subpixel import SETTINGS, _runs, _surfaces
+from tests.pat.matching.matched_scenes import beside, blurred, matched
 
 H, W, NEAREST = 96, 160, 30
 FAR, NEAR = 6, 21
 BOX = (slice(21, 70), slice(53, 104))
-LABELS = [*range(RUN), *range(HIGH, HIGH + RUN)]
-"""Lanes that stand for labels."""
-
-
-def in_lanes(cost):
-    """Costs (h, w, labels) in their lanes, anything in the others."""
-    lanes = np.random.default_rng(2).integers(0, 256, (*cost.shape[:2], LANES), np.uint8)
-    lanes[..., LABELS] = cost
-    return lanes
-
-
-def test_with_all_labels_it_is_semi_global_matching():
-    """Both runs beside each other are ten labels; those of every pixel begin elsewhere."""
-    rng = np.random.default_rng(0)
-    guide = rng.random((9, 11), np.float32)
-    cost = rng.integers(0, 60, (9, 11, 2 * RUN), np.uint8)
-    low = np.full((9, 11), 3, np.int32)
-    whole, bands = np.empty(cost.shape, np.int16), np.empty((9, 11, LANES), np.float32)
-    semi_global_kernels.aggregate(cost, guide, whole)
-    penalties = semi_global_kernels.SMALL, semi_global_kernels.LARGE
-    band_kernels.band_aggregate(in_lanes(cost), guide, low, low + RUN, *penalties, bands)
-    np.testing.assert_allclose(
-        bands[..., LABELS], whole / semi_global_kernels.PARTS, atol=8 / semi_global_kernels.PARTS
-    )
-
-
-def aggregated(cost, guide, labels, small, large):
-    """One path along a row, written out: `labels` (w, 10) of each pixel."""
-    total = cost.astype(float).copy()
-    for order in (range(1, len(cost)), range(len(cost) - 2, -1, -1)):
-        path = cost.astype(float).copy()
-        for x in order:
-            before = x - 1 if order.step > 0 else x + 1
-            jump = max(small + 1, large / (1 + abs(float(guide[x]) - float(guide[before])) / (4 / 255)))
-            apart = np.abs(labels[x][:, None] - labels[before][None])
-            step = np.where(apart == 0, 0.0, np.where(apart == 1, small, jump))
-            path[x] = cost[x] + (path[before][None] + step).min(1) - path[before].min()
-        total += path
-    return total - cost
-
-
-def test_runs_of_neighbours_are_aligned_by_label():
-    rng = np.random.default_rng(1)
-    guide = rng.random((1, 12), np.float32)
-    cost = rng.integers(0, 60, (1, 12, 2 * RUN), np.uint8)
-    low = rng.integers(0, 6, (1, 12), np.int32)
-    high = low + RUN + rng.integers(0, 6, (1, 12), np.int32)
-    total = np.empty((1, 12, LANES), np.float32)
-    band_kernels.band_aggregate(in_lanes(cost), guide, low, high, *PENALTIES, total)
-    run = np.arange(RUN)
-    labels = np.concatenate([low[0][:, None] + run, high[0][:, None] + run], 1)
-    paths = total[0][:, LABELS] - 6 * cost[0].astype(float)
-    np.testing.assert_allclose(paths, aggregated(cost[0], guide[0], labels, *PENALTIES), rtol=1e-4, atol=1e-2)
 
 
 @pytest.mark.parametrize("half", [np.full((6, 6), 9.0), np.tile([4.0, 4.0, 4.0, 30.0, 30.0, 30.0], (6, 1))])
 def test_runs_hold_what_is_nearby_and_do_not_overlap(half):
-    low, high = _runs(half.astype(np.float32))
-    assert (high >= low + RUN).all()
+    low, high = np.moveaxis(_runs(half.astype(np.float32)), -1, 0)
+    assert (high >= low + SETTINGS.run).all()
     for value in np.unique(half):
         beside = np.abs(np.arange(12) // 2 - np.flatnonzero(half[0] == value)[:, None]).min(0) <= 2
-        held = [(first <= value) & (value < first + RUN) for first in (low[:, beside], high[:, beside])]
+        held = [(first <= value) & (value < first + SETTINGS.run) for first in (low[:, beside], high[:, beside])]
         assert (held[0] | held[1]).all()
 
 

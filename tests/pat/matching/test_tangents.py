@@ -10,7 +10,9 @@ from arraygeom import Dense, Epipolar, Local, NearestVoxels, Positions, Segments
 from arraygeom.fields.grid import FieldOnGrid
 from pat import fuse, load_weights
 from pat.evaluation.metrics import score
+from pat.matching import cost
 from pat.matching import semi_global_numba as kernels
+from pat.matching.cost import planes_of
 from pat.matching.positions_numba import costs_at
 from pat.matching.tangents import along_tangents
 from tests.pat.layered_array import ALPHA, load_sample
@@ -67,13 +69,14 @@ def test_a_curve_of_ones_own_is_fused_as_well_as_the_segment():
 
 def test_costs_of_positions_are_those_of_labels():
     rng = np.random.default_rng(0)
-    a, b = rng.random((2, 6, 9)).astype(np.float32)
-    bits = rng.integers(2**48, size=(2, 6, 9)).astype(np.uint64)
+    own, other = rng.random((2, 6, 9)).astype(np.float32)
+    (a, a_bits), (b, b_bits) = planes_of(own), planes_of(other)
     places = rng.integers(-1, b.size, (6, 9, 5)).astype(np.int32)
-    found = np.empty(places.shape, np.uint8)
-    costs_at(a, bits[0], b, bits[1], places, found)
+    found = np.empty((6, 9, 1, 16), np.uint8)
+    costs_at((a.ravel(), a_bits.ravel()), (b.ravel(), b_bits.ravel()), places, found)
+    assert (found[..., 5:] == kernels.NO_LABEL).all()
     for y, x, label in np.ndindex(places.shape):
         at = divmod(int(places[y, x, label]), 9)
-        bright = int(min(abs(a[y, x] - b[at]) * kernels.LEVELS, kernels.TRUNCATED))
-        expected = bin(int(bits[0, y, x] ^ bits[1][at])).count("1") + bright
-        assert found[y, x, label] == (expected if places[y, x, label] >= 0 else kernels.NOWHERE)
+        bright = int(min(abs(a[y, x] - b[at]) * cost.BRIGHTNESS, cost.TRUNCATED))
+        expected = bin(int(a_bits[y, x] ^ b_bits[at])).count("1") + bright
+        assert found[y, x, 0, label] == (expected if places[y, x, label] >= 0 else cost.NOWHERE)

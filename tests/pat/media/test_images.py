@@ -1,4 +1,5 @@
 import errno
+import io
 import os
 import struct
 import sys
@@ -104,6 +105,38 @@ def test_half_a_image_is_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(content[: len(content) // 2])
     with pytest.raises(ValueError, match=r"a.png: not an image"):
         read_image(tmp_path / "a.png")
+
+
+def planar_tiff(**options) -> bytes:
+    """A TIFF file with a plane of its own for each colour, all of 200."""
+    file = io.BytesIO()
+    tifffile.imwrite(file, np.full((3, 60, 80), 200, np.uint8), photometric="rgb", planarconfig="separate", **options)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("options", [{}, {"rowsperstrip": 5}, {"rowsperstrip": 5, "compression": "zlib"}])
+def test_half_a_planar_tiff_is_refused(tmp_path, options):
+    """OpenCV takes the strips that are missing for black."""
+    content = planar_tiff(**options)
+    (tmp_path / "whole.tif").write_bytes(content)
+    assert read_image(tmp_path / "whole.tif").allclose(torch.tensor(200 / 255))
+    (tmp_path / "half.tif").write_bytes(content[: len(content) // 2])
+    with pytest.raises(ValueError, match=r"half.tif: not an image"):
+        read_image(tmp_path / "half.tif")
+
+
+def png_chunk(kind: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+
+
+def test_the_first_image_of_an_animated_png_is_read(tmp_path):
+    """OpenCV's decoder crashes on this one, whose frame is said to be larger than the image."""
+    write_image(tmp_path / "a.png", torch.full((1, 12, 16), 0.2))
+    still = (tmp_path / "a.png").read_bytes()
+    frame = png_chunk(b"fcTL", struct.pack(">IIIIIHHBB", 0, 32, 24, 3, 3, 1, 10, 1, 0))
+    animation = png_chunk(b"acTL", struct.pack(">II", 2, 0)) + frame
+    (tmp_path / "a.png").write_bytes(still[:33] + animation + still[33:])
+    assert read_image(tmp_path / "a.png").allclose(torch.tensor(0.2))
 
 
 @pytest.mark.parametrize(

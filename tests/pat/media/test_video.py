@@ -1,10 +1,11 @@
 import os
 
 import cv2
+import numpy as np
 import pytest
 import torch
 
-from pat.media.video import write_video
+from pat.media.video import read_video, write_video
 
 
 def frames(count, hw=(48, 65)):
@@ -27,6 +28,24 @@ def test_a_video_has_all_frames_in_their_colours(tmp_path):
 def test_grey_frames_too(tmp_path):
     write_video(tmp_path / "a.mp4", [torch.full((1, 32, 32), 0.5)])
     assert cv2.VideoCapture(str(tmp_path / "a.mp4")).read()[0]
+
+
+def written_by_opencv(path, images, codec):
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*codec), 25, images[0].shape[1::-1])
+    for image in images:
+        writer.write(image)
+    writer.release()
+
+
+@pytest.mark.parametrize("codec", ["mp4v", "MJPG"])
+def test_a_grey_video_is_not_in_colour(tmp_path, codec):
+    """MPEG-4 rounds the colour of grey to 3 counts, by which it was taken for one in colour."""
+    ramp = np.repeat(np.arange(0, 255, 5, dtype=np.uint8)[None, :, None], 48, 0)
+    written_by_opencv(tmp_path / "grey.avi", [ramp.repeat(3, 2)] * 2, codec)
+    assert {frame.shape[0] for frame in read_video(tmp_path / "grey.avi").frames} == {1}
+    red = ramp * np.array([0, 0, 1], np.uint8)
+    written_by_opencv(tmp_path / "red.avi", [red] * 2, codec)
+    assert {frame.shape[0] for frame in read_video(tmp_path / "red.avi").frames} == {3}
 
 
 def test_what_goes_wrong_leaves_no_file(tmp_path):

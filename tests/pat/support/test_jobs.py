@@ -50,6 +50,13 @@ def test_errors_stop_or_are_skipped(tmp_path):
     assert str(report) == "1 made, 1 there already, 1 failed"
 
 
+def test_a_message_names_what_a_task_is_about(tmp_path):
+    """Of a sequence it named the file of a key frame's colour, 00000000.safetensors."""
+    bad = tasks(tmp_path, "bad")[0]._replace(about="mono/0001.png")
+    with pytest.raises(JobError, match=r"^mono/0001.png: not good"):
+        run_tasks([bad])
+
+
 @pytest.mark.slow
 def test_workers_do_the_same_and_say_the_same(tmp_path):
     names = [f"{i}" for i in range(10)]

@@ -1,0 +1,282 @@
+"""The tags of the images of one capture: Pix4D's `Camera:` (MicaSense, Parrot Sequoia, senseFly) and `drone-dji`.
+
+A file is one image; the others of its capture are those beside it whose names differ in what follows the last "_".
+
+Source convention: principal points in millimetres (pixels where the units say so) from the image's first pixel, whose
+centre is 0, as in MicaSense's own code; focal lengths in millimetres or, above 100 or where the units say so, in
+pixels; radial R1 R2 R3 and tangential T1 T2 as OpenCV's k1 k2 k3 p1 p2. Fisheye: theta = 2 / pi times the angle off
+axis goes to p0 + p1 theta + p2 theta^2 + ..., which the matrix C D E F takes to pixels. `RigRelatives` are degrees
+about x, y and z, R = Rx Ry Rz: camera->rig, inverted; `RigTranslations` are the cameras' centres, metres. DJI's
+`DewarpData` is fx fy cx cy k1 k2 p1 p2 k3, with cx and cy counted from `CalibratedOpticalCenter`.
+All are of the pixels as stored: the rig is of the images as their orientation tags say.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..camera import Camera
+from ..distortion import Distortion
+from ..lenses.central import POLYNOMIAL_FISHEYE
+from ..pose import Pose
+from ..rig import Rig
+from ..sensor import Band, Sensor
+from .image_tags import DJI, MICASENSE, PIX4D, ImageTags, image_tags
+from .source import RigSource
+
+CONVENTION = "first pixel's centre at 0 (no shift); millimetres by the sensor's resolution; RigRelatives camera->rig"
+
+SUFFIXES = (".tif", ".tiff", ".jpg", ".jpeg")
+IN_PIXELS = 100.0
+"""A focal length above is in pixels: no lens of these cameras has so many millimetres, and no image so few pixels."""
+LONGEST_TRANSLATION = 1.0
+"""Metres between cameras of one body; what is longer is in another unit."""
+BLACK_LEVEL, EXPOSURE, ISO, ISO_SPEED, TAKEN, SERIAL = 50714, 0x829A, 0x8827, 0x8833, 0x9003, 0xA431
+RESOLUTION_X, RESOLUTION_Y, RESOLUTION_UNIT = 0xA20E, 0xA20F, 0xA210
+ORIENTATION, QUARTER_TURNS = 274, {1: 0, 3: 2, 6: 3, 8: 1}
+"""EXIF's orientations, and the quarter turns counter-clockwise that put them upright."""
+MILLIMETRES = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
+"""Of EXIF's units of resolution: inch, cm, mm, micrometre."""
+
+
+def recognises(path: Path, head: str) -> bool:
+    return path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path))
+
+
+def read(source: RigSource) -> Rig:
+    """The rig of the capture that an image is of, its cameras named by their bands."""
+    return rig_of_images(named_by_band(capture_of(source.path)))
+
+
+def capture_of(path: Path) -> list[Path]:
+    """The images of the same capture: names that differ only in what follows the last "_"."""
+    stem = path.stem.rpartition("_")[0]
+    beside = sorted(
+        p for p in path.parent.iterdir() if p.suffix.lower() in SUFFIXES and p.stem.rpartition("_")[0] == stem
+    )
+    return [p for p in beside if _states_camera(image_tags(p))] if stem else [path]
+
+
+def named_by_band(paths: Sequence[Path]) -> dict[str, Path]:
+    """Images by the names of their bands; where those are not given, by what follows the last "_" of the files'."""
+    bands = []
+    for path in paths:
+        tags = image_tags(path)
+        words = (tags.text(PIX4D, "BandName") or tags.text(DJI, "BandName") or "").split(",") if tags else []
+        name = "rgb" if len(words) == 3 else words[0] if len(words) == 1 else ""
+        bands.append(re.sub(r"[^\w.-]+", "_", name.lower()))
+    ends = [path.stem.rpartition("_")[2] for path in paths]
+    for names in (bands, ends, [path.stem for path in paths]):
+        if all(names) and len(set(names)) == len(names):
+            return dict(zip(names, paths))
+    return {f"camera{i}": path for i, path in enumerate(paths, 1)}
+
+
+def states_cameras(paths: Sequence[Path]) -> bool:
+    """Whether the tags of every image state its camera."""
+    return bool(paths) and all(
+        path.suffix.lower() in SUFFIXES and path.is_file() and _states_camera(image_tags(path)) for path in paths
+    )
+
+
+def rig_of_images(files: Mapping[str, Path]) -> Rig:
+    """The rig of the images of one capture, by camera. Without translations in the tags all cameras are at one point.
+
+    Warns of what the tags do not state. Raises RigFileError for images without tags, of several captures or bodies, and
+    for numbers that no camera has.
+    """
+    images = {name: _Image.of(path) for name, path in files.items()}
+    _check_one_capture(images)
+    cameras = [(name, image.camera()) for name, image in images.items()]
+    first = next(iter(images.values())).source
+    rig = first.rig(cameras)
+    if unrotated := [name for name, image in images.items() if image.rotation is None][1:]:
+        first.warn(f"RigRelatives are not stated of {', '.join(unrotated)}: parallel axes are assumed")
+    if len(cameras) > 1 and not any(bool(image.centre.any()) for image in images.values()):
+        first.warn("RigTranslations are not stated: all cameras are at one point; state the translations, in metres")
+    return rig
+
+
+class _Image(NamedTuple):
+    """One image's tags, and where they are from."""
+
+    source: RigSource
+    tags: ImageTags
+
+    @classmethod
+    def of(cls, path: Path) -> _Image:
+        source = RigSource(path)
+        tags = image_tags(path)
+        if tags is None or not _states_camera(tags):
+            raise source.fail(None, "has no tags of a camera (Camera: or drone-dji): give a rig file instead")
+        return cls(source, tags)
+
+    def text(self, name: str) -> str | None:
+        return self.tags.text(PIX4D, name)
+
+    def numbers(self, name: str, namespace: str = PIX4D) -> Tensor | None:
+        """The numbers of a tag, None if it is not stated."""
+        text = self.tags.text(namespace, name)
+        return None if text is None else self.source.numbers_in(re.sub(r"[,;]", " ", text), None, name)
+
+    def needed(self, name: str, count: int) -> Tensor:
+        """So many numbers of a tag of Pix4D's."""
+        found = self.numbers(name)
+        if found is None:
+            raise self.source.fail(name, "is not stated: give a rig file instead")
+        return self.source.numbers(found, (count,), name)
+
+    @property
+    def per_mm(self) -> Tensor:
+        """Pixels a millimetre of the sensor, (x, y)."""
+        fields = self.tags.fields
+        if RESOLUTION_X not in fields:
+            raise self.source.fail(
+                "FocalPlaneXResolution", "is not stated, and the camera's numbers are in millimetres: give a rig file"
+            )
+        unit = MILLIMETRES.get(int(fields.get(RESOLUTION_UNIT, (2,))[0]), 25.4)
+        x = float(fields[RESOLUTION_X][0])
+        return torch.tensor([x, float(fields.get(RESOLUTION_Y, (x,))[0])], dtype=torch.float64) / unit
+
+    @property
+    def rotation(self) -> Tensor | None:
+        """Rotation from the camera to the rig; None if it is not stated."""
+        return None if self.numbers("RigRelatives") is None else _rotation(self.needed("RigRelatives", 3))
+
+    @property
+    def centre(self) -> Tensor:
+        """The camera's centre in the rig, metres; zero if it is not stated."""
+        if self.numbers("RigTranslations") is None:
+            return torch.zeros(3, dtype=torch.float64)
+        found = self.needed("RigTranslations", 3)
+        if float(found.abs().max()) > LONGEST_TRANSLATION:
+            raise self.source.fail(
+                "RigTranslations", f"is {found.tolist()}, and metres are wanted: give a rig file in metres"
+            )
+        return found
+
+    def camera(self) -> Camera:
+        """The camera with its pose in the rig."""
+        K, lens = self._dji() if self.text("ModelType") is None else self._pix4d()
+        self._check_centre(K)
+        rotation = self.rotation
+        R = torch.eye(3, dtype=torch.float64) if rotation is None else rotation.mT
+        pose = Pose(R, -R @ self.centre)
+        camera = Camera(K=K, cam_from_world=pose, hw=self.tags.hw, distortion=lens, sensor=self.sensor())
+        return camera.rot90(self._quarter_turns())
+
+    def _quarter_turns(self) -> int:
+        """Those by which a viewer, and `pat`, rotate the stored pixels, which the tags are of."""
+        orientation = int(self.tags.fields.get(ORIENTATION, (1,))[0])
+        if orientation not in QUARTER_TURNS:
+            raise self.source.fail("Orientation", f"is {orientation}, a mirrored image: save it as the camera did")
+        return QUARTER_TURNS[orientation]
+
+    def _pix4d(self) -> tuple[Tensor, Distortion | None]:
+        kind, centre = self.text("ModelType"), self.needed("PrincipalPoint", 2)
+        if "pixel" not in (self.text("PrincipalPointUnits") or "mm"):
+            centre = centre * self.per_mm
+        K = torch.eye(3, dtype=torch.float64)
+        K[:2, 2] = centre
+        if kind == "perspective":
+            (focal,) = self.needed("PerspectiveFocalLength", 1)
+            units = self.text("PerspectiveFocalLengthUnits") or ("pixel" if focal > IN_PIXELS else "mm")
+            K[:2, :2] = torch.diag(focal.expand(2) if "pixel" in units else focal * self.per_mm)
+            if self.numbers("PerspectiveDistortion") is None:
+                return self._intrinsics(K), None
+            r1, r2, r3, t1, t2 = self.needed("PerspectiveDistortion", 5)
+            return self._intrinsics(K), self.source.brown_conrady([r1, r2, t1, t2, r3], "PerspectiveDistortion")
+        if kind != "fisheye":
+            raise self.source.fail("ModelType", f"is '{kind}'; perspective and fisheye are read")
+        p = self.numbers("FisheyePolynomial")
+        if p is None or not 2 <= len(p) <= 5 or float(p[0]) != 0 or float(p[1]) <= 0:
+            raise self.source.fail(
+                "FisheyePolynomial", "is not 0, a positive number and up to three more: is it whole?"
+            )
+        scale = 2 / math.pi
+        K[:2, :2] = self.needed("FisheyeAffineMatrix", 4).reshape(2, 2) * float(p[1]) * scale
+        powers = torch.nn.functional.pad(p[2:] / p[1], (0, 5 - len(p)))
+        bends = powers * scale ** torch.arange(1, 4, dtype=torch.float64)
+        return self._intrinsics(K), self.source.lens(POLYNOMIAL_FISHEYE, bends, "FisheyePolynomial")
+
+    def _dji(self) -> tuple[Tensor, Distortion | None]:
+        (h, w), text = self.tags.hw, self.tags.text(DJI, "DewarpData") or ""
+        dated, _, numbers = text.rpartition(";")
+        if not dated:
+            raise self.source.fail("DewarpData", "is not a date and nine numbers: give a rig file instead")
+        fx, fy, cx, cy, *c = self.source.numbers_in(numbers.replace(",", " "), (9,), "DewarpData").tolist()
+        middle = [(self.numbers(f"CalibratedOpticalCenter{axis}", DJI), n / 2) for axis, n in (("X", w), ("Y", h))]
+        x, y = (half if stated is None else float(stated[0]) for stated, half in middle)
+        K = torch.tensor([[fx, 0, x + cx], [0, fy, y + cy], [0, 0, 1]], dtype=torch.float64)
+        return self._intrinsics(K), self.source.brown_conrady(c, "DewarpData")
+
+    def _intrinsics(self, K: Tensor) -> Tensor:
+        return self.source.intrinsics(K, "PrincipalPoint")
+
+    def _check_centre(self, K: Tensor) -> None:
+        (h, w), (x, y) = self.tags.hw, K[:2, 2].tolist()
+        if not (0.25 * w < x < 0.75 * w and 0.25 * h < y < 0.75 * h):
+            raise self.source.fail(
+                "PrincipalPoint", f"is at {x:.0f}, {y:.0f} of an image of {w}x{h}: was it cropped or resized?"
+            )
+
+    def sensor(self) -> Sensor:
+        """What the tags say of the sensor: band, black level, exposure and gain."""
+        fields = self.tags.fields
+        colour = len((self.text("BandName") or "").split(",")) == 3
+        centre, width = (self._one(name) for name in ("CentralWavelength", "WavelengthFWHM"))
+        response = "rgb" if colour else Band(centre, width or 0.0) if centre else None
+        if colour:  # a developed photograph: sRGB, no counts of light
+            return Sensor(response=response)
+        speed = fields.get(ISO, fields.get(ISO_SPEED, (100.0,)))[0]
+        black = fields.get(BLACK_LEVEL, (0.0,))
+        exposure = float(fields.get(EXPOSURE, (0.0,))[0]) or None
+        return Sensor(
+            response=response,
+            coding="linear",
+            bits=16,
+            black_level=float(sum(black) / len(black)),
+            exposure=exposure,
+            gain=float(speed) / 100.0,
+        )
+
+    def _one(self, name: str) -> float | None:
+        found = self.numbers(name)
+        return None if found is None else float(found[0])
+
+
+def _states_camera(tags: ImageTags | None) -> bool:
+    return tags is not None and (tags.text(PIX4D, "ModelType") is not None or tags.text(DJI, "DewarpData") is not None)
+
+
+def _check_one_capture(images: Mapping[str, _Image]) -> None:
+    """Raise RigFileError for images of several captures or of several bodies."""
+    kinds = {
+        "capture": lambda tags: tags.text(PIX4D, "CaptureUUID") or tags.text(MICASENSE, "CaptureId"),
+        "serial number": lambda tags: tags.fields.get(SERIAL, (None,))[0],
+        "time": lambda tags: tags.fields.get(TAKEN, (None,))[0],
+    }
+    (name, first), *others = images.items()
+    for _, image in others:
+        for kind, stated in kinds.items():
+            one, two = stated(first.tags), stated(image.tags)
+            if one and two and one != two:
+                raise image.source.fail(
+                    None, f"is of another {kind} than the image of '{name}' ({two}, {one}): give images of one capture"
+                )
+
+
+def _rotation(degrees: Tensor) -> Tensor:
+    """Rx Ry Rz of angles in degrees."""
+    (cx, sx), (cy, sy), (cz, sz) = zip(torch.deg2rad(degrees).cos().tolist(), torch.deg2rad(degrees).sin().tolist())
+    about_x = torch.tensor([[1, 0, 0], [0, cx, -sx], [0, sx, cx]], dtype=torch.float64)
+    about_y = torch.tensor([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]], dtype=torch.float64)
+    about_z = torch.tensor([[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]], dtype=torch.float64)
+    return about_x @ about_y @ about_z

@@ -1,0 +1,144 @@
+"""What cameras see of each other: rays in the world, images warped by depth, plane sweeps, depth maps that agree."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Int, Real
+from torch import Tensor
+
+from .camera import Camera, Projected
+from .epipolar import beside
+from .pixels import floating, pixel_grid
+from .pose import Pose
+from .rig import Pair, Rig
+from .sampling import Interpolation, Sampled, sample
+
+
+class WorldRays(NamedTuple):
+    """Origins (metres) and unit directions of pixels' rays in the world, and which pixels have one."""
+
+    origin: Float[Tensor, "*n 3"]
+    direction: Float[Tensor, "*n 3"]
+    valid: Bool[Tensor, "*n"]
+
+    @property
+    def plucker(self) -> Float[Tensor, "*n 6"]:
+        """Pluecker coordinates (direction, origin x direction): the same for every point of the ray."""
+        return torch.cat([self.direction, torch.linalg.cross(self.origin, self.direction)], -1)
+
+
+def world_rays(camera: Camera, x: Real[Tensor, "*n 2"] | None = None) -> WorldRays:
+    """The rays of pixels in the world, of all of the image (*b, H, W) by default; through any lens.
+
+    >>> camera = Camera(K=torch.eye(3), cam_from_world=Pose(torch.eye(3), torch.tensor([0.0, -1, 0])), hw=(4, 6))
+    >>> world_rays(camera, torch.tensor([0.0, 0.0])).plucker.tolist()
+    [0.0, 0.0, 1.0, 1.0, 0.0, -0.0]
+    """
+    batch = camera.batch_shape
+    if x is None:
+        x = pixel_grid(camera.hw, dtype=camera.K.dtype, device=camera.K.device)
+        x = x.expand(*batch, *x.shape)
+    local, valid = camera.rays(x)
+    back = Pose(camera.R.mT, torch.zeros_like(camera.t))
+    direction = back.apply(torch.where(valid[..., None], local / local.norm(dim=-1, keepdim=True), 0.0))
+    origin = beside(camera.centre, direction.ndim, 1).expand_as(direction)
+    if not camera.central:
+        origin = camera.cam_from_world.inverse().apply(camera.ray_origins(x))
+    return WorldRays(origin.to(direction), direction, valid)
+
+
+def warp(
+    pair: Pair,
+    image: Float[Tensor, "b c h w"],
+    depth: Float[Tensor, "b *d ha wa"],
+    *,
+    interpolation: Interpolation = "bilinear",
+) -> Sampled:
+    """Beta's image as alpha sees it, given the depth (metres) of alpha's pixels; through any lenses.
+
+    Values (B, C, *d, Ha, Wa) and which are valid: depth is finite and positive, and the point is in front of beta and
+    on its image. Occlusion is not looked for. A batch of pairs (B) takes depths (B, *d, Ha, Wa), or (1, ...) for the
+    same in each. Differentiable in image, depth and cameras.
+    """
+    seen = _in_beta(pair, depth)
+    batch = max(len(image), len(depth))
+    values, inside = sample(image.expand(batch, *image.shape[1:]), seen.x, interpolation=interpolation)
+    valid = inside & seen.valid
+    return Sampled(torch.where(valid[:, None], values, 0.0), valid)
+
+
+def plane_sweep(
+    pair: Pair,
+    image: Float[Tensor, "b c h w"],
+    depths: Float[Tensor, "d"],
+    *,
+    interpolation: Interpolation = "bilinear",
+) -> Sampled:
+    """Beta's image warped to alpha by planes z = depth in alpha's frame: values (B, C, D, Ha, Wa) and validity.
+
+    Of any cameras: through lenses too, where planes are no homographies. Depths are metres.
+    """
+    planes = depths[:, None, None, None].expand(-1, len(image), *pair.alpha.hw)
+    swept = [warp(pair, image, plane, interpolation=interpolation) for plane in planes]
+    return Sampled(torch.stack([s.values for s in swept], 2), torch.stack([s.valid for s in swept], 1))
+
+
+def _in_beta(pair: Pair, depth: Tensor, x: Tensor | None = None) -> Projected:
+    """Where beta sees alpha's pixels (all of them, or x (*n, 2)) at depths (*b, *d, *n); a batch's axes come first."""
+    alpha, beta = pair.cameras
+    depth = floating(depth)
+    x = pixel_grid(alpha.hw, dtype=depth.dtype, device=depth.device) if x is None else x
+    rays, seen = alpha.rays(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
+    known = depth.isfinite() & (depth > 0) & seen & (rays[..., 2] > 0)
+    scale = torch.where(known, depth, 1.0) / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0)
+    X = rays * scale[..., None]
+    if not alpha.central:
+        start = alpha.ray_origins(x.reshape(*[1] * (depth.ndim + 1 - x.ndim), *x.shape))
+        X = X + start - rays * (start[..., 2] / torch.where(rays[..., 2] > 0, rays[..., 2], 1.0))[..., None]
+    projected = beta.project_local(pair.beta_from_alpha.apply(X))
+    return projected._replace(valid=projected.valid & known & beta.contains(projected.x))
+
+
+class ConsistentDepth(NamedTuple):
+    """Depth of alpha's pixels (metres; the mean of the views that agree), how many others agree, and validity."""
+
+    depth: Float[Tensor, "h w"]
+    views: Int[Tensor, "h w"]
+    valid: Bool[Tensor, "h w"]
+
+
+def consistent_depth(
+    rig: Rig,
+    depths: Mapping[str, Float[Tensor, "h w"]],
+    alpha: str,
+    *,
+    views: int = 1,
+    pixels: float = 1.0,
+    relative: float = 0.01,
+) -> ConsistentDepth:
+    """Alpha's depth map fused with those of other cameras that agree with it, through any lenses.
+
+    A view agrees where alpha's point, replaced by what the view's own depth map has at its pixel, comes back to within
+    `pixels` of where it was in alpha and to within `relative` of its depth (Yao et al. 2018, MVSNet). Valid where
+    `views` others agree. Depths that are not finite or not positive are unknown. Differentiable in depths and cameras.
+    """
+    own = floating(depths[rig.require(alpha)])
+    if own.shape != rig[alpha].hw:
+        raise ValueError(f"the depth map of '{alpha}' is {tuple(own.shape)}, its camera {rig[alpha].hw}: resize one")
+    x = pixel_grid(rig[alpha].hw, dtype=own.dtype, device=own.device)
+    total, count = own, torch.ones_like(own)
+    for name, other in depths.items():
+        if name == alpha:
+            continue
+        there = _in_beta(rig.pair(alpha, name), own)
+        known = torch.where(other.isfinite(), other, 0.0)
+        found, inside = sample(known[None, None].to(own), there.x[None])
+        back = _in_beta(rig.pair(name, alpha), found[0, 0], there.x)
+        agrees = there.valid & inside[0] & back.valid
+        agrees = agrees & ((back.x - x).square().sum(-1) < pixels**2) & ((back.depth - own).abs() < relative * own)
+        total, count = total + torch.where(agrees, back.depth, 0.0), count + agrees
+    valid = (count > views) & own.isfinite() & (own > 0)
+    return ConsistentDepth(torch.where(valid, total / count, 0.0), (count - 1).long(), valid)

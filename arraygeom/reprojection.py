@@ -1,0 +1,137 @@
+"""Reprojection: slopes and residuals of images of points, and bundle adjustment as a differentiable layer."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float, Real
+from torch import Tensor
+
+from .camera import Camera, Projected
+from .pixels import product
+from .rig import Rig
+
+STEP = 1e-5
+"""Of central differences, in distances from the camera: in float64 they are then good to 1e-9."""
+
+
+def projection_slopes(
+    camera: Camera, X: Float[Tensor, "*n 3"], distance: Float[Tensor, "*n"]
+) -> tuple[Projected, Float[Tensor, "*n 2 3"]]:
+    """Where a float64 camera sees world points, and dx / dX in pixels a metre: of any lens, by central differences.
+
+    `distance` is the points' from the camera, metres. Differentiable as often as `Camera.project` is.
+    """
+    step = STEP * distance[..., None, None]
+    offsets = torch.eye(3).to(X) * step
+    around = torch.cat([X[..., None, :], X[..., None, :] + offsets, X[..., None, :] - offsets], -2)
+    seen = camera.project(around)
+    by_X = (seen.x[..., 1:4, :] - seen.x[..., 4:, :]) / (2 * step)
+    return Projected(*(part[..., 0, :] if part is seen.x else part[..., 0] for part in seen)), by_X.mT
+
+
+def reprojection_residuals(
+    cameras: Sequence[Camera],
+    X: Float[Tensor, "*n 3"],
+    x: Real[Tensor, "v *n 2"],
+    *,
+    seen: Bool[Tensor, "v *n"] | None = None,
+) -> Float[Tensor, "v *n 2"]:
+    """Pixels x minus where the cameras see the world points X; zero where a point is not `seen` or cannot be."""
+    projected = [camera.project(X) for camera in cameras]
+    used = torch.stack([p.valid for p in projected])
+    used = used if seen is None else used & seen
+    return torch.where(used[..., None], x - torch.stack([p.x for p in projected]), 0.0)
+
+
+class Bundle(NamedTuple):
+    """The adjusted rig and points (n, 3), and the sum of squared residuals (steps + 1) from the first on, pixels^2."""
+
+    rig: Rig
+    X: Float[Tensor, "n 3"]
+    cost: Float[Tensor, "s"]
+
+
+def bundle_adjusted(
+    rig: Rig,
+    X: Float[Tensor, "n 3"],
+    x: Real[Tensor, "v n 2"],
+    *,
+    free: Iterable[str],
+    seen: Bool[Tensor, "v n"] | None = None,
+    steps: int = 10,
+    damping: float = 1e-3,
+) -> Bundle:
+    """The rig and the points of least reprojection error: Levenberg-Marquardt with the points eliminated (Schur).
+
+    `x` are the points' pixels in the rig's cameras, in its order; `free` is as for `Rig.parameters`. In float64. A step
+    that does not lower the cost is not made, and the next is damped tenfold. Gradients follow the steps made: at the
+    optimum those of the least error, in everything that is given. The damping holds what images do not determine, such
+    as scale. Memory: points times free numbers. Raises ValueError for a batch, and for uncalibrated cameras.
+    """
+    cameras = list(rig.cameras.values())
+    if rig.batch_shape or not all(isinstance(camera, Camera) for camera in cameras):
+        raise ValueError("bundle adjustment needs one rig of calibrated cameras: take one of the batch, or calibrate")
+    if x.shape != (len(cameras), len(X), 2):
+        raise ValueError(f"wanted pixels ({len(cameras)} cameras, {len(X)} points, 2), got {tuple(x.shape)}")
+    rig, X, x = rig.to(torch.float64), X.double(), x.double()
+    names = list(rig.parameters(free=free))
+    costs = [_cost(rig, X, x, seen)]
+    for _ in range(steps):
+        trial, moved = _stepped(rig, X, x, seen, names, damping)
+        cost = _cost(trial, moved, x, seen)
+        better = bool(cost <= (1 + ROUNDED) * costs[-1])
+        rig, X = (trial, moved) if better else (rig, X)
+        costs.append(cost if better else costs[-1])
+        damping = max(damping / 10, LEAST_DAMPING) if better else damping * 10
+    return Bundle(rig, X, torch.stack(costs))
+
+
+ROUNDED = 1e-9
+"""A step that raises the cost by no more than this share is made: at the optimum gradients need it."""
+LEAST_DAMPING = 1e-9
+"""Of a diagonal in float64: less would not hold what images leave free, such as scale."""
+
+
+def _cost(rig: Rig, X: Tensor, x: Tensor, seen: Tensor | None) -> Tensor:
+    return reprojection_residuals(list(rig.cameras.values()), X, x, seen=seen).square().sum()
+
+
+def _stepped(
+    rig: Rig, X: Tensor, x: Tensor, seen: Tensor | None, names: list[str], damping: float
+) -> tuple[Rig, Tensor]:
+    """Rig and points after one damped Gauss-Newton step."""
+    cameras = list(rig.cameras.values())
+    r = reprojection_residuals(cameras, X, x, seen=seen)
+    used = r.any(-1)[..., None, None]
+    slopes = [projection_slopes(c, X, (X - c.centre).norm(dim=-1))[1] for c in cameras]
+    by_X = torch.where(used, torch.stack(slopes), 0.0)
+    zeros = rig.parameters(free=names)
+    sizes = [zero.numel() for zero in zeros.values()]
+
+    def changed(change: Tensor) -> Rig:
+        parts = (c.reshape(zeros[n].shape) for n, c in zip(names, change.split(sizes)))
+        return rig.perturbed(dict(zip(names, parts)))
+
+    def images(change: Tensor) -> Tensor:
+        return torch.stack([c.project(X).x for c in changed(change).cameras.values()])
+
+    by_rig = torch.func.jacfwd(images)(x.new_zeros(sum(sizes)))
+    by_rig = torch.where(used, by_rig, 0.0)
+    points = _damped(product(by_X.mT, by_X).sum(0), damping)
+    both = torch.einsum("vnij,vnik->njk", by_rig, by_X)
+    back = torch.linalg.solve(points, both.mT).mT
+    whole = _damped(torch.einsum("vnij,vnik->jk", by_rig, by_rig), damping) - torch.einsum("njk,nlk->jl", back, both)
+    at_points = torch.einsum("vnij,vni->nj", by_X, r)
+    target = torch.einsum("vnij,vni->j", by_rig, r) - torch.einsum("njk,nk->j", back, at_points)
+    change = torch.linalg.solve(whole, target)
+    at_points = at_points - torch.einsum("njk,j->nk", both, change)
+    return changed(change), X + torch.linalg.solve(points, at_points[..., None])[..., 0]
+
+
+def _damped(information: Tensor, damping: float) -> Tensor:
+    """With its diagonal raised by the factor of Marquardt; what nothing depends on has 1 there."""
+    diagonal = information.diagonal(dim1=-2, dim2=-1)
+    return information + torch.diag_embed(torch.where(diagonal > 0, damping * diagonal, 1.0))

@@ -1,0 +1,95 @@
+"""Matches between unlike bands where it is roughly known where a point is: patches whose structure agrees.
+
+Descriptors of features hardly match where leaves are dark in red and bright in near infrared. A patch's correlation,
+squared, does not depend on the sign of its contrast, and the search is confined to a window around what is expected.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from .matches import PointMatches, contrast_equalised
+
+POINTS = 1500
+"""Corners of alpha at most."""
+SPACING = 8
+"""Their least distance, pixels."""
+PATCH = 20
+"""Pixels from a patch's middle to its edge."""
+ALIKE = 0.4
+"""The least squared correlation of patches that match."""
+DISTINCT = 0.9
+"""A second peak's squared correlation is at most this share of the first's, as in Lowe's ratio test (2004)."""
+PEAK = 3
+"""Pixels around a peak that are part of it."""
+
+
+def guided_matches(
+    alpha: Float[Tensor, "_ h w"],
+    beta: Float[Tensor, "_ hb wb"],
+    beta_from_alpha: Float[Tensor, "3 3"],
+    *,
+    window: int,
+    shown: tuple[Bool[Tensor, "h w"], Bool[Tensor, "hb wb"]],
+) -> PointMatches:
+    """Corners of alpha with the patch most like theirs within `window` pixels of where a homography puts them in beta.
+
+    Images are to be alike in scale and orientation. `shown` says what of each image a camera recorded.
+    """
+    own, other = (contrast_equalised(image) for image in (alpha, beta))
+    solid = np.ones((2 * PATCH + 1, 2 * PATCH + 1), np.uint8)
+    mask, valid = (
+        np.asarray(cv2.erode(part.numpy().astype(np.uint8), solid, borderType=cv2.BORDER_CONSTANT, borderValue=(0,)))
+        for part in shown
+    )
+    corners = cv2.goodFeaturesToTrack(own, POINTS, 1e-3, SPACING, mask=mask)
+    x = np.zeros((0, 2)) if corners is None else corners[:, 0].astype(np.float64)
+    there = cv2.perspectiveTransform(x[:, None], beta_from_alpha.double().numpy())[:, 0] if len(x) else x
+    found = [_most_alike(own, other, valid, *points, window) for points in zip(x, there)]
+    kept = [i for i, y in enumerate(found) if y is not None]
+    y = np.array([found[i] for i in kept], np.float64).reshape(-1, 2)
+    return PointMatches(torch.from_numpy(x[kept].round()), torch.from_numpy(y))
+
+
+def _most_alike(
+    own: NDArray[np.uint8],
+    other: NDArray[np.uint8],
+    valid: NDArray[Any],
+    x: NDArray[np.float64],
+    there: NDArray[np.float64],
+    window: int,
+) -> NDArray[np.float64] | None:
+    """The position in beta of the patch that is most like that around a pixel; None where none is clearly so."""
+    (column, row), (left, top) = (np.rint(p).astype(int) for p in (x, there - window))
+    patch = own[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
+    first, last = np.maximum([left, top], PATCH), np.array([left, top]) + 2 * window
+    last = np.minimum(last, np.array(other.shape[::-1]) - 1 - PATCH)
+    if (last - first < 2 * PEAK).any() or patch.std() < 1:
+        return None
+    searched = other[first[1] - PATCH : last[1] + PATCH + 1, first[0] - PATCH : last[0] + PATCH + 1]
+    alike = np.nan_to_num(cv2.matchTemplate(searched, patch, cv2.TM_CCOEFF_NORMED)) ** 2
+    alike = np.where(valid[first[1] : last[1] + 1, first[0] : last[0] + 1] > 0, alike, 0)
+    v, u = np.unravel_index(alike.argmax(), alike.shape)
+    best = alike[v, u]
+    if best < ALIKE or not (0 < u < alike.shape[1] - 1 and 0 < v < alike.shape[0] - 1):
+        return None
+    away = alike.copy()
+    away[max(v - PEAK, 0) : v + PEAK + 1, max(u - PEAK, 0) : u + PEAK + 1] = 0
+    if away.max() > DISTINCT * best:
+        return None
+    du, dv = _vertex(alike[v, u - 1 : u + 2]), _vertex(alike[v - 1 : v + 2, u])
+    return first + np.array([u + du, v + dv])
+
+
+def _vertex(values: NDArray[np.float32]) -> float:
+    """Where a parabola through three values has its vertex, from the middle one."""
+    before, middle, after = map(float, values)
+    curvature = before - 2 * middle + after
+    return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0

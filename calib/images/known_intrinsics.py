@@ -1,0 +1,180 @@
+"""Where the cameras of one body are, whose lenses and, roughly, orientations are known: from one image of each.
+
+The tags of many multispectral cameras state everything but translations. With orientations known, every match says
+that one triple product with the baseline is zero: all pairs together give all centres, up to one scale (Hartley and
+Zisserman, section 18.5, for known rotations).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import combinations
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from arraygeom import Camera, Pose, Rig
+from arraygeom.pixels import map_homogeneous
+
+from .guided_matches import guided_matches
+from .held_out import median_off
+from .matches import ENOUGH, Images, PointMatches, near_lines
+from .refinement import refine_matches
+from .self_calibration import depth_bounds
+
+WINDOW = 0.09
+"""Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
+NEAR = 4.0
+"""Matches this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
+SHARE = 0.4
+"""A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3 are."""
+TRIALS = 500
+"""Directions of each baseline that are tried (Fischler and Bolles 1981)."""
+SIGMA = {"rotation": math.radians(0.5), "translation": 0.3}
+"""Standard deviations: of orientations, radians; of translations as a share."""
+ROUNDS = (4.0, 2.0, 2.0)
+"""Pixels from their lines up to which matches are used, in one refinement after the other."""
+
+
+def centres_found(
+    rig: Rig, images: Images, shown: Mapping[str, Bool[Tensor, "_ _"]], *, alpha: str
+) -> tuple[Rig, dict[str, tuple[int, float]]]:
+    """The rig of pinhole cameras with translations, and orientations refined; of each beta how many points, and their
+    median distance from their lines, pixels.
+
+    Alpha is at the origin, and the baseline of the first beta is 1, unless the rig states translations, whose scale is
+    kept. `shown` says what of each image its camera recorded. Cameras that match with none are left out. Raises
+    ValueError if none matches.
+    """
+    stated = [float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)]
+    pairs: dict[tuple[str, str], PointMatches] = {}
+    for a, b in combinations(rig.names, 2):
+        found = _consistent(rig, a, b, _matched(rig, a, b, images, shown))
+        if found is not None:
+            pairs[a, b] = found
+    names = _connected(alpha, list(pairs))
+    if len(names) < 2:
+        raise ValueError("the images hardly match, so their cameras' translations stay unknown: give a rig file")
+    rig = Rig({name: rig[name] for name in rig.names if name in names})
+    pairs = {pair: matches for pair, matches in pairs.items() if set(pair) <= names}
+    rig = _with_centres(rig, alpha, pairs)
+    for within in ROUNDS:
+        near = {pair: near_lines(m, rig.pair(*pair).fundamental, within=within) for pair, m in pairs.items()}
+        near = {pair: matches for pair, matches in near.items() if len(matches.alpha) >= ENOUGH}
+        free = [f"{name}.{kind}" for name in rig.betas(alpha) for kind in SIGMA]
+        rig = refine_matches(rig, [near], free=free, sigma=SIGMA, keep_depth=False).rig
+    first = float(rig.pair(alpha, rig.betas(alpha)[0]).beta_from_alpha.t.norm())
+    rig = _scaled(rig, alpha, (stated[0] if any(stated) else 1.0) / first)
+    facts = {b: _fit(rig, near, b) for b in rig.betas(alpha)}
+    return rig.replace(depth=_depths(rig, alpha, near)), facts
+
+
+def _matched(rig: Rig, a: str, b: str, images: Images, shown: Mapping[str, Tensor]) -> PointMatches:
+    infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
+    window = round(WINDOW * max(images[b].shape[-2:]))
+    return guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
+
+
+def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:
+    """What is perpendicular to the baseline, of each match, in the rig's frame; times the focal length, so that the
+    product with a baseline of length 1 is about a distance in pixels."""
+    one, two = _rays(rig, a, b, matches)
+    return float(rig[b].K[0, 0]) * torch.linalg.cross(one, two)
+
+
+def _rays(rig: Rig, a: str, b: str, matches: PointMatches) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    """The matches' rays in the rig's frame, of both cameras."""
+    one, two = (
+        map_homogeneous(rig[name].R.mT @ torch.linalg.inv(rig[name].K), x.double())
+        for name, x in ((a, matches.alpha), (b, matches.beta))
+    )
+    return one, two
+
+
+def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
+    """The matches that one direction of the baseline explains; None if that is no large share of them."""
+    if len(matches.alpha) < ENOUGH:
+        return None
+    normals = _normals(rig, a, b, matches)
+    some = torch.randint(len(normals), (TRIALS, 2), generator=torch.Generator().manual_seed(0))
+    trials = torch.linalg.cross(normals[some[:, 0]], normals[some[:, 1]])
+    length = trials.norm(dim=-1)
+    near = (normals @ (trials / length.clamp(min=1e-12)[:, None]).T).abs() < NEAR
+    near &= length > 1e-6  # else the two points say the same
+    best = near[:, int(near.sum(0).argmax())]
+    enough = int(best.sum()) >= max(ENOUGH, SHARE * len(best))
+    return matches.only(best) if enough else None
+
+
+def _connected(alpha: str, pairs: list[tuple[str, str]]) -> set[str]:
+    """The cameras that pairs connect with alpha."""
+    names = {alpha}
+    for _ in pairs:
+        names |= {name for pair in pairs if names & set(pair) for name in pair}
+    return names
+
+
+def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], PointMatches]) -> Rig:
+    """The rig with the centres that all matches agree on: alpha's is the origin, most points are in front."""
+    index = {name: i for i, name in enumerate(rig.betas(alpha))}
+    rows = []
+    for (a, b), matches in pairs.items():
+        normals = _normals(rig, a, b, matches)
+        row = normals.new_zeros(len(normals), len(index), 3)
+        for name, sign in ((b, 1), (a, -1)):
+            if name != alpha:
+                row[:, index[name]] = sign * normals
+        rows.append((row / math.sqrt(len(normals))).flatten(1))
+    system = torch.cat(rows)
+    weight = system.new_ones(len(system))
+    for _ in range(10):  # iteratively reweighted: L1
+        _, _, axes = torch.linalg.svd(system * weight[:, None], full_matrices=False)
+        off = (system @ axes[-1]).abs()
+        weight = (off.median() / off.clamp(min=1e-3 * float(off.median()) + 1e-12)).sqrt()
+    centres = {alpha: axes.new_zeros(3), **{name: axes[-1].reshape(-1, 3)[i] for name, i in index.items()}}
+    ahead = sum(_points_ahead(rig, pair, matches, centres) for pair, matches in pairs.items())
+    side = 1.0 if ahead >= 0 else -1.0
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        R = camera.R.double() @ rig[alpha].R.double().mT
+        centre = side * rig[alpha].R.double() @ centres[name]
+        cameras[name] = camera.replace(cam_from_world=Pose(R, -R @ centre))
+    return Rig(cameras)
+
+
+def _points_ahead(rig: Rig, pair: tuple[str, str], matches: PointMatches, centres: Mapping[str, Tensor]) -> float:
+    """How many more matches are in front of both cameras than behind."""
+    a, b = pair
+    one, two = _rays(rig, a, b, matches)
+    baseline = (centres[b] - centres[a]).expand_as(one)
+    # one z = baseline + two z2, and so z (one x two) = baseline x two
+    return float((torch.linalg.cross(one, two) * torch.linalg.cross(baseline, two)).sum(-1).sign().sum())
+
+
+def _scaled(rig: Rig, alpha: str, factor: float) -> Rig:
+    cameras = {}
+    for name, camera in rig.cameras.items():
+        assert isinstance(camera, Camera)
+        pose = camera.cam_from_world
+        cameras[name] = camera.replace(cam_from_world=Pose(pose.R, pose.t * factor))
+    return rig.replace(cameras=cameras)
+
+
+def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> tuple[int, float]:
+    """The points of a camera with all others, and their median distance from their lines."""
+    own = {pair: matches for pair, matches in near.items() if name in pair}
+    return sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
+
+
+def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
+    """The range of depths that all pairs' points have, extended. Raises ValueError for points without parallax."""
+    found = []
+    for (a, b), matches in near.items():
+        bounds = depth_bounds(Rig({name: rig[name] for name in (a, b)}), matches)
+        if bounds is not None:
+            found.append(bounds)
+    if not found:
+        raise ValueError("the images have no parallax, so depths stay unknown: give a rig file")
+    return min(n for n, _ in found), max(f for _, f in found)

@@ -1,0 +1,32 @@
+"""Segments as masks of other people's transformers."""
+
+from __future__ import annotations
+
+from torch import Tensor
+from torch.nn.attention.flex_attention import BlockMask, create_block_mask
+
+from arraygeom.pixels import HW
+from arraygeom.segments import Segments
+
+
+def segment_block_mask(segments: Segments, hw: HW, *, radius: float = 0.5, block: int = 128) -> BlockMask:
+    """For `flex_attention`: alpha's pixels (Ha, Wa), row by row, attend to beta's within `radius` px of their segment.
+
+    `segments` (Ha, Wa) or, of a batch, (B, Ha, Wa); keys are beta's H W pixels, row by row. `block` is that of the
+    mask. A query without such a key gets zeros. `Segments.mask` is the same, dense, for scaled_dot_product_attention.
+    """
+    batch = segments.valid.shape[0] if segments.valid.ndim > 2 else None
+    parts = (segments.start, segments.end, segments.valid)
+    starts, ends, valids = (part.reshape(batch or 1, -1, *part.shape[segments.valid.ndim :]) for part in parts)
+    width = hw[1]
+
+    def within(b: Tensor, h: Tensor, query: Tensor, key: Tensor) -> Tensor:
+        start, end, valid = (part[b if batch else 0, query] for part in (starts, ends, valids))
+        dx, dy, u, v = end[0] - start[0], end[1] - start[1], key % width - start[0], key // width - start[1]
+        along = ((u * dx + v * dy) / (dx * dx + dy * dy).clamp(min=1e-12)).clamp(0, 1)
+        return valid & ((u - along * dx).square() + (v - along * dy).square() <= radius**2)
+
+    queries = valids.shape[1]
+    return create_block_mask(
+        within, batch, None, queries, hw[0] * hw[1], device=segments.valid.device, BLOCK_SIZE=block
+    )

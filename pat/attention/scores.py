@@ -1,0 +1,108 @@
+"""What a loss needs of C3 attention without its weights: the log of each pixel's sum of exponentials, the mean score
+along its segment, and the position of the largest weight.
+
+Nothing is gathered: memory is that of the query, the key and one image of alpha's size. The weight of a sample with
+the score s is exp(s - log_sum).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.autograd import Function
+
+from arraygeom.segments import Segments
+
+from . import reference, torch_op
+from .attend import Interpolation, Locations, attend, attend_with_statistics, chosen_backend, sample_positions
+from .reference import Attended, AttentionInputs
+
+SHARPENED = 1e4
+"""Queries times this give nearly all weight to the largest score."""
+
+
+class Compared(NamedTuple):
+    """A query (B, D, Ha, Wa), and a key and a value (B, D, Hb, Wb), at `locations`, all as `attend` takes them."""
+
+    query: Tensor
+    key: Tensor
+    value: Tensor
+    locations: Segments | Callable[[Tensor], Locations]
+    samples: int
+    interpolation: Interpolation
+
+    def attended(self) -> Attended:
+        """C3 attention, with its statistics."""
+        return attend_with_statistics(
+            *(self.query, self.key, self.value, self.locations),
+            samples=self.samples,
+            interpolation=self.interpolation,
+        )
+
+    @property
+    def segments(self) -> Segments:
+        """The locations (B or 1, Ha, Wa). Raises ValueError for explicit positions."""
+        if not isinstance(self.locations, Segments):
+            raise ValueError("a loss on attention needs straight segments: choose a straight field")
+        return self.locations
+
+    def strided(self, stride: int) -> Compared:
+        """Of every `stride`-th row and column of alpha alone."""
+        part = (..., slice(None, None, stride), slice(None, None, stride))
+        start, end, valid = self.segments.start, self.segments.end, self.segments.valid
+        few = Segments(start[(*part, slice(None))], end[(*part, slice(None))], valid[part])
+        return self._replace(query=self.query[part], locations=few)
+
+
+def log_sum(compared: Compared) -> Float[Tensor, "b ha wa"]:
+    """log sum_l exp(query . key(x_l)) over the samples that count; of no meaning where none does.
+
+    Differentiable once, by query and key.
+    """
+    positions = sample_positions(compared.segments, compared.query, compared.samples)
+    nearest = compared.interpolation == "nearest"
+    return _LogSum.apply(compared.query, compared.key, positions, nearest)
+
+
+def mean_score(compared: Compared) -> Float[Tensor, "b ha wa"]:
+    """The mean of the scores of a pixel's samples that count; 0 where none does."""
+    query, key, _, locations, samples, interpolation = compared
+    nothing = torch.zeros_like(query), torch.zeros_like(key)
+    even = attend(*nothing, key, locations, samples=samples, interpolation=interpolation)
+    return (query * even).sum(1)
+
+
+@torch.no_grad()
+def peak_position(compared: Compared) -> Float[Tensor, "b 2 ha wa"]:
+    """Where the largest weight is, (x, y) in beta's pixels; 0 where no sample counts. Of equal ones their mean."""
+    query, key, _, locations, samples, interpolation = compared
+    sharp = query.float() * SHARPENED
+    found = attend_with_statistics(
+        sharp, key.float(), key[:, :1].float(), locations, samples=samples, interpolation=interpolation
+    )
+    return found.position
+
+
+class _LogSum(Function):
+    """Its gradient by the query is the attended key; by the key, that of attended values with the query upstream."""
+
+    @staticmethod
+    def forward(ctx: Any, query: Tensor, key: Tensor, positions: reference.SamplePositions, nearest: bool) -> Tensor:
+        ctx.inputs = AttentionInputs(query.detach(), key.detach(), key.detach(), positions, None, nearest)
+        kernels = torch_op.compiled(chosen_backend("auto", query.device.type))
+        value, statistics, total, best = kernels.forward(ctx.inputs, False)
+        ctx.saved = statistics, total, best, value
+        return total.clone()
+
+    @staticmethod
+    def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor, Tensor, None, None]:
+        inputs, (_, _, _, value) = ctx.inputs, ctx.saved
+        weighted = upstream[:, None].to(inputs.query)
+        cotangents = (weighted * inputs.query, upstream.new_zeros(0))
+        kernels = torch_op.compiled(chosen_backend("auto", inputs.query.device.type))
+        by_key = kernels.backward(inputs, ctx.saved, cotangents, [False, False, True, False, False])[2]
+        return weighted * value, by_key, None, None

@@ -1,0 +1,200 @@
+"""`pat align`: images of an array in, every camera's own values at one camera's pixels out."""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+
+from tyro.conf import Positional, UseAppendAction, arg
+
+from . import options
+from .fusing import files_by_camera, named_images, warn_of_wrong_rig
+from .options import FIRST, WEIGHTS_HELP, Depth, FieldName, Images, Memory, Out, optional, say
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from arraygeom import Rig
+
+
+@dataclass
+class Align:
+    """Align the images of an array: every camera's own values at the pixels of one, with masks; no fused image.
+
+    Without a rig: pat align IMG_0000_*.TIF
+    With one: pat align rig.yaml --alpha mono --image mono=a.png --image nir=b.tif --depth 2 20 --out out/
+
+    Values keep their recorded type and bits. Without a rig it is found from the tags of the images, or from the images,
+    and written to rig.yaml beside the result. With folders, or quoted patterns, frames are aligned one by one.
+    """
+
+    spellings: ClassVar[Mapping[str, str]] = {"--rig": FIRST, "--to": "--alpha"}
+
+    given: Annotated[Positional[tuple[Path, ...]], arg(metavar="RIG|IMAGE IMAGE")] = ()
+    """Rig file of any known format (also: --rig RIG); or, without one, an image or folder of each camera."""
+    alpha: Annotated[str | None, optional("NAME")] = None
+    """The camera to whose pixels the others are aligned; without a rig by default the largest grey image. Also:
+    --to."""
+    image: Images = ()
+    """With a rig: an image of each camera, once each; or NAME=FOLDER, or NAME=PATTERN."""
+    depth: Depth = None
+    """Near and far bounds in metres, instead of the rig's; far may be inf."""
+    out: Out = Path("out")
+    """Folder for aligned.tif (all bands, with names and wavelengths), NAME_visibility.png (255 seen, 128 occluded, 0
+    beyond the edge), NAME_confidence.png, NAME_positions.npy, depth.tif, visibility.txt and index.html."""
+    interpolation: Literal["nearest", "bilinear", "cubic"] = "bilinear"
+    """Between recorded values; nearest keeps them."""
+    confidence: float = 0.5
+    """From which confidence on, 0 to 1, a camera counts as seeing a point: lower keeps more, with more mistakes."""
+    fill: Literal["none", "propagate"] = "none"
+    """Pixels that a camera does not see: none leaves them without a value, propagate takes the nearest value seen."""
+    separate: bool = False
+    """Write a file of each camera, NAME.tif, instead of one of all bands."""
+    positions: Literal["npy", "tif", "none"] = "npy"
+    """Format of the sub-pixel positions of alpha's pixels in each camera's image (x, y)."""
+    weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
+    field: FieldName = "auto"
+    """Receptive field in the other cameras; auto takes what the rig allows."""
+    max_memory: Memory = None
+    """Memory limit of the whole process, such as 4GiB."""
+    normalise_radiometry: bool = False
+    """First bring every beta to alpha's mean and contrast, for matching alone: values stay as recorded."""
+    response: Annotated[str, options.arg(metavar="fit|rec601|R,G,B")] = "fit"
+    """How a mono alpha weighs red, green and blue; fit: found from matches, with gain and gamma."""
+    correct: bool = True
+    """Find how far the other cameras lie off their search segments, and put that right."""
+    noise: UseAppendAction[Annotated[tuple[str, ...], options.arg(metavar="NAME=ELECTRONS[,READ]|estimate")]] = ()
+    """Low light: views are denoised before they are matched; values stay as recorded."""
+    report: bool = True
+    """Of a single frame, also write index.html: a page with any two bands or composites under a slider."""
+    strict: bool = False
+    """Write nothing, instead of warning, where the confidence says that the rig does not fit the images."""
+
+    def run(self) -> None:
+        """Align one frame or several, with the rig that is given or one that is found."""
+        from ..fusion.checks import confidence_checked
+        from ..support.memory import limited, parse_bytes
+
+        options.writable(self.out, folder=True)
+        limit = None if self.max_memory is None else parse_bytes(self.max_memory)
+        options.response_of(self.response)
+        options.noise_of(self.noise)
+        options.compile_at_once()
+        with limited(limit), confidence_checked(strict=self.strict):
+            image, with_rig = named_images(self.given, self.image, "align")
+            for frame in self._frames_with_rig(image) if with_rig else self._frames_without():
+                self._align(frame)
+
+    def _frames_with_rig(self, image: tuple[str, ...]) -> Iterator[_Frame]:
+        from ..fusion.views import ViewFiles
+
+        rig = options.load_rig(self.given[0], self.depth)
+        alpha, files = files_by_camera(rig, self.alpha, self.given, image)
+        for i, one in enumerate(_in_order(files)):
+            views = ViewFiles(rig, one, alpha=alpha)
+            if i == 0:
+                warn_of_wrong_rig(views)
+            yield _Frame(views.developed, rig, views, one, alpha, name=_name_of(files, alpha, one))
+
+    def _frames_without(self) -> Iterator[_Frame]:
+        from ..fusion.views import ViewFiles
+        from .from_images import array_of, camera_names, files_of
+
+        if self.depth:
+            raise ValueError("--depth: needs a rig: give one with --rig RIG")
+        files = {name: files_of(path) for name, path in camera_names(self.given).items()}
+        options.say_when_compiling()
+        with options.working("finding the rig"):
+            array = array_of(
+                {n: paths[0] for n, paths in files.items()}, alpha=self.alpha, weights=self.weights, say=say
+            )
+        self.weights = array.weights
+        self.normalise_radiometry |= array.match_levels
+        files = {name: files[name] for name in array.rig.names}
+        for one in _in_order(files):
+            first = one == {name: paths[0] for name, paths in files.items()}
+            images = array.images if first else ViewFiles(array.rig, one, alpha=array.alpha)
+            name = _name_of(files, array.alpha, one)
+            yield _Frame(array.rig, array.rig, images, one, array.alpha, array.notes, name, found=True)
+
+    def _align(self, frame: _Frame) -> None:
+        from ..fusion.align import align
+        from ..fusion.aligned_files import RecordedFiles, save_aligned
+        from ..fusion.aligned_page import write_aligned_page
+        from ..fusion.report import Facts
+        from ..networks.weights import load_weights
+        from ..support.locks import folder_lock
+
+        begin, texts = time.monotonic(), []
+        show = warnings.showwarning
+
+        def noted(message: Warning | str, *further: Any, **options: Any) -> None:
+            texts.append(str(message))
+            show(message, *further, **options)
+
+        options.say_when_compiling()
+        with folder_lock(self.out), warnings.catch_warnings():
+            warnings.showwarning = noted
+            with options.working(f"aligning {frame.name}".strip()):
+                aligned = align(
+                    frame.rig,
+                    frame.images,
+                    alpha=frame.alpha,
+                    recorded=RecordedFiles(frame.recorded, frame.files),
+                    network=None if self.weights is None else load_weights(self.weights),
+                    field=options.field_named(self.field),
+                    interpolation=self.interpolation,
+                    min_confidence=self.confidence,
+                    fill=self.fill,
+                    max_memory=self.max_memory,
+                    match_levels=self.normalise_radiometry,
+                    response=options.response_of(self.response),
+                    correct=self.correct,
+                    noise=options.noise_of(self.noise),
+                )
+            written = save_aligned(aligned, self.out, separate=self.separate, positions=self.positions, name=frame.name)
+            if frame.found:
+                frame.rig.save(self.out / "rig.yaml")
+                written.append(self.out / "rig.yaml")
+            if self.report and not frame.name:
+                facts = Facts(frame.notes, texts, time.monotonic() - begin)
+                written.append(write_aligned_page(self.out / "index.html", aligned, frame.rig, facts))
+        print(
+            (self.out / f"{frame.name}_visibility.txt" if frame.name else self.out / "visibility.txt").read_text(),
+            end="",
+        )
+        say(f"written to {self.out}: {', '.join(path.name for path in written)}")
+
+
+@dataclass(frozen=True)
+class _Frame:
+    """One frame to align: the rig of its developed images, that of its files, and those; `found` says that the rig was
+    found from the images. The name goes in front of the files'; empty for a single frame."""
+
+    rig: Rig
+    recorded: Rig
+    images: Mapping[str, Tensor]
+    files: Mapping[str, Path]
+    alpha: str
+    notes: tuple[str, ...] = ()
+    name: str = ""
+    found: bool = False
+
+
+def _in_order(files: Mapping[str, list[Path]]) -> Iterator[dict[str, Path]]:
+    """The first file of each camera, the second of each, and so on. Raises ValueError for unequal numbers."""
+    counts = {name: len(paths) for name, paths in files.items()}
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"'{name}' {count}" for name, count in counts.items())
+        raise ValueError(f"every camera needs an image of every frame; there are {listed}")
+    for paths in zip(*files.values()):
+        yield dict(zip(files, paths))
+
+
+def _name_of(files: Mapping[str, list[Path]], alpha: str, one: Mapping[str, Path]) -> str:
+    """The name of a frame among several: that of alpha's file."""
+    return one[alpha].stem if len(files[alpha]) > 1 else ""

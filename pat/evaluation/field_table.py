@@ -1,0 +1,179 @@
+"""Every field of the toolkit with one network whose only way to the other camera is the field.
+
+On rectified pairs with true disparity, where all fields are comparable; on the same with F alone; and on unrectified
+rigs of layered scenes with exact positions.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import (
+    Curved,
+    Dense,
+    Epipolar,
+    EpipolarLine,
+    HomographyDisplacement,
+    Link,
+    Local,
+    NearestVoxels,
+    Pair,
+    ReceptiveField,
+    Rectified,
+    View,
+    Widened,
+)
+from arraygeom.fields.straight import covering_displacement
+
+from ..data.pairs import PAPER_DISPARITY, StereoPair
+from ..networks.protocol import Comparing
+from ..synthesis.photos import PhotoBank
+from .metrics import score
+from .protocols import hw_of, mono_colour_task, rectified_rig
+from .sweeps import ALPHA, BETA, RecordedScene, fused, made, rig_of
+from .tables import distinct, markdown_table
+
+DENSE_LIMIT = 2**28
+"""Samples that an image may take; more are left out."""
+
+
+class Case(NamedTuple):
+    """A scene with what fields know of its pair, and the largest displacement from H x, pixels of beta."""
+
+    kind: str
+    name: str
+    pair: Pair
+    scene: RecordedScene
+    max_displacement: float
+
+
+class FieldRow(NamedTuple):
+    """One field on one case; `note` says why there are no figures, where there are none.
+
+    `peaks` is the share, of the pixels whose true position is known and in beta, whose largest weight is within a pixel
+    of it.
+    """
+
+    kind: str
+    case: str
+    field: str
+    psnr: float = math.nan
+    ssim: float = math.nan
+    peaks: float = math.nan
+    seconds: float = math.nan
+    note: str = ""
+
+
+def fields_of(max_displacement: float) -> dict[str, ReceptiveField]:
+    """The families by name, for pairs whose points move up to so many pixels from H x."""
+    return {
+        "epipolar": Epipolar(),
+        "full line": EpipolarLine(),
+        "homography + displacement": HomographyDisplacement(max_displacement),
+        "nearest voxels": NearestVoxels(),
+        "rectified": Rectified(max_displacement, alpha_is="left"),
+        "curved": Curved(math.ceil(max_displacement) + 1),
+        "local 5x5": Local(),
+        "widened by 1 px": Widened(Epipolar(), across=1.0),
+        "dense": Dense(),
+    }
+
+
+def rectified_cases(pairs: Iterable[StereoPair], *, rate: int = 2, linked: bool = False) -> Iterator[Case]:
+    """Pairs with true disparity, the right image reduced `rate` times and enlarged again; with F and H alone if
+    `linked`."""
+    for pair in pairs:
+        if pair.disparity is None:
+            continue
+        task = mono_colour_task(pair, rate)
+        h, w = hw_of(task.alpha)
+        beta = interpolate(task.beta[None], (h, w), mode="bicubic", align_corners=False)[0].clamp(0, 1)
+        scene = RecordedScene({ALPHA: task.alpha, BETA: beta}, task.ground_truth, *_truth(pair, (h, w)))
+        rig = rectified_rig((h, w), {BETA: (h, w)}, PAPER_DISPARITY)
+        known = row_link((h, w)) if linked else rig.pair(ALPHA, BETA)
+        yield Case("F alone" if linked else "rectified pairs", pair.name, known, scene, PAPER_DISPARITY)
+
+
+def row_link(hw: tuple[int, int]) -> Pair:
+    """A rectified pair of which only F is known, and H of the points at infinity."""
+    F = torch.tensor([[0, 0, 0], [0, 0, -1], [0, 1, 0]], dtype=torch.float64)
+    return Pair(View(hw=hw), View(hw=hw), link=Link(F, torch.eye(3, dtype=torch.float64)))
+
+
+def _truth(pair: StereoPair, hw: tuple[int, int]) -> tuple[Float[Tensor, "h w 2"], Tensor]:
+    """Where left's pixels are in right, and where that is known and in the image."""
+    assert pair.disparity is not None
+    value, valid = (t[: hw[0], : hw[1]] for t in pair.disparity)
+    y, x = torch.meshgrid(torch.arange(hw[0]).double(), torch.arange(hw[1]).double(), indexing="ij")
+    found = x - value.double()
+    return torch.stack([found, y], -1), valid & (found >= -0.5)
+
+
+def layered_cases(bank: PhotoBank, count: int, *, hw: tuple[int, int] = (96, 128)) -> Iterator[Case]:
+    """Unrectified rigs, of different focal lengths, in front of layered scenes."""
+    for number in range(count):
+        rig = rig_of(hw, ratio=(1.0, 1.25)[number % 2], ahead=(0.0, 30.0)[number // 2 % 2])
+        pair = rig.pair(ALPHA, BETA)
+        yield Case("unrectified", f"scene {number}", pair, made(rig, bank, number), float(covering_displacement(pair)))
+
+
+def evaluate_fields(
+    network: Comparing,
+    cases: Iterable[Case],
+    *,
+    fields: Callable[[float], Mapping[str, ReceptiveField]] = fields_of,
+    each: Callable[[FieldRow], None] = lambda row: None,
+) -> list[FieldRow]:
+    """Every field on every case."""
+    rows = []
+    for case in cases:
+        for name, field in fields(case.max_displacement).items():
+            rows.append(_row(network, case, name, field))
+            each(rows[-1])
+    return rows
+
+
+def _row(network: Comparing, case: Case, name: str, field: ReceptiveField) -> FieldRow:
+    alpha, beta = case.scene.images[ALPHA], case.scene.images[BETA]
+    pixels = math.prod(hw_of(alpha)) * math.prod(hw_of(beta))
+    if isinstance(field, Dense) and pixels > DENSE_LIMIT:
+        return FieldRow(case.kind, case.name, name, note=f"{pixels:.1g} samples: left out")
+    began = time.perf_counter()
+    try:
+        result = fused(network, case.pair, alpha, beta, field)
+    except ValueError as error:
+        return FieldRow(case.kind, case.name, name, note=f"{error}".partition(":")[0])
+    seconds = time.perf_counter() - began
+    psnr, ssim = score(result.image.clamp(0, 1), case.scene.ground_truth)
+    off = (result.peak - case.scene.position).norm(dim=-1)
+    peaks = float((off[case.scene.visible] <= 1).double().mean())
+    return FieldRow(case.kind, case.name, name, psnr, ssim, peaks, seconds)
+
+
+def fields_markdown(rows: Sequence[FieldRow]) -> str:
+    """A table for each kind of cases: means over them, fields as lines."""
+    parts = []
+    for kind in distinct(row.kind for row in rows):
+        some = [row for row in rows if row.kind == kind]
+        lines = [_line(name, [r for r in some if r.field == name]) for name in distinct(r.field for r in some)]
+        columns = [f"{kind} ({len(distinct(r.case for r in some))})", "PSNR", "SSIM", "peaks within 1 px", "s", ""]
+        parts.append(markdown_table(columns, lines, align="lrrrrl"))
+    return "\n".join(parts)
+
+
+def _line(name: str, rows: Sequence[FieldRow]) -> list[str]:
+    served = [row for row in rows if not row.note]
+    if not served:
+        return [name, "", "", "", "", rows[0].note]
+    psnr, ssim, peaks, seconds = (
+        sum(getattr(r, n) for r in served) / len(served) for n in ("psnr", "ssim", "peaks", "seconds")
+    )
+    return [name, f"{psnr:.2f}", f"{ssim:.4f}", f"{peaks:.1%}", f"{seconds:.1f}", ""]

@@ -1,0 +1,133 @@
+"""The ablation's rows as a table, as JSON, and as one figure of curves with intervals."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from arraygeom.atomic import write_text
+from arraygeom.viz import new_figure
+
+from ..media.figures import save_figure
+from .metrics import bootstrap_interval
+from .sweeps import SWEEPS, Row
+from .tables import distinct, markdown_table
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+MEASURES = {"psnr": ("PSNR, dB", "{:.2f}"), "peaks": ("peaks within a pixel, %", "{:.1f}")}
+"""What is drawn, its label, and how it is printed."""
+
+
+def write_report(rows: Sequence[Row], out: Path) -> None:
+    """ablation.md, ablation.json, ablation.svg and ablation.png in a folder."""
+    write_text(out / "ablation.md", markdown(rows))
+    write_text(out / "ablation.json", json.dumps([_plain(row) for row in rows], indent=0))
+    for kind in ("svg", "png"):
+        save_curves(rows, out / f"ablation.{kind}")
+
+
+def read_rows(path: str | Path) -> list[Row]:
+    """The rows of an ablation.json. Raises ValueError for another file."""
+    try:
+        found = json.loads(Path(path).read_text(encoding="utf-8"))
+        if not isinstance(found, list):
+            raise TypeError("wanted a list")
+        rows: list[dict[str, Any]] = [{k: math.nan if v is None else v for k, v in row.items()} for row in found]
+        return [Row(**row) for row in rows]
+    except (TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: not the rows of an ablation ({error})") from None
+
+
+def shipped_rows() -> list[Row]:
+    """The rows of `pat ablate` with the weights that ship, computed once."""
+    return read_rows(Path(__file__).with_name("ablation.json"))
+
+
+def markdown(rows: Sequence[Row]) -> str:
+    """A table for each sweep and measure: fields as lines, values as columns; means over scenes."""
+    return "\n".join(
+        f"#### {sweep}: {SWEEPS[sweep][0] if sweep in SWEEPS else 'rigs'}\n\n{_tables(rows, sweep)}"
+        for sweep in distinct(row.sweep for row in rows)
+    )
+
+
+def _tables(rows: Sequence[Row], sweep: str) -> str:
+    values = distinct(row.value for row in rows if row.sweep == sweep)
+    fields = distinct(row.field for row in rows if row.sweep == sweep)
+    parts = []
+    for measure, (label, form) in MEASURES.items():
+        lines = [[field, *(_cell(_of(rows, sweep, field, v, measure), form) for v in values)] for field in fields]
+        parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
+    notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in rows if row.sweep == sweep and row.note)
+    return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
+
+
+def _cell(values: Sequence[float], form: str) -> str:
+    return form.format(np.mean(values)) if values else ""
+
+
+def _of(rows: Sequence[Row], sweep: str, field: str, value: float, measure: str) -> list[float]:
+    """A measure on every scene where there is one, peaks in percent."""
+    found = [getattr(r, measure) for r in rows if (r.sweep, r.field, r.value) == (sweep, field, value)]
+    return [100 * v if measure == "peaks" else v for v in found if not math.isnan(v)]
+
+
+def save_curves(rows: Sequence[Row], path: Path) -> Path:
+    """Write the figure of `curves`."""
+    return save_figure(curves(rows), path)
+
+
+def curves(rows: Sequence[Row]) -> Figure:
+    """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the mean.
+
+    PSNR is drawn against the first field at the first value, scene by scene: scenes differ by more than fields.
+    """
+    sweeps = distinct(row.sweep for row in rows)
+    figure = new_figure(figsize=(3.2 * len(sweeps), 6.0))
+    axes = figure.subplots(len(MEASURES), len(sweeps), squeeze=False)
+    for line, measure in zip(axes, MEASURES):
+        for axis, sweep in zip(line, sweeps):
+            _draw(axis, [row for row in rows if row.sweep == sweep], measure)
+            axis.set_xlabel(SWEEPS[sweep][0].replace(", ", ",\n") if sweep in SWEEPS else sweep, fontsize=8)
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=len(labels), frameon=False)
+    figure.tight_layout(rect=(0, 0.05, 1, 1))
+    return figure
+
+
+def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
+    """The curves of one sweep."""
+    values = distinct(row.value for row in rows)
+    for field in distinct(row.field for row in rows):
+        found = {value: _drawn(rows, field, value, measure) for value in values}
+        known = [value for value in values if found[value]]
+        means = np.array([np.mean(found[value]) for value in known])
+        bounds = np.array([bootstrap_interval(found[value]) for value in known]).reshape(-1, 2)
+        spread = np.abs(np.nan_to_num(bounds.T - means)) if len(known) else None
+        axis.errorbar(known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1)
+    axis.set_ylabel(f"{'gain in ' if measure == 'psnr' else ''}{MEASURES[measure][0]}", fontsize=8)
+    axis.tick_params(labelsize=8)
+    axis.grid(alpha=0.3)
+
+
+def _drawn(rows: Sequence[Row], field: str, value: float, measure: str) -> list[float]:
+    """What is drawn of each scene where there is something."""
+    if measure != "psnr":
+        return _of(rows, rows[0].sweep, field, value, measure)
+    first = {r.scene: r.psnr for r in rows if (r.field, r.value) == (rows[0].field, rows[0].value)}
+    found = [r.psnr - first[r.scene] for r in rows if (r.field, r.value) == (field, value) and r.scene in first]
+    return [gain for gain in found if not math.isnan(gain)]
+
+
+def _plain(row: Row) -> dict[str, object]:
+    """Seven digits; NaN is no JSON."""
+    plain = {k: float(f"{v:.7g}") if isinstance(v, float) else v for k, v in row._asdict().items()}
+    return {k: None if v != v else v for k, v in plain.items()}

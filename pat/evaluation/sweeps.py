@@ -1,0 +1,324 @@
+"""The ablation of calibration: the same network and scenes, each field, as one property of the rig changes.
+
+Scenes are layered photographs rendered for each rig, so that the true position of every pixel in beta is known. What
+a field is computed from may be another rig than the true one: that is a calibration which is wrong.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import interpolate
+
+from arraygeom import (
+    Camera,
+    Dense,
+    Epipolar,
+    Local,
+    Pair,
+    Pose,
+    Positions,
+    ReceptiveField,
+    Rectified,
+    Rig,
+    Segments,
+    apply_homography,
+    intrinsics,
+    pixel_grid,
+    rectify,
+    rotation_from_vector,
+    sample,
+)
+from arraygeom.fields.grid import FieldOnGrid
+from arraygeom.fields.straight import covering_displacement
+from arraygeom.pixels import HW
+
+from ..attention.scores import peak_position
+from ..fusion.steps import resolution_ratio
+from ..matching.inputs import Inputs
+from ..media.colour import luminance
+from ..networks.protocol import Comparing
+from ..sensors import Clip, Noise, Quantise, generator_for, record
+from ..synthesis.layered import LayeredScenes
+from ..synthesis.photos import PhotoBank
+from ..synthesis.rig_distribution import RigDistribution
+from ..synthesis.rigs import RigBatch
+from .ablation import sample_photographs
+from .metrics import score
+
+ALPHA, BETA = "alpha", "beta"
+SIZE: HW = (96, 128)
+NEAR, FAR = 2.0, 16.0
+"""Of the scenes, metres."""
+PARALLAX = 24.0
+"""Displacement of the nearest points against infinity, alpha's pixels, where it is not what changes."""
+TILT = 3.0
+"""Degrees that beta is rotated by in every rig: none is rectified."""
+
+
+class Point(NamedTuple):
+    """One rig of a sweep: the true one, and the calibration that fields are computed from."""
+
+    sweep: str
+    value: float
+    rig: Rig
+    assumed: Rig
+
+
+class RecordedScene(NamedTuple):
+    """Recorded images by name, alpha's view in colour, where its pixels are in beta (h, w, 2), which beta sees."""
+
+    images: dict[str, Tensor]
+    ground_truth: Tensor
+    position: Float[Tensor, "h w 2"]
+    visible: Bool[Tensor, "h w"]
+
+
+class Result(NamedTuple):
+    """The fused image (3, H, W), and where attention is largest in beta as recorded (h, w, 2)."""
+
+    image: Tensor
+    peak: Tensor
+
+
+class Row(NamedTuple):
+    """One field on one scene of one rig.
+
+    `peaks` is the share of the pixels that beta sees whose largest weight is within a pixel of the true position.
+    `note` says why there are no figures, where there are none.
+    """
+
+    sweep: str
+    value: float
+    field: str
+    scene: int
+    psnr: float = math.nan
+    ssim: float = math.nan
+    peaks: float = math.nan
+    seconds: float = math.nan
+    note: str = ""
+
+
+@runtime_checkable
+class Way(Protocol):
+    """Something other than a field: it is given the network, the calibration and the images."""
+
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+        """The result at alpha's view. Raises ValueError for a rig that it is not for."""
+        ...
+
+
+@dataclass(frozen=True)
+class Directly:
+    """The images as they are, beta resized to about alpha's angular resolution as `fuse` does it, with a field."""
+
+    field: ReceptiveField
+
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+        """The network with the field of the pair. All of beta is searched as it is: enlarged it would not fit."""
+        pair, beta = rig.pair(ALPHA, BETA), images[BETA]
+        ratio = resolution_ratio(pair)
+        if 0.8 < ratio < 1.25 or isinstance(self.field, Dense):
+            return fused(network, pair, images[ALPHA], beta, self.field)
+        hw = [round(n / ratio) for n in pair.beta.hw]
+        larger = interpolate(beta[None], hw, mode="bicubic", align_corners=False, antialias=ratio > 1)[0].clamp(0, 1)
+        resized = Pair(pair.alpha, pair.cameras[1].resize((hw[0], hw[1])), pair.depth)
+        found = fused(network, resized, images[ALPHA], larger, self.field)
+        step = found.peak.new_tensor([pair.beta.hw[1] / hw[1], pair.beta.hw[0] / hw[0]])
+        return found._replace(peak=(found.peak + 0.5) * step - 0.5)
+
+
+@dataclass(frozen=True)
+class Resampled:
+    """Both images resampled to rows by the calibration, searched along the rows, and the result resampled back."""
+
+    field: ReceptiveField = Epipolar()  # noqa: RUF009 - frozen
+
+    def fuse(self, network: Comparing, rig: Rig, images: Mapping[str, Tensor]) -> Result:
+        """Raises ValueError where the pair cannot be rectified, as of a camera ahead of the other."""
+        pair = rig.pair(ALPHA, BETA)
+        found = rectify(pair)
+        views = (images[ALPHA], found.H_alpha), (images[BETA], found.H_beta)
+        alpha, beta = (warped(image, torch.linalg.inv(H), found.pair.alpha.hw) for image, H in views)
+        result = fused(network, found.pair, alpha, beta, self.field)
+        back = warped(result.image, found.H_alpha, pair.alpha.hw)
+        peaks = warped(result.peak.movedim(-1, 0), found.H_alpha, pair.alpha.hw, interpolation="nearest").movedim(0, -1)
+        return Result(back, apply_homography(torch.linalg.inv(found.H_beta), peaks.double()).x)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rectified assumption: rows of beta, as far to both sides as the depth range moves points."""
+
+    def __call__(self, pair: Pair, x: Float[Tensor, "*n 2"]) -> Segments | Positions:
+        """Horizontal segments through the pixel itself."""
+        return Rectified(2 * max(float(covering_displacement(pair)), 1.0), alpha_is="either")(pair, x)
+
+
+FIELDS: dict[str, ReceptiveField | Way] = {
+    "calibrated segments": Epipolar(),
+    "rectified and resampled": Resampled(),
+    "rows": Rows(),
+    "local 5x5": Local(),
+    "dense": Dense(),
+}
+"""What is compared by default."""
+
+
+def ablate(
+    network: Comparing,
+    rigs: Mapping[str, Rig] | Iterable[Point],
+    fields: Mapping[str, ReceptiveField | Way] = FIELDS,
+    *,
+    scenes: int = 6,
+    photos: PhotoBank | None = None,
+    seed: int = 0,
+    each: Callable[[Row], None] = lambda row: None,
+) -> list[Row]:
+    """Each field on so many scenes of each rig; `rigs` by name, or points of sweeps (`points`).
+
+    A rig has two calibrated pinhole cameras, alpha first, and a depth range: its scenes lie in it. `fields` are fields,
+    one's own included, or ways. `each` is called with every row. Raises ValueError for another kind of rig.
+    """
+    given = [Point(name, 0.0, rig, rig) for name, rig in rigs.items()] if isinstance(rigs, Mapping) else rigs
+    bank = photos or sample_photographs()
+    rows: list[Row] = []
+    everywhere: dict[tuple[str, int, bytes], Row] = {}
+    for point in given:
+        for number in range(scenes):
+            scene = made(two(point.rig), bank, number, seed)
+            for name, field in fields.items():
+                # A search of all of beta asks for no calibration: once for each true rig.
+                key = (name, number, _numbers(point.rig))
+                row = everywhere.get(key) or _row(network, point, name, field, number, scene)
+                if isinstance(field, Dense):
+                    everywhere[key] = row
+                rows.append(row._replace(sweep=point.sweep, value=point.value))
+                each(rows[-1])
+    return rows
+
+
+def _numbers(rig: Rig) -> bytes:
+    """What two rigs of equal cameras have in common."""
+    return b"".join(t.numpy().tobytes() for c in two(rig).pair(ALPHA, BETA).cameras for t in (c.K, c.R, c.t))
+
+
+def _row(
+    network: Comparing, point: Point, name: str, field: ReceptiveField | Way, number: int, scene: RecordedScene
+) -> Row:
+    way = field if hasattr(field, "fuse") else Directly(field)
+    began = time.perf_counter()
+    try:
+        result = way.fuse(network, two(point.assumed), scene.images)
+    except ValueError as error:
+        return Row(point.sweep, point.value, name, number, note=f"{error}".partition(":")[0])
+    seconds = time.perf_counter() - began
+    psnr, ssim = score(result.image.clamp(0, 1), scene.ground_truth)
+    off = (result.peak - scene.position).norm(dim=-1)
+    peaks = float((off[scene.visible] <= 1).double().mean())
+    return Row(point.sweep, point.value, name, number, psnr, ssim, peaks, seconds)
+
+
+@torch.no_grad()
+def fused(network: Comparing, pair: Pair, alpha: Tensor, beta: Tensor, field: ReceptiveField) -> Result:
+    """The network on two images (C, H, W), whole."""
+    inputs = Inputs.of(alpha[None], [beta[None]], [FieldOnGrid.of(field, pair, blocks=False)])
+    output, compared = network.compare(inputs)
+    return Result(output.image[0], peak_position(compared[0])[0].movedim(0, -1).double())
+
+
+def warped(image: Tensor, H: Tensor, hw: HW, *, interpolation: str = "bicubic") -> Tensor:
+    """An image (C, h, w) at H x for the pixels x of an image of size hw; its border is repeated beyond."""
+    x = apply_homography(H, pixel_grid(hw, dtype=torch.float64)).x
+    return sample(image[None], x[None].float(), interpolation=interpolation, extended=True).values[0]  # type: ignore[arg-type]
+
+
+def two(rig: Rig) -> Rig:
+    """The first two cameras, as alpha and beta. Raises ValueError unless they are calibrated, with a depth range."""
+    first, second = rig.names[:2]
+    cameras = rig.pair(first, second).cameras
+    return Rig(dict(zip((ALPHA, BETA), cameras)), depth=tuple(float(d) for d in rig.pair(first, second).depth_range))
+
+
+def made(rig: Rig, bank: PhotoBank, number: int, seed: int = 0) -> RecordedScene:
+    """Scene `number`, of the same things whatever the rig, recorded with some noise."""
+    g = generator_for(seed, "sweep", number)
+    pair = rig.pair(ALPHA, BETA)
+    near, far = (torch.full((1,), float(d), dtype=torch.float64) for d in pair.depth_range)
+    cameras = [Camera(K=c.K[None], cam_from_world=Pose(c.R[None], c.t[None]), hw=c.hw) for c in pair.cameras]
+    batch = LayeredScenes(bank, RigDistribution(), hw=pair.alpha.hw, seed=seed).render(RigBatch(cameras, near, far), g)
+    position, visible = seen_at(pair, *(depth[0].double() for depth in batch.depth))
+    steps = [Noise(8000, 3), Clip(), Quantise(8)]
+    images = {ALPHA: luminance(batch.images[0]), BETA: batch.images[1]}
+    recorded = {name: record(image, steps, g).image[0] for name, image in images.items()}
+    return RecordedScene(recorded, batch.images[0][0], position, visible)
+
+
+def seen_at(
+    pair: Pair, depth: Float[Tensor, "h w"], beta_depth: Float[Tensor, "hb wb"]
+) -> tuple[Float[Tensor, "h w 2"], Bool[Tensor, "h w"]]:
+    """Where alpha's pixels are in beta, and whether beta sees the same surface there, to 2 % of its depth."""
+    alpha, beta = pair.cameras
+    found = beta.project(alpha.unproject(pixel_grid(alpha.hw, dtype=torch.float64), depth))
+    there = sample(beta_depth[None, None], found.x[None], interpolation="nearest")
+    same = (there.values[0, 0] / found.depth - 1).abs() < 0.02
+    return found.x, found.valid & there.valid[0] & same
+
+
+SWEEPS: dict[str, tuple[str, tuple[float, ...]]] = {
+    "rotation": ("error of beta's rotation, degrees", (0, 0.1, 0.2, 0.3, 0.5, 1.0)),
+    "principal point": ("error of beta's principal point, pixels", (0, 2, 5, 10, 20)),
+    "baseline": ("parallax of the nearest points, pixels", (6, 12, 24, 48)),
+    "focal ratio": ("alpha's focal length over beta's", (1, 1.5, 2, 3, 4)),
+    "ahead": ("direction of the baseline, degrees from across to ahead", (0, 30, 60, 90)),
+}
+"""What changes, and the values it takes."""
+
+
+def points(sweeps: Sequence[str] = tuple(SWEEPS), *, hw: HW = SIZE) -> Iterator[Point]:
+    """The rigs of sweeps. Raises ValueError for a sweep that there is not."""
+    for name in sweeps:
+        if name not in SWEEPS:
+            raise ValueError(f"no sweep '{name}': there are {', '.join(SWEEPS)}")
+        for value in SWEEPS[name][1]:
+            yield point(name, value, hw=hw)
+
+
+def point(sweep: str, value: float, *, hw: HW = SIZE) -> Point:
+    """One rig of a sweep."""
+    options = {"baseline": {"parallax": value}, "focal ratio": {"ratio": value}, "ahead": {"ahead": value}}
+    rig = rig_of(hw, **options.get(sweep, {}))
+    beta = rig[BETA]
+    if sweep == "rotation":
+        turn = rotation_from_vector(math.radians(value) * _unit(1.0, 1.0, 1.0))
+        beta = beta.replace(cam_from_world=Pose(turn, torch.zeros(3).double()) @ beta.cam_from_world)
+    if sweep == "principal point":
+        shift = torch.zeros(3, 3).double()
+        shift[:2, 2] = value * _unit(1.0, 1.0)
+        beta = beta.replace(K=beta.K + shift)
+    return Point(sweep, float(value), rig, rig.with_camera(BETA, beta))
+
+
+def rig_of(hw: HW, *, parallax: float = PARALLAX, ratio: float = 1.0, ahead: float = 0.0) -> Rig:
+    """Alpha, and a beta with a shorter focal length, to its right and `ahead` degrees of that forwards."""
+    K = intrinsics(1.2 * hw[1], hw)
+    alpha = Camera(K=K, cam_from_world=Pose.identity(), hw=hw)
+    angle = math.radians(ahead)
+    centre = parallax * NEAR / float(K[0, 0]) * _unit(math.cos(angle), 0.2 * math.cos(angle), math.sin(angle))
+    R = rotation_from_vector(math.radians(TILT) * _unit(0.3, 0.5, 1.0))
+    shorter = torch.diag(torch.tensor([1 / ratio, 1 / ratio, 1.0], dtype=torch.float64))
+    K_beta = torch.cat([(K @ shorter)[:, :2], K[:, 2:]], 1)
+    beta = Camera(K=K_beta, cam_from_world=Pose(R, -R @ centre), hw=hw)
+    return Rig({ALPHA: alpha, BETA: beta}, depth=(NEAR, FAR))
+
+
+def _unit(*numbers: float) -> Tensor:
+    vector = torch.tensor(numbers, dtype=torch.float64)
+    return vector / vector.norm()

@@ -1,0 +1,406 @@
+"""Each beta's own values at alpha's pixels, with where they are seen: what fusion finds on its way, and no fused image.
+
+Values are those that the cameras recorded, resampled once, at sub-pixel positions: no luminance of alpha and no colour
+of a network is in them.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal, NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from numpy.typing import DTypeLike, NDArray
+from torch import Tensor
+
+from arraygeom import Band, LensView, ReceptiveField, Rig, Segments, View, pixel_grid, sample
+from arraygeom.chunks import chunked
+from arraygeom.pixels import map_homogeneous
+from arraygeom.sampling import Interpolation, on_image
+from arraygeom.undistortion import pixels_between, sampled_between
+
+from ..matching.inputs import Beta
+from ..matching.match import Matcher, match
+from ..matching.matches import BetaMatches
+from ..matching.radiometry import Given
+from ..media.images import Images
+from ..networks.protocol import FusionNetwork
+from ..support.memory import limited, parse_bytes
+from .checks import warn_of_confidence
+from .corrections import corrections_for, expected_work
+from .fuse import Progress
+from .inputs import FrameInputs, Placement, check_bands, prepared
+from .low_light import Noise, denoised_views
+from .results import Frame
+from .steps import EqualResolution, FusionStep, Radiometry, Undistort, Undo, Upright
+from .tiles import fused_in_tiles, plan_frame
+from .views import Views
+
+LOG = logging.getLogger(__name__)
+
+Resampling = Literal["nearest", "bilinear", "cubic"]
+Fill = Literal["none", "propagate"]
+INTERPOLATIONS: dict[str, Interpolation] = {"nearest": "nearest", "bilinear": "bilinear", "cubic": "bicubic"}
+
+OUTSIDE, OCCLUDED, SEEN = 0, 1, 2
+"""Visibility of alpha's pixels in a beta: beyond its edge; occluded, or without a match of enough confidence; seen."""
+
+LEAST_CONFIDENCE = 0.5
+"""Confidence from which a point counts as seen: that it is, and at this position, is likelier than not. On the real
+motorcycle pair 26 % of occluded pixels exceed it and 9 % of others do not; .3: 41 and 4 %; the left-right check of
+matching alone: 46 and 3 %."""
+
+SMOOTH = 1.0
+"""Pixels by which a disparity between alpha's may differ from the nearest one's, at most: beyond is a depth edge, where
+a mean is of neither surface."""
+
+Recorded = Mapping[str, Any]
+"""Values (C, H, W) by camera, as recorded: NumPy arrays of any type, or tensors."""
+
+
+@dataclass(frozen=True)
+class AlignedView:
+    """One camera's values at alpha's H x W pixels; `numpy.asarray` gives the values.
+
+    values: (C, H, W), in the recorded type; 0, of floats NaN, where the camera does not see the point, unless filled.
+    positions: (H, W, 2), float32, where alpha's pixels are in the recorded image (x, y); NaN beyond its edge.
+    visibility: (H, W), `OUTSIDE`, `OCCLUDED` or `SEEN`.
+    confidence: (H, W), float32, 0 to 1: that this camera sees the point, and at this position.
+    bands: a name for each of the values' channels. response: the sensor's.
+    """
+
+    values: NDArray[Any]
+    positions: NDArray[np.float32]
+    visibility: NDArray[np.uint8]
+    confidence: NDArray[np.float32]
+    bands: tuple[str, ...]
+    response: Any = None
+
+    @property
+    def valid(self) -> NDArray[np.bool_]:
+        """(H, W), where the camera sees the point."""
+        return self.visibility == SEEN
+
+    @property
+    def wavelengths(self) -> tuple[float | None, ...]:
+        """The bands' centres in nanometres; None where the rig does not state them."""
+        centre = self.response.centre if isinstance(self.response, Band) else None
+        return (centre,) * len(self.bands)
+
+    def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> NDArray[Any]:
+        return np.array(self.values, dtype=dtype) if copy else np.asarray(self.values, dtype=dtype)
+
+
+@dataclass(frozen=True)
+class Aligned(Mapping[str, AlignedView]):
+    """All cameras' own values at the pixels of one of them: a mapping of names to views, that of `alpha` first.
+
+    depth: (H, W), float32, metres along alpha's axis; NaN where no calibrated beta sees the point.
+    """
+
+    alpha: str
+    views: Mapping[str, AlignedView]
+    depth: NDArray[np.float32]
+
+    def __getitem__(self, name: str) -> AlignedView:
+        return self.views[name]
+
+    def __iter__(self) -> Any:
+        return iter(self.views)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @property
+    def bands(self) -> tuple[str, ...]:
+        """Names of all bands, those of alpha first."""
+        return tuple(band for view in self.views.values() for band in view.bands)
+
+    @property
+    def wavelengths(self) -> tuple[float | None, ...]:
+        """Of all bands, nanometres."""
+        return tuple(wave for view in self.views.values() for wave in view.wavelengths)
+
+    def band(self, name: str) -> NDArray[Any]:
+        """One band (H, W). Raises KeyError, which lists them, for a name that none has."""
+        for view in self.views.values():
+            if name in view.bands:
+                return view.values[view.bands.index(name)]
+        raise KeyError(f"no band '{name}' (there are: {', '.join(self.bands)})")
+
+    def stack(self) -> NDArray[Any]:
+        """All bands (bands, H, W), in the type that holds all."""
+        return np.concatenate([view.values for view in self.views.values()])
+
+
+def align(
+    rig: Rig,
+    images: Images,
+    *,
+    alpha: str,
+    recorded: Recorded | None = None,
+    network: FusionNetwork | None = None,
+    depth: tuple[float, float] | None = None,
+    field: ReceptiveField | Mapping[str, ReceptiveField | None] | None = None,
+    interpolation: Resampling = "bilinear",
+    min_confidence: float = LEAST_CONFIDENCE,
+    fill: Fill = "none",
+    max_memory: float | str | None = None,
+    match_levels: bool = False,
+    response: Given = "fit",
+    correct: bool = True,
+    noise: Noise | None = None,
+    progress: Progress | None = None,
+    matcher: Matcher = match,
+) -> Aligned:
+    """Every camera's own values at the pixels of camera `alpha`.
+
+    `rig`, `images`, `depth`, `field`, `max_memory`, `match_levels`, `response`, `noise`, `progress` and `matcher` are
+    as of `fuse`, and `correct` is its `align`; they serve to find where alpha's pixels are in each beta. A pixel
+    counts as occluded where the confidence that beta sees its point, and there, is low.
+
+    Args:
+        recorded: the values to align, by camera, (C, H, W) of any type, as large as the images; by default the images.
+        network: the one whose confidence is taken; by default the shipped weights for bands as the betas'.
+        interpolation: "nearest" keeps recorded values, "bilinear" and "cubic" are between them; of integers rounded.
+        min_confidence: from which confidence on a camera counts as seeing a point, 0 to 1.
+        fill: "none" invents no values; "propagate" gives pixels that a camera does not see its nearest seen value.
+
+    Raises ValueError as `fuse`, and for recorded values of another size than the rig says.
+    """
+    if interpolation not in INTERPOLATIONS or fill not in ("none", "propagate"):
+        raise ValueError(
+            f"interpolation is nearest, bilinear or cubic, and fill none or propagate; got {interpolation}, {fill}"
+        )
+    limit = None if max_memory is None else parse_bytes(max_memory)
+    rig = _with_pixels(rig if depth is None else rig.replace(depth=depth))
+    views, low_light = denoised_views(Views.of(rig, images, alpha=alpha, field=field), noise)
+    betas = views.betas
+    network = network or _default_network([len(views.images[name]) for name in betas])
+    check_bands(network, views)
+    inputs, undo = prepared(network, views, _steps(network, normalise=match_levels))
+    del views
+    plan = plan_frame(
+        network,
+        inputs,
+        limit=limit,
+        estimate=False,
+        stored=False,
+        before=expected_work(inputs, response, align=correct),
+        kept=low_light.kept(inputs.hw, len(betas)),
+    )
+    found = corrections_for(network, inputs, response, align=correct)
+    inputs = inputs._replace(inputs=found.applied(inputs.inputs, inputs.hw))
+    with limited(limit), torch.no_grad():
+        matches = matcher(inputs.inputs)
+        done = fused_in_tiles(network, inputs, matches, plan.tiles, progress=progress)
+        warn_of_confidence(network, done.frame, inputs)
+        depths = _at_alpha(done.frame, undo).depth
+        own = recorded if recorded is not None else images
+        aligned = {alpha: _of_alpha(rig, alpha, own)}
+        for i, name in enumerate(betas):
+            LOG.info("aligning %s", name)
+            place = inputs.placements[i]
+            located = _located(inputs, i, matches.betas[i], rig[alpha])
+            confidence = _at_pixels(done.found[i, 2:], place.pair.alpha, rig[alpha], "bilinear")[0]
+            seen = confidence >= min_confidence
+            aligned[name] = _aligned_view(
+                rig[name], name, place, located, confidence, seen, own[name], interpolation, fill
+            )
+    return Aligned(alpha, aligned, depths.numpy())
+
+
+def _default_network(bands: Sequence[int]) -> FusionNetwork:
+    from ..networks.weights import load_weights
+
+    return load_weights("mono-colour" if all(count == 3 for count in bands) else "mono-spectral")
+
+
+def _steps(network: FusionNetwork, *, normalise: bool) -> list[FusionStep]:
+    """Those of a fusion that change where pixels are, and the radiometry that matching sees."""
+    resize = [EqualResolution(network)] if network.equal_resolution else []
+    return [Undistort(), Upright(), *resize, *([Radiometry()] if normalise else [])]
+
+
+def _with_pixels(rig: Rig) -> Rig:
+    """The rig whose views all have a K, the identity if they are not calibrated: it follows every change of pixels."""
+    for name, view in rig.cameras.items():
+        if not isinstance(view, LensView):
+            eye = torch.eye(3, dtype=torch.float64)
+            rig = rig.with_camera(name, LensView(hw=view.hw, sensor=view.sensor, K=eye))
+    return rig
+
+
+class _Located(NamedTuple):
+    """Positions of alpha's recorded pixels (H, W, 2) in a beta as prepared, and which are on it."""
+
+    where: Float[Tensor, "h w 2"]
+    inside: Bool[Tensor, "h w"]
+
+
+def _located(inputs: FrameInputs, i: int, found: BetaMatches, recorded: View) -> _Located:
+    """Where alpha's pixels are in the i-th beta, by its matches."""
+    h, w = inputs.hw
+    beta = inputs.inputs.betas[i]
+    hw = (beta.image.shape[-2], beta.image.shape[-1])
+    if not _has_lens(recorded):
+        where, inside = found.positions(beta.field.straight, hw)
+        return _Located(where[0, :h, :w], inside[0, :h, :w])
+    pinhole = inputs.placements[i].pair.alpha
+    assert isinstance(pinhole, LensView)
+    assert isinstance(recorded, LensView)
+    x, seen = pixels_between(pinhole, recorded)
+    disparity = _between_pixels(found.disparity[0, :, :h, :w], x)
+    where, inside = chunked(lambda x, disparity: _at_points(beta, found, x, disparity, hw), x, disparity, axis=0)
+    return _Located(where, inside & seen)
+
+
+def _at_points(
+    beta: Beta, found: BetaMatches, x: Float[Tensor, "h w 2"], disparity: Float[Tensor, "h w"], hw: tuple[int, int]
+) -> tuple[Tensor, Tensor]:
+    """Positions in beta of some points between alpha's pixels, by their disparities."""
+    segments = beta.field.at(x.reshape(-1, 2))
+    assert isinstance(segments, Segments)
+    h, w = x.shape[:2]
+    parts = (part.reshape(1, h, w, *part.shape[1:]) for part in (segments.start, segments.end, segments.valid))
+    where, inside = replace(found, disparity=disparity[None, None]).positions(Segments(*parts), hw)
+    return where[0], inside[0]
+
+
+def _between_pixels(disparity: Float[Tensor, "1 h w"], x: Float[Tensor, "h2 w2 2"]) -> Float[Tensor, "h2 w2"]:
+    """Disparity between pixels: interpolated within surfaces, the nearest at depth edges."""
+    nearest, smooth = (
+        sample(disparity[None], x[None], interpolation=kind, extended=True).values[0, 0]
+        for kind in ("nearest", "bilinear")
+    )
+    return torch.where((smooth - nearest).abs() < SMOOTH, smooth, nearest)
+
+
+def _at_alpha(frame: Frame, undo: Sequence[Undo]) -> Frame:
+    """The frame at alpha's recorded pixels."""
+    for back in undo:
+        frame = back(frame)
+    return frame
+
+
+def _at_pixels(
+    plane: Float[Tensor, "1 h w"], pinhole: View, recorded: View, interpolation: Interpolation
+) -> Float[Tensor, "1 h2 w2"]:
+    """A plane at alpha's recorded pixels; 0 where its pinhole view has none."""
+    if not _has_lens(recorded):
+        return plane
+    assert isinstance(pinhole, LensView)
+    assert isinstance(recorded, LensView)
+    return sampled_between(plane, pinhole, pixels_between(pinhole, recorded), interpolation).values[0]
+
+
+def _has_lens(view: View) -> bool:
+    return isinstance(view, LensView) and view.distortion is not None
+
+
+def recorded_pixels(
+    x: Float[Tensor, "*n 2"], now: LensView, recorded: LensView
+) -> tuple[Float[Tensor, "*n 2"], Bool[Tensor, "*n"]]:
+    """Pixels of a view without its lens, cropped, resized or rotated, in the image as recorded; which it can show.
+
+    K of both views says how pixels were changed: x ~ K_now K_recorded^-1 x_recorded but for the lens.
+    """
+    normalised = map_homogeneous(torch.linalg.inv(now.K.double())[:2], x)
+    if recorded.distortion is None:
+        valid = torch.ones_like(x[..., 0], dtype=torch.bool)
+    else:
+        normalised, valid = recorded.to(torch.float64).distortion.distort(normalised)  # type: ignore[union-attr]
+    return map_homogeneous(recorded.K.double()[:2], normalised), valid
+
+
+def _aligned_view(
+    camera: LensView,
+    name: str,
+    place: Placement,
+    located: _Located,
+    confidence: Float[Tensor, "h w"],
+    seen: Bool[Tensor, "h w"],
+    values: Any,
+    interpolation: Resampling,
+    fill: Fill,
+) -> AlignedView:
+    values, now = _as_array(values, name, camera.hw), place.pair.beta
+    assert isinstance(now, LensView)
+    where, valid = chunked(lambda x: recorded_pixels(x, now, camera), located.where.double(), axis=0)
+    where = where.float()
+    inside = located.inside & valid & on_image(where, camera.hw)
+    visibility = torch.where(inside, torch.where(seen, SEEN, OCCLUDED), OUTSIDE).to(torch.uint8).numpy()
+    taken = filled(resampled_values(values, where.numpy(), interpolation), visibility == SEEN, fill)
+    return AlignedView(
+        taken,
+        torch.where(inside[..., None], where, torch.nan).numpy(),
+        visibility,
+        torch.where(inside, confidence.float(), 0.0).numpy(),
+        _band_names(name, len(values)),
+        camera.sensor.response,
+    )
+
+
+def _of_alpha(rig: Rig, name: str, recorded: Recorded) -> AlignedView:
+    """Alpha's own values, each at its own pixel."""
+    hw = rig[name].hw
+    values = _as_array(recorded[name], name, hw)
+    grid, ones = pixel_grid(hw).numpy(), np.ones(hw, np.float32)
+    visibility = np.full(hw, SEEN, np.uint8)
+    return AlignedView(values, grid, visibility, ones, _band_names(name, len(values)), rig[name].sensor.response)
+
+
+def _as_array(values: Any, name: str, hw: tuple[int, int]) -> NDArray[Any]:
+    """Recorded values as NumPy's. Raises ValueError for another shape than (C, H, W)."""
+    array = values.detach().cpu().numpy() if isinstance(values, Tensor) else np.asarray(values)
+    if array.ndim != 3 or array.shape[1:] != tuple(hw):
+        (h, w), got = hw, "x".join(map(str, array.shape))
+        raise ValueError(f"the recorded values of '{name}' are {got}, the rig says (C, {h}, {w}): give the whole image")
+    return array
+
+
+def _band_names(name: str, count: int) -> tuple[str, ...]:
+    if count == 1:
+        return (name,)
+    return tuple(f"{name}.{band}" for band in ("red", "green", "blue") * (count == 3) or range(1, count + 1))
+
+
+def resampled_values(values: NDArray[Any], positions: NDArray[np.float32], interpolation: Resampling) -> NDArray[Any]:
+    """Recorded values (C, H, W) at positions (h, w, 2), in their own type: (C, h, w). Of integers rounded.
+
+    In float64: float32 would round positions by 1e-4 pixels in an image of 4000. Beyond the edge values are 0.
+    """
+    kind = INTERPOLATIONS[interpolation]
+    where = torch.from_numpy(positions)
+
+    def band(plane: NDArray[Any]) -> NDArray[Any]:
+        image = torch.from_numpy(plane.astype(np.float64))[None, None]
+        taken = chunked(lambda x: sample(image, x[None].double(), interpolation=kind).values[0, 0], where, axis=0)
+        return _in_type(taken.numpy(), values.dtype)
+
+    return np.stack([band(plane) for plane in values])
+
+
+def _in_type(values: NDArray[np.float64], dtype: Any) -> NDArray[Any]:
+    if np.issubdtype(dtype, np.integer):
+        limits = np.iinfo(dtype)
+        values = np.clip(np.rint(values), limits.min, limits.max)
+    return values.astype(dtype)
+
+
+def filled(values: NDArray[Any], valid: NDArray[np.bool_], fill: Fill) -> NDArray[Any]:
+    """Values (C, H, W) with 0, of floats NaN, where they are not valid; or with those of the nearest valid pixel."""
+    if fill == "none" or not valid.any():
+        nothing = np.nan if np.issubdtype(values.dtype, np.floating) else 0
+        return np.where(valid, values, np.asarray(nothing, values.dtype))
+    _, labels = cv2.distanceTransformWithLabels(
+        (~valid).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    nearest = np.zeros(labels.max() + 1, np.int64)
+    nearest[labels[valid]] = np.flatnonzero(valid)
+    return values.reshape(len(values), -1)[:, nearest[labels]]

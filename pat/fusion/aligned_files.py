@@ -1,0 +1,134 @@
+"""Values as recorded from image files, and what an alignment leaves on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+from xml.sax.saxutils import escape
+
+import numpy as np
+import tifffile
+import torch
+from numpy.typing import NDArray
+
+from arraygeom import Rig
+from arraygeom.atomic import write_together
+
+from ..media.images import read_recorded, write_image
+from ..media.raw import demosaiced
+from .align import Aligned, AlignedView
+
+PositionFormat = Literal["npy", "tif", "none"]
+GREY = {0: 0, 1: 128, 2: 255}
+"""Of visibility in its image: beyond the edge, occluded, seen."""
+GDAL_METADATA, GDAL_NODATA = 42112, 42113
+"""TIFF tags in which GDAL, QGIS and others read the bands' names and wavelengths, and the value of pixels without one
+(GDAL's documentation of GeoTIFF)."""
+LARGEST_TIFF = 2**32 - 2**25
+"""Bytes up to which a TIFF file has offsets of 32 bits; tifffile's own limit."""
+
+
+class RecordedFiles(Mapping[str, NDArray[Any]]):
+    """The values of an image file of each camera, read when asked for: counts, linear of raw ones.
+
+    Those behind a colour filter pattern are demosaiced: red, green and blue counts. Asking raises as `read_recorded`.
+    """
+
+    def __init__(self, rig: Rig, files: Mapping[str, str | Path]) -> None:
+        self.rig, self.files = rig, files
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.files)
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        view = self.rig[name]
+        pattern = view.sensor.bayer
+        values = read_recorded(
+            self.files[name], name=name, hw=view.hw, orientation="apply" if pattern is None else "ignore"
+        )
+        if pattern is None or not np.issubdtype(values.dtype, np.integer):
+            return values
+        white = 2 ** (view.sensor.bits or 8 * values.dtype.itemsize) - 1
+        colours = demosaiced(torch.from_numpy(values.astype(np.float32) / white), pattern).numpy()
+        return np.rint(colours.astype(np.float64) * white).astype(values.dtype)
+
+
+def save_aligned(
+    aligned: Aligned,
+    out: Path,
+    *,
+    separate: bool = False,
+    positions: PositionFormat = "npy",
+    name: str = "",
+) -> list[Path]:
+    """Write aligned.tif (all bands, alpha's first, with their names and wavelengths), and of each camera
+    NAME_visibility.png (0 beyond its edge, 128 occluded, 255 seen), NAME_confidence.png and NAME_positions.npy (or
+    .tif: x, y); depth.tif (metres) if any is known.
+
+    One file a camera, NAME.tif, if `separate`, or if their types differ: values keep theirs. With a `name` the files
+    are name_aligned.tif and so on. All are written, or none. Returns what was written.
+    """
+    prefix = f"{name}_" if name else ""
+    unlike = len({view.values.dtype for view in aligned.values()}) > 1
+    with write_together(out, last=f"{prefix}visibility.txt") as folder:
+        if separate or unlike:
+            for camera, view in aligned.items():
+                write_bands(folder / f"{prefix}{camera}.tif", view.values, view.bands, view.wavelengths)
+        else:
+            write_bands(folder / f"{prefix}aligned.tif", aligned.stack(), aligned.bands, aligned.wavelengths)
+        if np.isfinite(aligned.depth).any():
+            depth = torch.from_numpy(aligned.depth)[None]
+            write_image(folder / f"{prefix}depth.tif", depth, bits=32, unknown=True)
+        for camera, view in aligned.items():
+            if camera != aligned.alpha:
+                _write_view(folder, f"{prefix}{camera}", view, positions)
+        (folder / f"{prefix}visibility.txt").write_text(_shares(aligned), encoding="utf-8")
+        names = sorted(file.name for file in folder.iterdir())
+    return [out / file for file in names]
+
+
+def _write_view(folder: Path, stem: str, view: AlignedView, positions: PositionFormat) -> None:
+    grey = np.array([GREY[state] for state in sorted(GREY)], np.float32)[view.visibility] / 255
+    write_image(folder / f"{stem}_visibility.png", torch.from_numpy(grey)[None])
+    write_image(folder / f"{stem}_confidence.png", torch.from_numpy(view.confidence)[None])
+    if positions == "npy":
+        np.save(folder / f"{stem}_positions.npy", view.positions)
+    elif positions == "tif":
+        write_bands(folder / f"{stem}_positions.tif", view.positions.transpose(2, 0, 1), ("x", "y"), (None, None))
+
+
+def _shares(aligned: Aligned) -> str:
+    """A line for each camera but alpha: what share of alpha's pixels it sees."""
+    lines = []
+    for camera, view in aligned.items():
+        if camera != aligned.alpha:
+            outside, occluded, seen = np.bincount(view.visibility.ravel(), minlength=3) / view.visibility.size
+            lines.append(f"{camera}: sees {seen:.1%} of {aligned.alpha}, {occluded:.1%} occluded or unmatched, ")
+            lines[-1] += f"{outside:.1%} beyond its edge\n"
+    return "".join(lines)
+
+
+def write_bands(path: Path, values: NDArray[Any], bands: Sequence[str], wavelengths: Sequence[float | None]) -> None:
+    """Write bands (C, H, W) as one TIFF file in their own type, with names and wavelengths (nanometres) for GIS."""
+    items = []
+    for i, (band, wave) in enumerate(zip(bands, wavelengths, strict=True)):
+        items.append(f'<Item name="DESCRIPTION" sample="{i}" role="description">{escape(band)}</Item>')
+        if wave is not None:
+            micrometres = f"{wave / 1000:g}"
+            items.append(f'<Item name="CENTRAL_WAVELENGTH_UM" domain="IMAGERY" sample="{i}">{micrometres}</Item>')
+    described = f"<GDALMetadata>{''.join(items)}</GDALMetadata>"
+    nothing = "nan" if np.issubdtype(values.dtype, np.floating) else "0"
+    tifffile.imwrite(
+        path,
+        np.ascontiguousarray(values),
+        photometric="minisblack",
+        planarconfig="separate" if len(values) > 1 else None,
+        bigtiff=values.nbytes > LARGEST_TIFF,
+        metadata=None,
+        description=", ".join(bands),
+        extratags=[(GDAL_METADATA, "s", 0, described, True), (GDAL_NODATA, "s", 0, nothing, True)],
+    )

@@ -1,0 +1,127 @@
+"""A page that shows aligned bands: any two under a slider, composites of them, and what a camera does not see."""
+
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+
+from arraygeom import Rig
+from arraygeom.atomic import write_text
+
+from ..media.figures import colour_depth, reduced
+from .align import Aligned
+from .report import LONGEST, Facts, data_url, filled_page, listed, rig_drawing, shares_layer
+
+STRETCH = (1.0, 99.0)
+"""Percentiles of a band's values that are shown black and white."""
+COLOURS = {"colour": (650.0, 550.0, 470.0), "infrared composite": (840.0, 660.0, 550.0)}
+"""Nanometres shown as red, green and blue."""
+NEAREST = 60.0
+"""Nanometres by which a band's centre may differ from those, at most."""
+RED, NEAR_INFRARED = 660.0, 840.0
+
+
+def write_aligned_page(path: Path, aligned: Aligned, rig: Rig, facts: Facts) -> Path:
+    """Write the page atomically; it needs no other file and no network. Returns the path."""
+    layers = {name: data_url(reduced(image, LONGEST)) for name, image in shown_layers(aligned).items()}
+    overlays = {
+        f"not seen by {name}": shares_layer(torch.from_numpy(view.valid.astype(np.float32)))
+        for name, view in aligned.items()
+        if name != aligned.alpha
+    }
+    h, w = aligned.depth.shape
+    seen = {name: view.valid.mean() for name, view in aligned.items() if name != aligned.alpha}
+    figures = {"size": f"{w} x {h} pixels", "bands": ", ".join(aligned.bands)}
+    figures |= {f"seen by {name}": f"{share:.1%}" for name, share in seen.items()}
+    page = filled_page(
+        f"{', '.join(aligned)} at the pixels of {aligned.alpha}",
+        (h, w),
+        layers,
+        overlays,
+        FACTS="\n".join(f"<tr><th>{escape(key)}<td>{escape(value)}" for key, value in figures.items()),
+        NOTES=listed("What was found", facts.notes),
+        WARNINGS=listed("Warnings", facts.warnings, kind="warnings"),
+        RIG=rig_drawing(rig, aligned.alpha),
+    )
+    write_text(path, page)
+    return path
+
+
+def shown_layers(aligned: Aligned) -> dict[str, Float[Tensor, "_ h w"]]:
+    """Each camera's bands, stretched; composites and NDVI where wavelengths allow them; depth if known."""
+    layers = {}
+    for name, view in aligned.items():
+        bands = [_stretched(band, view.valid) for band in view.values]
+        layers[name] = torch.stack(bands if len(bands) in (1, 3) else bands[:1])
+        if len(bands) not in (1, 3):
+            layers |= {band: plane[None] for band, plane in zip(view.bands[1:], bands[1:])}
+    for name, waves in COLOURS.items():
+        chosen = [_band_near(aligned, wave) for wave in waves]
+        if all(chosen) and len({band.name for band in chosen if band}) == len(waves):
+            layers[name] = torch.stack([_stretched(band.values, band.valid) for band in chosen if band])
+    if (index := ndvi(aligned)) is not None:
+        layers["NDVI"] = _index_colours(index)
+    if np.isfinite(aligned.depth).any():
+        layers["depth"] = colour_depth(torch.from_numpy(aligned.depth))
+    return layers
+
+
+def ndvi(aligned: Aligned) -> NDArray[np.float32] | None:
+    """(near infrared - red) / their sum (H, W), of values as they are; NaN where a camera does not see the point.
+
+    None without bands near 840 and 660 nm. Only of values that are proportional to reflectance is it the index of the
+    literature (Tucker 1979).
+    """
+    nir, red = (_band_near(aligned, wave) for wave in (NEAR_INFRARED, RED))
+    if nir is None or red is None or nir.name == red.name:
+        return None
+    one, other = (band.values.astype(np.float32) for band in (nir, red))
+    total = one + other
+    with np.errstate(all="ignore"):
+        index = (one - other) / total
+    return np.where(nir.valid & red.valid & (total > 0), index, np.float32(np.nan))
+
+
+class _ShownBand(NamedTuple):
+    """A band of an alignment, and where its camera sees the point."""
+
+    name: str
+    values: NDArray[Any]
+    valid: NDArray[np.bool_]
+
+
+def _band_near(aligned: Aligned, wave: float) -> _ShownBand | None:
+    """The band whose centre is nearest to a wavelength; None if none is near."""
+    found = {
+        abs(centre - wave): _ShownBand(name, values, view.valid)
+        for view in aligned.values()
+        for name, centre, values in zip(view.bands, view.wavelengths, view.values)
+        if centre is not None and abs(centre - wave) <= NEAREST
+    }
+    return found[min(found)] if found else None
+
+
+def _stretched(values: NDArray[Any], valid: NDArray[np.bool_]) -> Float[Tensor, "h w"]:
+    light = values.astype(np.float32)
+    counts = valid & np.isfinite(light)
+    if not counts.any():
+        return torch.zeros(values.shape)
+    low, high = np.percentile(light[counts], STRETCH)
+    shown = np.nan_to_num((light - low) / max(high - low, 1e-9)).clip(0, 1)
+    return torch.from_numpy(shown.astype(np.float32))
+
+
+def _index_colours(index: NDArray[np.float32]) -> Float[Tensor, "3 h w"]:
+    """-1 brown, 0 pale, 1 green; black where unknown."""
+    stops = torch.tensor([[0.55, 0.32, 0.04], [0.96, 0.96, 0.86], [0.0, 0.41, 0.22]])
+    value = torch.from_numpy(np.nan_to_num(index)).clamp(-1, 1)[..., None]
+    colour = torch.where(value < 0, torch.lerp(stops[1], stops[0], -value), torch.lerp(stops[1], stops[2], value))
+    known = torch.from_numpy(np.isfinite(index))[..., None]
+    return torch.where(known, colour, 0.0).movedim(-1, 0)

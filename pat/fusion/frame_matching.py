@@ -1,0 +1,130 @@
+"""Which image files of several cameras are of one frame: by their names, their numbers or times in these, or in order.
+
+A camera that missed a frame would else shift all that follow.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from itertools import pairwise, takewhile
+from pathlib import Path
+from statistics import median
+
+LEAST_WHOLE = 0.5
+"""Of all frames, those that every camera has: of fewer, names agree by chance, as those of a sequence may."""
+LISTED = 5
+"""Names of missing frames in a message."""
+
+Files = Mapping[str, Sequence[Path]]
+Keys = dict[str, list[Hashable]]
+"""What a file's name says of its frame, by camera, in the order of the files."""
+
+
+class MissingFramesWarning(UserWarning):
+    """Frames that are not there of every camera, or that no name relates."""
+
+
+def matched_frames(files: Files) -> dict[str, list[Path]]:
+    """The files of the frames that every camera has, in order.
+
+    Warns of frames that some camera lacks, and where nothing but their order relates files. Raises ValueError if
+    nothing relates them and their numbers differ. A camera of one file is left as it is.
+    """
+    given = {name: list(paths) for name, paths in files.items()}
+    if min(map(len, given.values())) < 2:
+        return given
+    for what, keys in (("names", _names(files)), ("numbers", _numbers(files)), ("names", _endings(files))):
+        frames = _frames(given, keys) if keys else []
+        whole = [frame for frame in frames if len(frame) == len(given)]
+        if len(whole) >= LEAST_WHOLE * len(frames) > 0:
+            _warn_of_missing(given, frames, what)
+            return {name: [frame[name] for frame in whole] for name in given}
+    spans = ", ".join(f"'{name}' {paths[0].name} to {paths[-1].name}" for name, paths in given.items())
+    if len({len(paths) for paths in given.values()}) > 1:
+        counts = ", ".join(f"{len(paths)} of '{name}'" for name, paths in given.items())
+        raise ValueError(f"frames need as many images of each camera, got {counts}; or is it a --sequence?")
+    warnings.warn(f"no name or number relates the frames ({spans}): taken in order", MissingFramesWarning, stacklevel=2)
+    return given
+
+
+def warn_of_gaps(files: Files) -> None:
+    """Warn of missing numbers in a camera's frames, which a sequence counts one by one at its frame rate."""
+    for name, numbers in (_numbers(files) or {}).items():
+        counted = [n for n in numbers if isinstance(n, float)]
+        steps = [b - a for a, b in pairwise(counted)] if len(counted) == len(numbers) else []
+        gaps = [i for i, step in enumerate(steps) if step > 1.5 * median(steps)]
+        if gaps:
+            before, after = files[name][gaps[0]].name, files[name][gaps[0] + 1].name
+            text = f"'{name}' has no frame between {before} and {after}: those after it count as recorded earlier"
+            warnings.warn(f"{text} than they were; give all frames", MissingFramesWarning, stacklevel=2)
+
+
+def _frames(files: Mapping[str, Sequence[Path]], keys: Keys) -> list[dict[str, Path]]:
+    """The files of each frame by camera, in the order of the keys."""
+    frames: dict[Hashable, dict[str, Path]] = {}
+    for name, paths in files.items():
+        for key, path in zip(keys[name], paths):
+            frames.setdefault(key, {})[name] = path
+    order: Iterable[Hashable] = frames
+    if all(isinstance(key, float | tuple) for key in frames):
+        order = sorted(frames)  # type: ignore[type-var]
+    return [frames[key] for key in order]
+
+
+def _warn_of_missing(files: Files, frames: Sequence[Mapping[str, Path]], what: str) -> None:
+    missing = []
+    for name in files:
+        lacking = [min(frame.values()).stem for frame in frames if name not in frame]
+        if lacking:
+            more = f" and {len(lacking) - LISTED} more" if len(lacking) > LISTED else ""
+            missing.append(f"'{name}' has none of {', '.join(lacking[:LISTED])}{more}")
+    if missing:
+        whole = sum(len(frame) == len(files) for frame in frames)
+        text = f"frames are matched by their {what}: {'; '.join(missing)}: {whole} of {len(frames)} are fused"
+        warnings.warn(text, MissingFramesWarning, stacklevel=3)
+
+
+def _names(files: Files) -> Keys:
+    return {name: [path.stem for path in paths] for name, paths in files.items()}
+
+
+def _endings(files: Files) -> Keys | None:
+    """Names without what all of a camera begin with."""
+    keys: Keys = {}
+    for name, paths in files.items():
+        columns = zip(*(path.stem for path in paths))
+        shared = sum(1 for _ in takewhile(lambda letters: len(set(letters)) == 1, columns))
+        keys[name] = [path.stem[shared:] for path in paths]
+    return keys
+
+
+def _numbers(files: Files) -> Keys | None:
+    """The numbers in names that differ between a camera's files; of one number, times that are nearly equal are equal.
+
+    None where two files of a camera have the same, or some have other numbers of numbers.
+    """
+    varying: dict[str, list[tuple[float, ...]]] = {}
+    for name, paths in files.items():
+        rows = [tuple(map(float, re.findall(r"\d+(?:\.\d+)?", path.stem))) for path in paths]
+        if len({len(row) for row in rows}) != 1 or len(set(rows)) < len(rows):
+            return None
+        columns = [column for column in zip(*rows) if len(set(column)) > 1]
+        varying[name] = list(zip(*columns))
+    if {len(rows[0]) for rows in varying.values()} != {1}:
+        return {name: list(rows) for name, rows in varying.items()}
+    return _common_times({name: [row[0] for row in rows] for name, rows in varying.items()})
+
+
+def _common_times(times: Mapping[str, Sequence[float]]) -> Keys:
+    """Each time as the first of those of other cameras that are less than half an interval from it."""
+    near = min(median(b - a for a, b in pairwise(sorted(row))) for row in times.values()) / 2
+    common: dict[tuple[str, float], float] = {}
+    first, here = -float("inf"), set[str]()
+    for time, name in sorted((time, name) for name, row in times.items() for time in row):
+        if time - first >= near or name in here:
+            first, here = time, set()
+        here.add(name)
+        common[name, time] = first
+    return {name: [common[name, time] for time in row] for name, row in times.items()}

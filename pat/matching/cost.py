@@ -1,0 +1,87 @@
+"""What two pixels cost: how unlike they are by the order of brightness around them, and by brightness itself.
+
+Another cost is another file with these names: `planes_of` prepares an image (numbers, 64-bit words, a few
+channels a pixel), `pixel_of` takes a pixel of that, `dissimilarity` compares two, and `UNSEEN` and `NOWHERE`
+are on its scale. One image, one thread, without Python's lock, without torch.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from arraygeom.compiled import compiled, separate_cache
+
+from ..support.settings import physics, tuned
+
+
+@dataclass(frozen=True)
+class CensusSettings:
+    """The numbers of this cost, whose unit is a bit of the census."""
+
+    brightness: float = tuned(30.0, "Source not recorded: what a difference of 1 in (normalised) brightness costs")
+    truncated: float = tuned(20.0, "Source not recorded: what brightness costs at most")
+    unseen: int = physics(
+        24, "About a mismatch, half of the bits: of a label beyond beta's edge, where the point may well be"
+    )
+    nowhere: int = physics(80, "More than any other cost, 48 + `truncated`: of a label that is not on beta")
+
+
+SETTINGS = CensusSettings()
+BRIGHTNESS, TRUNCATED = np.float32(SETTINGS.brightness), np.float32(SETTINGS.truncated)
+UNSEEN, NOWHERE = np.uint8(SETTINGS.unseen), np.uint8(SETTINGS.nowhere)
+
+
+def planes_of(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.uint64]]:
+    """What `dissimilarity` compares of an image's pixels (h, w): brightness and census."""
+    bits = np.empty(image.shape, np.uint64)
+    census(image, bits)
+    return image, bits
+
+
+@compiled(inline="always")
+def pixel_of(planes, i):
+    """What is compared of a pixel: of planes as `planes_of` gives them, but flat."""
+    return planes[0][i], planes[1][i]
+
+
+@compiled(inline="always")
+def dissimilarity(own, other):
+    """The cost of a pixel of alpha and one of beta, less than `NOWHERE`."""
+    apart = min(abs(own[0] - other[0]) * BRIGHTNESS, TRUNCATED)
+    return np.uint8(_count(own[1] ^ other[1])) + np.uint8(apart)
+
+
+@compiled(inline="always")
+def _count(bits):
+    """Ones among 64 bits."""
+    bits = bits - ((bits >> np.uint64(1)) & np.uint64(0x5555555555555555))
+    bits = (bits & np.uint64(0x3333333333333333)) + ((bits >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    bits = (bits + (bits >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return (bits * np.uint64(0x0101010101010101)) >> np.uint64(56)
+
+
+@compiled(nogil=True, cache=True)
+def census(image, out):
+    """One bit for each of the 48 pixels around: whether it is darker (Zabih and Woodfill 1994)."""
+    height, width = image.shape
+    # A row around at a time, continued by three pixels to either side: then the loop along it is of vectors.
+    row = np.empty(width + 6, image.dtype)
+    for y in range(height):
+        centre, bits = image[y], out[y]
+        bits[:] = 0
+        for dy in range(-3, 4):
+            above = image[min(max(y + dy, 0), height - 1)]
+            for x in range(3):
+                row[x], row[width + 3 + x] = above[0], above[width - 1]
+            for x in range(width):
+                row[x + 3] = above[x]
+            for dx in range(7):
+                if dx != 3 or dy != 0:
+                    for x in range(width):
+                        bits[x] = (bits[x] << np.uint64(1)) | np.uint64(row[x + dx] < centre[x])
+
+
+separate_cache(census)

@@ -1,0 +1,247 @@
+"""Images made comparable: their moments (whole, where a weight is, and local), and their sharpness."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy.typing import NDArray
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from arraygeom.fields.protocol import compilable
+
+from ..media.colour import to_bytes
+from ..support.settings import size, tuned
+
+LEAST_WEIGHT = 1e-6
+"""Size: added to weights, so that there are moments where all are 0."""
+
+
+@dataclass(frozen=True)
+class NormalisationSettings:
+    """How far one image is brought to another's brightness and sharpness."""
+
+    largest_gain: float = size(
+        4.0, "The largest factor of brightness; images that differ by more show different things"
+    )
+    blurs: tuple[float, ...] = size(
+        (0.4, 0.6, 0.8, 1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0),
+        "Standard deviations, in pixels, with which the sharper image is tried until it is as sharp as the other",
+    )
+    sharper: float = tuned(1.05, "Source not recorded: contrast over the other's up to which an image is no sharper")
+
+
+SETTINGS = NormalisationSettings()
+
+
+class Moments(NamedTuple):
+    """Mean and standard deviation of images, over their last three dimensions, which are kept."""
+
+    mean: Tensor
+    deviation: Tensor
+
+    def gain(self, wanted: Moments, largest: float) -> Tensor:
+        """The factor that makes the standard deviation the wanted one."""
+        return (wanted.deviation / self.deviation.clamp(min=1e-6)).clamp(max=largest)
+
+    def matched(self, image: Tensor, wanted: Moments, largest_gain: float = math.inf) -> Tensor:
+        """An image of these moments, with the wanted ones; not cut to 0..1."""
+        return (image - self.mean) * self.gain(wanted, largest_gain) + wanted.mean
+
+
+def moments(image: Float[Tensor, "*b c h w"], weight: Float[Tensor, "*b 1 h w"] | None = None) -> Moments:
+    """The moments of whole images, or where the weight is."""
+    if weight is None:
+        deviation, mean = torch.std_mean(image, (-3, -2, -1), keepdim=True)
+        return Moments(mean, deviation)
+    mean = _weighted_mean(image, weight)
+    return Moments(mean, _weighted_mean((image - mean).square(), weight).sqrt())
+
+
+def normalised(
+    image: Float[Tensor, "*b c h w"],
+    like: Float[Tensor, "*b d hl wl"],
+    weight: Float[Tensor, "*b 1 h w"] | None = None,
+    *,
+    largest_gain: float = math.inf,
+) -> Float[Tensor, "*b c h w"]:
+    """The image with another's mean and standard deviation.
+
+    With a weight, where that is: both show the same point at a pixel there. Statistics of whole images mean
+    little where these show different parts of a scene.
+    """
+    return moments(image, weight).matched(image, moments(like, weight), largest_gain)
+
+
+def mean_moments(images: Iterable[Float[Tensor, "c h w"]]) -> Moments:
+    """The means of several images' moments."""
+    return Moments(*(torch.stack(part).mean(0) for part in zip(*map(moments, images))))
+
+
+def explained_share(
+    image: Float[Tensor, "b 1 h w"], of: Float[Tensor, "b 1 h w"], weight: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 1 1 1"]:
+    """The share of one image's variance that another explains where the weight is, 0 if one is the other's
+    negative.
+
+    Small for an alpha in the near infrared: its detail says little of visible colours.
+    """
+    a, b = (p - _weighted_mean(p, weight) for p in (image, of))
+    common, one, other = (_weighted_mean(p, weight) for p in (a * b, a * a, b * b))
+    return common.clamp(min=0).square() / (one * other + 1e-9)
+
+
+def _weighted_mean(image: Tensor, weight: Tensor) -> Float[Tensor, "*b 1 1 1"]:
+    weight = weight + LEAST_WEIGHT
+    return (weight / weight.sum((-3, -2, -1), keepdim=True) * image).sum((-3, -2, -1), keepdim=True)
+
+
+class ComparedViews(NamedTuple):
+    """Alpha and what of beta is compared with it, (B, 1, ., .), equally bright and sharp; alpha in 8 bits (B, h, w)."""
+
+    alpha: Tensor
+    beta: Tensor
+    guides: NDArray[np.uint8]
+
+
+class Normalisation(NamedTuple):
+    """How beta's brightness is normalised to alpha's, and how either is then blurred, for each of a batch.
+
+    level: (3, B, 1, 1, 1): what is subtracted from beta, the factor, what is added.
+    blurs: standard deviations for alpha, and for beta, in pixels; 0 for the one that is not the sharper.
+    """
+
+    level: Tensor
+    blurs: tuple[list[float], list[float]]
+
+    @classmethod
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisation:
+        """What makes the means and standard deviations the same, and then the sharpness."""
+        own, wanted = moments(beta), moments(alpha)
+        level = torch.stack([own.mean, own.gain(wanted, SETTINGS.largest_gain), wanted.mean])
+        return cls(level, equalising_blurs(alpha, _levelled(beta, level)))
+
+    def normalised(self, beta: Tensor) -> Tensor:
+        """Beta's brightness (or that of a part of it) with alpha's mean and standard deviation."""
+        return _levelled(beta, self.level)
+
+    def softened(self, alpha: Tensor) -> Tensor:
+        """Alpha (or a part of it), no sharper than beta."""
+        return blurred(alpha, self.blurs[0])
+
+    def equally_sharp(self, alpha: Tensor, normalised: Tensor) -> tuple[Tensor, Tensor]:
+        """Both (or parts of them), the sharper one blurred."""
+        own, other = (blurred(p, blurs) for p, blurs in zip((alpha, normalised), self.blurs))
+        return own, other
+
+    def views(self, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> ComparedViews:
+        """Alpha and beta's brightness, or parts of them, as they are compared."""
+        return ComparedViews(*self.equally_sharp(alpha, self.normalised(beta)), to_bytes(alpha[:, 0]))
+
+
+class Normalisations(NamedTuple):
+    """Those of images, and of the same at half the size."""
+
+    whole: Normalisation
+    half: Normalisation
+
+    @classmethod
+    def of(cls, alpha: Float[Tensor, "b 1 h w"], beta: Float[Tensor, "b 1 hb wb"]) -> Normalisations:
+        """Of alpha and beta's brightness; all sides are even."""
+        return cls(Normalisation.of(alpha, beta), Normalisation.of(avg_pool2d(alpha, 2), avg_pool2d(beta, 2)))
+
+
+def _levelled(image: Tensor, level: Tensor) -> Tensor:
+    mean, factor, middle = level.to(image)
+    return (image - mean) * factor + middle
+
+
+def equalising_blurs(
+    image: Float[Tensor, "b 1 h w"], other: Float[Tensor, "b 1 hb wb"]
+) -> tuple[list[float], list[float]]:
+    """Standard deviations to blur either with until it is no sharper.
+
+    Detail that only one has cannot be matched. Sharpness is the mean difference of neighbouring pixels; 0 for an
+    image that has hardly more than the other.
+    """
+    own, its = ([float(_contrast(p)) for p in images] for images in (image, other))
+    return [_least_blur(p, c) for p, c in zip(image, its)], [_least_blur(p, c) for p, c in zip(other, own)]
+
+
+def _least_blur(image: Tensor, contrast: float) -> float:
+    """The least of the blurs after which there is no more contrast than that."""
+    for blur in (0.0, *SETTINGS.blurs):
+        if float(_contrast(blurred(image[None], [blur])[0])) <= SETTINGS.sharper * contrast:
+            return blur
+    return SETTINGS.blurs[-1]
+
+
+def blurred(images: Float[Tensor, "b 1 h w"], blurs: Sequence[float]) -> Float[Tensor, "b 1 h w"]:
+    """Each blurred with its standard deviation in pixels; 0: as it is."""
+
+    def one(image: Tensor, blur: float) -> Tensor:
+        if not blur:
+            return image
+        plane = np.ascontiguousarray(image.detach().cpu().numpy(), np.float32)
+        return torch.from_numpy(cv2.GaussianBlur(plane, (0, 0), blur)).to(image)
+
+    return torch.stack([one(p[0], blur) for p, blur in zip(images, blurs)])[:, None]
+
+
+def _contrast(image: Float[Tensor, "1 h w"]) -> Tensor:
+    return image.diff(dim=-1).abs().mean() + image.diff(dim=-2).abs().mean()
+
+
+class LocalMoments(NamedTuple):
+    """Moments of bands (B, C, H, W) and an image (B, 1, H, W) within squares around each pixel.
+
+    `bands` and `image` are the means.
+    """
+
+    bands: Tensor
+    image: Tensor
+    variance_of_bands: Tensor
+    variance_of_image: Tensor
+    covariance: Tensor
+
+    @classmethod
+    def within(cls, radius: int, bands: Float[Tensor, "b c h w"], image: Float[Tensor, "b 1 h w"]) -> LocalMoments:
+        """Those within squares of so many pixels to either side."""
+        mean = partial(box_mean, radius=radius)
+        centre, middle = mean(bands), mean(image)
+        variation = (mean(bands.square()) - centre.square()).clamp(min=0)
+        variance = (mean(image.square()) - middle.square()).clamp(min=0)
+        return cls(centre, middle, variation, variance, mean(bands * image) - centre * middle)
+
+    def slope(self, floor: float) -> Float[Tensor, "b c h w"]:
+        """The slope of the bands' regression on the image, whose variance is regularised by the floor."""
+        return self.covariance / (self.variance_of_image + floor)
+
+
+def box_mean(x: Tensor, radius: int) -> Tensor:
+    """Over squares around each pixel, as far as these are on the image."""
+    side = 2 * radius + 1
+    if compilable(x) and not x.requires_grad:
+        return _box_mean_of_numbers(x, radius)
+    rows = avg_pool2d(x, (side, 1), 1, (radius, 0), count_include_pad=False)
+    return avg_pool2d(rows, (1, side), 1, (0, radius), count_include_pad=False)
+
+
+def _box_mean_of_numbers(x: Tensor, radius: int) -> Tensor:
+    """The same by OpenCV's running sums: a third of the time."""
+    planes = x.detach().contiguous().flatten(0, -3).numpy()
+    counts = [np.minimum(np.arange(n), radius) + np.minimum(np.arange(n)[::-1], radius) + 1 for n in planes.shape[1:]]
+    share = (1 / (counts[0][:, None] * counts[1])).astype(planes.dtype)
+    out = np.empty_like(planes)
+    for plane, target in zip(planes, out):
+        sums = cv2.boxFilter(plane, -1, (2 * radius + 1,) * 2, normalize=False, borderType=cv2.BORDER_CONSTANT)
+        np.multiply(sums, share, out=target)
+    return torch.from_numpy(out).view(x.shape)

@@ -1,0 +1,156 @@
+"""Checkpoints of the paper's authors: their names, shapes and options, as those of PAT here.
+
+Their repository, github.com/djbradyAtOpticalSciencesArizona/physicsAwareTransformer, trains under DataParallel and
+saves a dict with `epoch`, `psnr` and `state_dict`, whose names begin with `module.`. The files are read with
+`weights_only`: tensors and plain numbers, nothing that runs.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterator, Mapping
+from importlib import import_module
+from pathlib import Path
+from pickle import UnpicklingError
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .configs import PATConfig
+
+PREFIX = "module."
+ORDER = ("pam.fusion.weight", "post.0.weight")
+"""Theirs takes the attended betas first and alpha last; here alpha is first."""
+
+
+class Authors(NamedTuple):
+    """A checkpoint: its configuration here, the weights by their names here, and what else the file says."""
+
+    config: PATConfig
+    state: dict[str, Tensor]
+    facts: dict[str, str]
+
+
+def read_authors(path: str | Path) -> Authors:
+    """A checkpoint of theirs, of any number of inputs and any upscale factor.
+
+    Raises FileNotFoundError for no file; ValueError for one that would run code, is cut short, or holds another
+    network, naming the first weight that does not fit.
+    """
+    content = _loaded(Path(path))
+    given = content.get("state_dict", content) if isinstance(content, Mapping) else None
+    if not given or not all(isinstance(v, Tensor) and isinstance(k, str) for k, v in given.items()):
+        raise ValueError(f"{path}: holds no state_dict: give a best.pth.tar that the authors' train.py saved")
+    given = {name.removeprefix(PREFIX): tensor for name, tensor in given.items()}
+    try:
+        config = config_of(given)
+        return Authors(config, renamed(given, config), _facts(content))
+    except ValueError as error:
+        raise ValueError(f"{path}: not a checkpoint of the authors' PAT: {error}") from None
+
+
+def config_of(given: Mapping[str, Tensor]) -> PATConfig:
+    """The configuration that weights with their names are of. Raises ValueError naming what is missing."""
+    betas = sum(re.fullmatch(r"pam\.b2s\.\d+\.weight", name) is not None for name in given)
+    for name in ("init_feature.0.weight", "upscale.4.weight", "upscale.7.weight"):
+        if name not in given or given[name].dim() != 4:
+            raise ValueError(f"{name} is missing")
+    dim, in_channels = given["init_feature.0.weight"].shape[:2]
+    scale = round((len(given["upscale.4.weight"]) / max(dim, 1)) ** 0.5)
+    out_channels = len(given["upscale.7.weight"])
+    sizes = {"betas": betas, "in_channels": in_channels, "out_channels": out_channels, "dim": dim, "scale": scale}
+    if min(sizes.values()) < 1 or max(sizes.values()) > 1024:
+        raise ValueError(f"it has {', '.join(f'{name} {n}' for name, n in sizes.items())}")
+    layout: dict[str, Any] = {"block_bias": False, "fusion_bias": True, "values_after_block": True}
+    # Their loaders enlarge beta to alpha's size.
+    return PATConfig(**sizes, **layout, equal_resolution=True)
+
+
+def renamed(given: Mapping[str, Tensor], config: PATConfig) -> dict[str, Tensor]:
+    """Weights with their names as those of a PAT of this configuration.
+
+    Raises ValueError naming the first that is missing, too many, or of another shape.
+    """
+    from .paper import PAT
+
+    with torch.device("meta"):
+        wanted = {name: tuple(t.shape) for name, t in PAT(config).state_dict().items()}
+    names = dict(_names(config.betas))
+    for theirs, ours in names.items():
+        shape = tuple(given[theirs].shape) if theirs in given else "missing"
+        if shape != wanted[ours]:
+            raise ValueError(f"{theirs} is {shape}, wanted {wanted[ours]}")
+    more = [name for name in given if name not in names]
+    if more:
+        raise ValueError(f"{more[0]} is one weight too many")
+    state = {ours: given[theirs].float() for theirs, ours in names.items()}
+    theirs, ours = ORDER
+    state[ours] = alpha_first(given[theirs].float(), config)
+    for name, tensor in state.items():
+        if not tensor.isfinite().all():
+            raise ValueError(f"{name} holds something other than finite numbers")
+    return state
+
+
+def alpha_first(weight: Tensor, config: PATConfig) -> Tensor:
+    """The columns of their fusion (D, (m + 1) D, 1, 1), with alpha's moved to the front."""
+    return weight.roll(config.dim, 1)
+
+
+def _names(betas: int) -> Iterator[tuple[str, str]]:
+    """Their name of each weight, and ours."""
+    yield "init_feature.0.weight", "features.0.weight"
+    for part in (2, 4, 6):
+        yield from _block(f"init_feature.{part}", f"features.{part}")
+    for part in (3, 5):
+        for group in range(3):
+            for branch in range(3):
+                theirs = f"init_feature.{part}.conv{branch + 1}_{group + 1}.0.weight"
+                yield theirs, f"features.{part}.groups.{group}.{branch}.weight"
+            yield f"init_feature.{part}.b_{group + 1}.weight", f"features.{part}.fuse.{group}.weight"
+    yield from _block("pam.rb", "engine.before")
+    for kind in ("weight", "bias"):
+        yield f"pam.b1.{kind}", f"engine.query.{kind}"
+        for i in range(betas):
+            yield f"pam.b2s.{i}.{kind}", f"engine.key.{i}.{kind}"
+            yield f"pam.b3s.{i}.{kind}", f"engine.value.{i}.{kind}"
+        yield f"pam.fusion.{kind}", f"post.0.{kind}"
+    for part in range(4):
+        yield from _block(f"upscale.{part}", f"post.{part + 1}")
+    for part in (4, 6, 7):
+        yield f"upscale.{part}.weight", f"post.{part + 1}.weight"
+
+
+def _block(theirs: str, ours: str) -> Iterator[tuple[str, str]]:
+    yield f"{theirs}.body.0.weight", f"{ours}.first.weight"
+    yield f"{theirs}.body.2.weight", f"{ours}.second.weight"
+
+
+def _loaded(path: Path) -> Any:
+    """What the file holds, read without running anything of it."""
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: no such file")
+    # Their psnr is a number of numpy's: these two make one, and nothing else.
+    scalar = import_module("numpy.core.multiarray").scalar
+    number = [(scalar, f"{core}.multiarray.scalar") for core in ("numpy.core", "numpy._core")]
+    try:
+        with torch.serialization.safe_globals([*number, np.dtype, type(np.dtype(np.float64)), type(np.dtype("f4"))]):
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except UnpicklingError as error:
+        what = re.search(r"GLOBAL (\S+)", str(error))
+        named = f" ({what[1]})" if what else ""
+        if what or "weights_only" in str(error).lower().replace(" ", "_"):
+            raise ValueError(
+                f"{path}: refused, as it would run code when read{named}: get it from its authors"
+            ) from None
+        raise ValueError(f"{path}: not a checkpoint, or cut short: copy it again") from None
+    except (EOFError, OSError, RuntimeError, ValueError, KeyError, IndexError, zipfile.BadZipFile):
+        raise ValueError(f"{path}: not a checkpoint, or cut short: copy it again") from None
+
+
+def _facts(content: Mapping[str, Any]) -> dict[str, str]:
+    found = {name: content[name] for name in ("epoch", "psnr") if isinstance(content.get(name), int | float)}
+    return {"recipe": "the authors' checkpoint"} | {name: f"{value:g}" for name, value in found.items()}

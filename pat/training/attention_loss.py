@@ -1,0 +1,90 @@
+"""Attention supervised by geometry: where the true position is known, the weights along the segment are a classifier.
+
+For an alpha pixel whose point beta sees at a true position between the samples l and l + 1 of its segment, a share u
+of the way, the loss is the cross-entropy of the weights against (1 - u) at l and u at l + 1. For a pixel whose
+point beta does not see, it is that against equal weights: a search that finds nothing says so by a small peak.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from arraygeom import Segments, sample
+from pat.attention.scores import Compared, log_sum, mean_score
+
+UNSEEN = 0.1
+"""Weight of pixels that beta does not see, against 1 of those it sees. Tuned on nothing."""
+OFF = 1.5
+"""A true position farther than this from its segment, in samples along it or pixels across it, is no target."""
+
+
+class Target(NamedTuple):
+    """The two samples (x, y) around a true position, the share of the second, and whether it is on the segment."""
+
+    first: Float[Tensor, "b h w 2"]
+    second: Float[Tensor, "b h w 2"]
+    share: Float[Tensor, "b h w"]
+    on_segment: Bool[Tensor, "b h w"]
+
+
+def attention_loss(
+    compared: Sequence[Compared],
+    position: Sequence[Float[Tensor, "b h w 2"]],
+    visible: Sequence[Bool[Tensor, "b h w"]],
+    *,
+    stride: int = 2,
+) -> Tensor:
+    """Mean cross-entropy over betas, of every `stride`-th row and column of alpha; nothing is gathered.
+
+    `position` (x, y in beta's pixels) is (0, 0) where it is not known, `visible` whether beta sees the point there.
+    """
+    part = (slice(None), slice(None, None, stride), slice(None, None, stride))
+    losses = [
+        _of_beta(one.strided(stride), where[part], seen[part]) for one, where, seen in zip(compared, position, visible)
+    ]
+    return torch.stack(losses).mean()
+
+
+def _of_beta(compared: Compared, position: Tensor, visible: Tensor) -> Tensor:
+    target = target_of(compared.segments, compared.samples, position.to(compared.segments.start))
+    valid, known = compared.segments.valid.expand_as(visible), (position != 0).any(-1)
+    scores, inside = _true_scores(compared, target)
+    total = log_sum(compared)
+    seen = _mean(total - scores, visible & valid & inside & target.on_segment)
+    return seen + UNSEEN * _mean(total - mean_score(compared), ~visible & valid & known)
+
+
+def target_of(segments: Segments, samples: int, position: Float[Tensor, "b h w 2"]) -> Target:
+    """The samples around true positions (x, y) on segments (B or 1, h, w) of `samples` positions each."""
+    along = segments.end - segments.start
+    squared = along.square().sum(-1).clamp(min=1e-12)
+    share = ((position - segments.start) * along).sum(-1) / squared
+    across = (position - segments.start - share[..., None] * along).norm(dim=-1)
+    number = share * (samples - 1)
+    on_segment = (across <= OFF) & (number >= -OFF) & (number <= samples - 1 + OFF)
+    number = number.clamp(0, samples - 1)
+    lower = number.floor().clamp(max=max(samples - 2, 0))
+
+    def at(index: Tensor) -> Tensor:
+        return segments.start + (index / max(samples - 1, 1))[..., None] * along
+
+    return Target(at(lower), at((lower + 1).clamp(max=samples - 1)), number - lower, on_segment)
+
+
+def _true_scores(compared: Compared, target: Target) -> tuple[Tensor, Tensor]:
+    """The score at the true position, (b, h, w), and whether both samples around it lie on beta."""
+    query, key, how = compared.query, compared.key, compared.interpolation
+    first, second = (sample(key, xy.to(key), interpolation=how) for xy in (target.first, target.second))
+    share = target.share[:, None].to(key)
+    scores = (query * ((1 - share) * first.values + share * second.values)).sum(1)
+    return scores, first.valid & second.valid
+
+
+def _mean(values: Tensor, where: Tensor) -> Tensor:
+    """Over some pixels; 0 of none."""
+    return torch.where(where, values, 0).sum() / where.sum().clamp(min=1)

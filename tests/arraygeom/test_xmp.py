@@ -1,0 +1,148 @@
+"""Rigs from the tags of images: units, lenses, rotations, orientation, and what is refused."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from arraygeom import Band, Rig
+from arraygeom.io import RigFileError, RigFileWarning, recognise
+from arraygeom.io.xmp import named_by_band
+
+FISHEYE = {
+    "ModelType": "fisheye",
+    "PrincipalPoint": "2.4,1.8",
+    "FisheyeAffineMatrix": "1660,0,0,1660",
+    "FisheyePolynomial": "0,1,0.0096,-0.1455",
+    "CentralWavelength": "660",
+    "WavelengthFWHM": "40",
+    "BandName": "Red",
+}
+PERSPECTIVE = {
+    "ModelType": "perspective",
+    "PrincipalPoint": "2.4,1.8",
+    "PerspectiveFocalLength": "5.5",
+    "PerspectiveDistortion": "-0.1,0.14,-0.017,-0.0006,-0.0003",
+    "BandName": "NIR",
+}
+PER_MM = 266.666667
+
+
+def image_of(path: Path, tags, *, dji=None, orientation=1, serial="A1", hw=(960, 1280)) -> Path:
+    """A TIFF file of zeros with these Camera: tags, half of them as elements."""
+    parts = [f'Camera:{k}="{v}"' for k, v in list(tags.items())[::2]]
+    parts += [f'drone-dji:{k}="{v}"' for k, v in (dji or {}).items()]
+    lists = [
+        f"<Camera:{k}><rdf:Seq>{''.join(f'<rdf:li>{p}</rdf:li>' for p in v.split(','))}</rdf:Seq></Camera:{k}>"
+        for k, v in list(tags.items())[1::2]
+    ]
+    xmp = (
+        '<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#">'
+        '<rdf:Description xmlns:Camera="http://pix4d.com/camera/1.0/" '
+        f'xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" {" ".join(parts)}>{"".join(lists)}'
+        "</rdf:Description></rdf:RDF></x:xmpmeta>"
+    ).encode()
+    fields = [
+        (700, "B", len(xmp), xmp, True),
+        (274, "H", 1, orientation, True),
+        (0xA20E, "2I", 1, (266666667, 1000000), True),
+        (0xA20F, "2I", 1, (266666667, 1000000), True),
+        (0xA210, "H", 1, 4, True),
+        (0xA431, "s", 0, serial, True),
+        (0x829A, "2I", 1, (3, 1000), True),
+        (50714, "H", 4, (4000, 4002, 4000, 4002), True),
+    ]
+    tifffile.imwrite(path, np.zeros(hw, np.uint16), extratags=fields, metadata=None)
+    return path
+
+
+def pair(tmp_path, second, **options) -> Path:
+    image_of(tmp_path / "IMG_1.tif", {**FISHEYE, "BandName": "Green"})
+    return image_of(tmp_path / "IMG_2.tif", second, **options)
+
+
+def test_a_fisheye_is_the_makers_formula(tmp_path):
+    path = image_of(tmp_path / "IMG_1.tif", FISHEYE)
+    assert recognise(path) == "xmp"
+    camera = Rig.load(path)["red"]
+    X = torch.tensor([[0.3, -0.2, 1.0], [-0.5, 0.4, 0.8]], dtype=torch.float64)
+    r = X[:, :2].norm(dim=-1)
+    theta = 2 / math.pi * torch.atan2(r, X[:, 2])
+    rho = theta + 0.0096 * theta**2 - 0.1455 * theta**3
+    expected = 1660 * rho[:, None] * X[:, :2] / r[:, None] + PER_MM * torch.tensor([2.4, 1.8], dtype=torch.float64)
+    assert (camera.project(X).x - expected).abs().max() < 1e-9
+    assert camera.sensor.response == Band(660.0, 40.0)
+    assert camera.sensor.black_level == 4001
+    assert camera.sensor.exposure == pytest.approx(0.003)
+
+
+@pytest.mark.parametrize("focal", [{"PerspectiveFocalLength": "5.5"}, {"PerspectiveFocalLength": str(5.5 * PER_MM)}])
+def test_focal_lengths_are_in_millimetres_or_pixels(tmp_path, focal):
+    camera = Rig.load(image_of(tmp_path / "IMG_1.tif", {**PERSPECTIVE, **focal}))["nir"]
+    assert float(camera.K[0, 0]) == pytest.approx(5.5 * PER_MM)
+    assert camera.distortion.coefficients.tolist() == [-0.1, 0.14, -0.0006, -0.0003, -0.017]
+
+
+def test_rig_relatives_are_from_the_camera_to_the_rig_and_translations_its_centre(tmp_path):
+    further = {"RigRelatives": "0,0,90", "RigTranslations": "0.01,-0.02,0"}
+    rig = Rig.load(pair(tmp_path, {**PERSPECTIVE, **further}))
+    X = rig["nir"].cam_from_world.inverse().apply(torch.tensor([1.0, 0, 0], dtype=torch.float64))
+    assert torch.allclose(X, torch.tensor([0.01, 0.98, 0], dtype=torch.float64))
+    assert torch.equal(rig["green"].R, torch.eye(3, dtype=torch.float64))
+
+
+def test_tags_are_of_the_stored_pixels_and_the_rig_of_upright_ones(tmp_path):
+    stored, rotated = (
+        Rig.load(image_of(tmp_path / f"{name}.tif", FISHEYE, orientation=n))["red"] for name, n in (("a", 1), ("b", 3))
+    )
+    X = torch.tensor([0.3, -0.2, 1.0], dtype=torch.float64)
+    last = torch.tensor([1279.0, 959.0], dtype=torch.float64)
+    assert torch.allclose(rotated.project(X).x, last - stored.project(X).x)
+
+
+def test_missing_translations_are_said(tmp_path):
+    path = pair(tmp_path, PERSPECTIVE)
+    with pytest.warns(RigFileWarning, match="RigTranslations are not stated"):
+        assert set(Rig.load(path).names) == {"green", "nir"}
+
+
+def test_dewarp_data(tmp_path):
+    data = {"DewarpData": "2022-01-01;2200,2201,10,-5,0.01,-0.02,0.001,-0.002,0.03", "CalibratedOpticalCenterX": "640"}
+    camera = Rig.load(image_of(tmp_path / "DJI_1.tif", {}, dji=data))["1"]
+    assert camera.K[:2].tolist() == [[2200, 0, 650], [0, 2201, 475]]
+    assert camera.distortion.coefficients.tolist() == [0.01, -0.02, 0.001, -0.002, 0.03]
+
+
+@pytest.mark.parametrize(
+    ("changed", "options", "message"),
+    [
+        ({"PrincipalPoint": "24,18"}, {}, "PrincipalPoint: is at 6400, 4800 of an image of 1280x960"),
+        ({"ModelType": "spherical"}, {}, "ModelType: is 'spherical'"),
+        ({"FisheyePolynomial": "0.1,1,0"}, {}, "FisheyePolynomial: is not 0"),
+        ({"FisheyeAffineMatrix": "1660,0"}, {}, "FisheyeAffineMatrix: has 2 numbers"),
+        ({"RigTranslations": "12.5,0,0"}, {}, "RigTranslations: is .*metres are wanted"),
+        ({}, {"serial": "B2"}, "another serial number"),
+        ({"CaptureUUID": "two"}, {}, "another capture"),
+        ({}, {"orientation": 2}, "a mirrored image"),
+        ({}, {"hw": (300, 400)}, "was it cropped or resized"),
+    ],
+)
+def test_mistakes_are_named(tmp_path, changed, options, message):
+    image_of(tmp_path / "IMG_1.tif", {**FISHEYE, "BandName": "Green", "CaptureUUID": "one"})
+    path = image_of(tmp_path / "IMG_2.tif", {**FISHEYE, **changed}, **options)
+    with pytest.raises(RigFileError, match=message) as refused:
+        Rig.load(path)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("folder", "bands"), [("sequoia", 5), ("rededge", 5)])
+@pytest.mark.filterwarnings("ignore::arraygeom.io.RigFileWarning")
+def test_real_captures_round_trip(shared_data, tmp_path, folder, bands):
+    files = sorted((shared_data / "multispectral" / folder).glob("IMG*"))
+    rig = Rig.load(files[0])
+    assert len(rig.names) == bands == len(named_by_band(files))
+    rig.save(tmp_path / "rig.yaml")
+    assert Rig.load(tmp_path / "rig.yaml") == rig

@@ -1,0 +1,94 @@
+"""Damage to files that are made of pieces: chunks of PNG and WebP, segments of JPEG, boxes of MP4, entries of TIFF."""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+from collections.abc import Callable
+
+Span = tuple[int, int]
+
+
+def rearranged(source: random.Random, content: bytes, suffix: str) -> bytes:
+    """The file with a piece lost, repeated, moved, cut, or with a number of its own changed.
+
+    Checksums of PNG are made anew: else a decoder reads no further than the first damaged chunk.
+    """
+    spans = PIECES[suffix](content)
+    if not spans:
+        return content
+    (first, last), (place, _) = source.choice(spans), source.choice(spans)
+    piece, rest = content[first:last], content[:first] + content[last:]
+    kind = source.randrange(5)
+    if kind == 0:
+        changed = rest
+    elif kind == 1:
+        changed = content[:place] + piece + content[place:]
+    elif kind == 2:
+        changed = rest[:place] + piece + rest[place:]
+    else:
+        own = piece[: source.randrange(len(piece) + 1)] if kind == 3 else _with_number(source, piece)
+        changed = content[:first] + own + content[last:]
+    return _with_checksums(changed) if suffix == ".png" else changed
+
+
+def _with_number(source: random.Random, piece: bytes) -> bytes:
+    """A number within a piece, small or extreme, of 1, 2 or 4 bytes."""
+    number = source.choice((0, 1, 2, 3, 100, 2**15, 2**31 - 1, 2**31, 2**32 - 1))
+    form = source.choice((">B", ">H", "<H", ">I", "<I"))
+    packed = struct.pack(form, number % 2 ** (8 * struct.calcsize(form)))
+    at = source.randrange(max(len(piece) - len(packed), 1))
+    return piece[:at] + packed + piece[at + len(packed) :]
+
+
+def _walked(content: bytes, start: int, form: str, extra: int) -> list[Span]:
+    """Pieces that begin with a length, which does not count `extra` of their bytes."""
+    spans = []
+    while start + struct.calcsize(form) <= len(content) and len(spans) < 1000:
+        length = struct.unpack_from(form, content, start)[0] + extra
+        spans.append((start, min(start + length, len(content))))
+        start += max(length, 1)
+    return spans
+
+
+def _png(content: bytes) -> list[Span]:
+    return _walked(content, 8, ">I", 12)
+
+
+def _webp(content: bytes) -> list[Span]:
+    return _walked(content, 12, "<4xI", 8)
+
+
+def _jpeg(content: bytes) -> list[Span]:
+    return _walked(content, 2, ">2xH", 2)
+
+
+def _mp4(content: bytes) -> list[Span]:
+    return _walked(content, 0, ">I", 0)
+
+
+def _tiff(content: bytes) -> list[Span]:
+    try:
+        start = struct.unpack_from("<I", content, 4)[0]
+        count = struct.unpack_from("<H", content, start)[0]
+    except struct.error:
+        return []
+    return [(start + 2 + 12 * i, start + 14 + 12 * i) for i in range(min(count, 100))]
+
+
+PIECES: dict[str, Callable[[bytes], list[Span]]] = {
+    ".png": _png,
+    ".webp": _webp,
+    ".jpg": _jpeg,
+    ".mp4": _mp4,
+    ".tif": _tiff,
+}
+
+
+def _with_checksums(content: bytes) -> bytes:
+    made = [content[:8]]
+    for first, last in _png(content):
+        body = content[first + 4 : last - 4]
+        made.append(content[first : first + 4] + body + struct.pack(">I", zlib.crc32(body)))
+    return b"".join(made)

@@ -1,0 +1,86 @@
+"""Every field in one table: cases say where points are, fields that cannot serve are named, others are scored."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from arraygeom import Dense, Epipolar, EpipolarLine, Rectified, sample
+from pat.data.pairs import Disparity, StereoPair
+from pat.evaluation.ablation import sample_photographs
+from pat.evaluation.field_table import (
+    FieldRow,
+    evaluate_fields,
+    fields_markdown,
+    fields_of,
+    layered_cases,
+    rectified_cases,
+    row_link,
+)
+from pat.evaluation.sweeps import ALPHA, BETA
+from pat.networks.configs import PATConfig
+from pat.networks.paper import PAT
+
+HW, SHIFT = (32, 48), 5
+
+
+@pytest.fixture(scope="module")
+def pair() -> StereoPair:
+    """A smooth picture and the same, shifted: the disparity is 5 everywhere, and not known in the first rows."""
+    g = torch.Generator().manual_seed(0)
+    wide = torch.nn.functional.interpolate(torch.rand(1, 3, 8, 14, generator=g), size=(32, 53), mode="bicubic")[0]
+    wide = wide.clamp(0, 1)
+    valid = torch.ones(HW, dtype=torch.bool)
+    valid[:2] = False
+    return StereoPair("made", wide[..., :48], wide[..., 5:], 12.0, Disparity(torch.full(HW, 5.0), valid))
+
+
+@pytest.fixture(scope="module")
+def network() -> PAT:
+    torch.manual_seed(0)
+    made = PAT(PATConfig(dim=8, residual=True, interpolation="bilinear", normalised=True)).eval()
+    return made.requires_grad_(False)
+
+
+def test_true_positions_of_a_pair(pair):
+    case = next(rectified_cases([pair], rate=2))
+    seen = sample(case.scene.images[BETA][None], case.scene.position[None].float()).values[0]
+    off = (seen - case.scene.ground_truth).abs().amax(0)
+    assert off[case.scene.visible][20:].median() < 0.03  # reduced and enlarged
+    assert not case.scene.visible[:2].any()
+    assert not case.scene.visible[:, : SHIFT - 1].any()
+    assert case.scene.visible[2:, SHIFT:].all()
+
+
+def test_pairs_without_truth_are_left_out(pair):
+    assert list(rectified_cases([StereoPair("none", pair.left, pair.right)])) == []
+
+
+def test_F_alone_gives_the_rows():
+    x = torch.tensor([[20.0, 7.0], [3.0, 30.0]])
+    found = EpipolarLine()(row_link(HW), x)
+    torch.testing.assert_close(found.start[:, 1].float(), x[:, 1])
+    torch.testing.assert_close(found.end[:, 1].float(), x[:, 1])
+    assert (found.length >= HW[1] - 1).all()
+
+
+def test_every_family_is_scored_or_named(network):
+    case = next(layered_cases(sample_photographs(count=2), 1, hw=(32, 48)))
+    rows = {row.field: row for row in evaluate_fields(network, [case])}
+    assert [*rows] == [*fields_of(1.0)]
+    assert all(row.note == "" and 0 <= row.peaks <= 1 for row in rows.values())
+    text = fields_markdown([*rows.values(), FieldRow("unrectified", "x", "dense", note="left out")])
+    assert "| unrectified (2) | PSNR |" in text
+    assert f"| epipolar | {rows['epipolar'].psnr:.2f} |" in text
+
+
+def test_what_cannot_serve_is_named(network, pair):
+    case = next(rectified_cases([pair], linked=True))
+    fields = {"epipolar": Epipolar(), "rectified": Rectified(12.0, alpha_is="left")}
+    epipolar, rectified = evaluate_fields(network, [case], fields=lambda max_displacement: fields)
+    assert epipolar.note
+    assert "| epipolar | " in fields_markdown([epipolar, rectified])
+    large = case._replace(
+        scene=case.scene._replace(images={ALPHA: torch.rand(1, 200, 200), BETA: torch.rand(3, 200, 200)})
+    )
+    assert "left out" in evaluate_fields(network, [large], fields=lambda max_displacement: {"dense": Dense()})[0].note

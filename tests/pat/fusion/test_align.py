@@ -1,0 +1,170 @@
+"""align: recorded values at alpha's pixels, of any type, through lenses and rotations; files; what is refused."""
+
+import numpy as np
+import pytest
+import tifffile
+import torch
+
+from arraygeom import Band, Camera, Distortion, Pose, Rig, Sensor, View, intrinsics, sample
+from pat import align
+from pat.fusion.align import OUTSIDE, SEEN, filled, recorded_pixels
+from pat.fusion.aligned_files import RecordedFiles, save_aligned, write_bands
+from pat.fusion.aligned_page import ndvi, write_aligned_page
+from pat.fusion.report import Facts
+from pat.fusion.steps import without_lenses
+from pat.media.images import read_image, read_recorded
+
+HW = (96, 160)
+DEPTH = 4.0
+LENS = Distortion("brown-conrady", torch.tensor([-0.12, 0.03, 1e-3, -1e-3], dtype=torch.float64))
+
+
+def textured(x: torch.Tensor) -> torch.Tensor:
+    """A band-limited pattern on the plane z = DEPTH, at points (*n, 2) of it."""
+    phases = torch.rand(24, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    waves = (phases[:, :2] - 0.5) * 60
+    return 0.5 + 0.06 * (x @ waves.T + 6.3 * phases[:, 2]).sin().sum(-1)
+
+
+def recorded_by(camera: Camera) -> torch.Tensor:
+    """The image (1, H, W) of a camera before the plane."""
+    h, w = camera.hw
+    y, x = torch.meshgrid(torch.arange(h), torch.arange(w), indexing="ij")
+    rays, _ = camera.rays(torch.stack([x, y], -1).double())
+    rays = rays @ camera.R.double()
+    t = (DEPTH - camera.centre[2]) / rays[..., 2]
+    return textured((camera.centre + t[..., None] * rays)[..., :2])[None].float().clamp(0, 1)
+
+
+def array(lens: Distortion | None = None, turns: int = 0) -> tuple[Rig, dict[str, torch.Tensor]]:
+    alpha = Camera(K=intrinsics(150.0, HW), cam_from_world=Pose.identity(), hw=HW, distortion=lens)
+    t = torch.tensor([-0.15, 0.0, 0.0], dtype=torch.float64)
+    beta = alpha.replace(cam_from_world=Pose(alpha.R, t), sensor=Sensor(response=Band(840.0, 40.0)))
+    rig = Rig({"mono": alpha, "nir": beta}, depth=(2.0, 20.0))
+    images = {name: recorded_by(rig[name]) for name in rig.names}
+    if turns:
+        rig, images["nir"] = rig.rot90("nir", turns), images["nir"].rot90(turns, (-2, -1))
+    return rig, images
+
+
+@pytest.mark.parametrize(("lens", "turns"), [(None, 0), (LENS, 0), (None, 1)])
+def test_positions_are_of_the_recorded_image(lens, turns):
+    rig, images = array(lens, turns)
+    found = align(rig, images, alpha="mono", correct=False)
+    view = found["nir"]
+    y, x = np.mgrid[: HW[0], : HW[1]]
+    X = rig["mono"].unproject(torch.from_numpy(np.stack([x, y], -1).astype(float)), torch.full(HW, DEPTH).double())
+    expected = rig["nir"].project(X).x.numpy()
+    inner = (slice(12, -12), slice(30, -12))
+    off = np.linalg.norm(view.positions - expected, axis=-1)[inner]
+    assert np.nanmedian(off) < 0.15
+    assert view.valid[inner].mean() > 0.8
+    assert np.abs(view.values[0] - images["mono"][0].numpy())[inner][view.valid[inner]].mean() < 0.02
+    assert np.nanmedian(np.abs(found.depth[inner] - DEPTH)) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("interpolation", "kind"), [("nearest", "nearest"), ("bilinear", "bilinear"), ("cubic", "bicubic")]
+)
+def test_values_are_samples_of_what_was_recorded(interpolation, kind):
+    rig, images = array()
+    counts = np.rint(images["nir"].numpy() * 60000).astype(np.uint16)
+    for recorded in (counts, counts.astype(np.float32)):
+        own = {"mono": images["mono"], "nir": recorded}
+        view = align(rig, images, alpha="mono", recorded=own, interpolation=interpolation, correct=False)["nir"]
+        assert view.values.dtype == recorded.dtype
+        where = torch.from_numpy(np.nan_to_num(view.positions)).double()[None]
+        taken = sample(torch.from_numpy(recorded.astype(np.float64))[None], where, interpolation=kind).values[0].numpy()
+        error = np.abs(view.values.astype(float) - taken)[:, view.valid]
+        assert error.max() <= (0.5 if recorded.dtype == np.uint16 else 1e-6 * 60000)
+        if interpolation == "nearest":
+            assert np.isin(view.values[:, view.valid], recorded).all()
+
+
+def test_without_a_view_there_are_no_values_unless_filled():
+    rig, images = array()
+    view = align(rig, images, alpha="mono", correct=False)["nir"]
+    beyond = view.visibility == OUTSIDE
+    assert beyond.any()
+    assert np.isnan(view.values[:, ~view.valid]).all()
+    assert np.isnan(view.positions[beyond]).all()
+    full = filled(np.where(view.valid, view.values, 0), view.valid, "propagate")
+    assert np.isin(full, view.values[:, view.valid]).all()
+    assert (full[:, view.valid] == view.values[:, view.valid]).all()
+    everything = align(rig, images, alpha="mono", correct=False, min_confidence=0.0)["nir"]
+    assert (everything.visibility[~beyond] == SEEN).all()
+
+
+def test_recorded_pixels_undo_all_that_was_done_to_a_view():
+    rig, images = array(LENS)
+    straight, _ = without_lenses(rig, images)
+    now = straight.rot90("nir", 1).resize("nir", (77, 50)).crop("nir", 5, 7, (40, 30))["nir"]
+    X = torch.tensor([[0.2, 0.1, 4.0], [-0.3, 0.2, 5.0]], dtype=torch.float64)
+    found, valid = recorded_pixels(now.project(X).x, now, rig["nir"])
+    assert valid.all()
+    assert torch.allclose(found, rig["nir"].project(X).x, atol=1e-6)
+
+
+def test_views_without_calibration():
+    _, images = array()
+    rig = Rig({"mono": View(hw=HW), "nir": View(hw=HW)})
+    view = align(rig, images, alpha="mono", correct=False)["nir"]
+    assert np.abs(view.values[0] - images["mono"][0].numpy())[view.valid].mean() < 0.03
+
+
+def test_files_have_names_wavelengths_and_types(tmp_path):
+    rig, images = array()
+    counts = {name: np.rint(image.numpy() * 4000).astype(np.uint16) for name, image in images.items()}
+    for name, values in counts.items():
+        tifffile.imwrite(tmp_path / f"{name}.tif", values[0])
+    recorded = RecordedFiles(rig, {name: tmp_path / f"{name}.tif" for name in counts})
+    assert (recorded["nir"] == counts["nir"]).all()
+    found = align(rig, images, alpha="mono", recorded=recorded, correct=False)
+    written = save_aligned(found, tmp_path / "out", positions="tif")
+    with tifffile.TiffFile(tmp_path / "out" / "aligned.tif") as file:
+        assert (file.asarray() == found.stack()).all()
+        assert file.asarray().dtype == np.uint16
+        assert file.pages[0].tags["ImageDescription"].value == "mono, nir"
+        assert 'sample="1">0.84<' in file.pages[0].tags[42112].value
+    assert {"nir_visibility.png", "nir_positions.tif", "depth.tif"} <= {path.name for path in written}
+    states = read_recorded(tmp_path / "out" / "nir_visibility.png")[0]
+    assert ((states == 255) == found["nir"].valid).all()
+    assert (np.asarray(found["nir"]) == found.band("nir")).all()
+    page = write_aligned_page(tmp_path / "index.html", found, rig, Facts(["a note"]))
+    assert "not seen by nir" in page.read_text(encoding="utf-8")
+
+
+def test_types_that_differ_go_to_files_of_their_own(tmp_path):
+    rig, images = array()
+    own = {"mono": (images["mono"].numpy() * 255).astype(np.uint8), "nir": images["nir"].numpy()}
+    save_aligned(align(rig, images, alpha="mono", recorded=own, correct=False), tmp_path)
+    assert tifffile.imread(tmp_path / "mono.tif").dtype == np.uint8
+    assert tifffile.imread(tmp_path / "nir.tif").dtype == np.float32
+    assert not (tmp_path / "aligned.tif").exists()
+
+
+def test_ndvi_needs_both_bands_and_both_views():
+    rig, images = array()
+    found = align(rig, images, alpha="mono", correct=False)
+    assert ndvi(found) is None
+    red = rig.with_camera("mono", rig["mono"].replace(sensor=Sensor(response=Band(660.0, 40.0))))
+    found = align(red, images, alpha="mono", correct=False)
+    index, (r, nir) = ndvi(found), (found.band(name) for name in ("mono", "nir"))
+    seen = found["nir"].valid
+    assert np.isnan(index[~seen]).all()
+    assert np.allclose(index[seen], ((nir - r) / (nir + r))[seen])
+
+
+def test_mistakes_are_named(tmp_path):
+    rig, images = array()
+    with pytest.raises(ValueError, match=r"recorded values of 'nir' are 1x4x4, the rig says \(C, 96, 160\)"):
+        align(rig, images, alpha="mono", recorded={**images, "nir": np.zeros((1, 4, 4))}, correct=False)
+    with pytest.raises(ValueError, match="interpolation is nearest, bilinear or cubic"):
+        align(rig, images, alpha="mono", interpolation="lanczos")
+    with pytest.raises(KeyError, match="there are: mono, nir"):
+        align(rig, images, alpha="mono", correct=False).band("red")
+
+
+def test_one_band_and_packed_values(tmp_path):
+    write_bands(tmp_path / "one.tif", np.ones((1, 8, 9), np.float32), ["x"], [None])
+    assert read_image(tmp_path / "one.tif").shape == (1, 8, 9)

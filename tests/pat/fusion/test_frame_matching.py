@@ -1,0 +1,71 @@
+"""Which files of several cameras are of one frame."""
+
+import warnings
+from pathlib import Path
+
+import pytest
+
+from pat.fusion.frame_matching import MissingFramesWarning, matched_frames, warn_of_gaps
+
+
+def files(**names):
+    return {camera: [Path(camera, f"{name}.png") for name in stems] for camera, stems in names.items()}
+
+
+def stems(matched):
+    return {camera: [path.stem for path in paths] for camera, paths in matched.items()}
+
+
+@pytest.mark.parametrize(
+    ("a", "b"),
+    [
+        (["1", "2", "10"], ["1", "2", "10"]),
+        (["m_1", "m_2", "m_10"], ["c_1", "c_2", "c_10"]),
+        (["cam0_0001", "cam0_0002"], ["cam1_0001", "cam1_0002"]),
+        (["run1_1", "run1_2", "run2_1"], ["1_1", "1_2", "2_1"]),
+        (["mono kitchen", "mono garden"], ["colour kitchen", "colour garden"]),
+        (["12.001", "12.034", "12.067"], ["12.002", "12.035", "12.066"]),
+        (["1403636579763555584", "1403636579813555456"], ["1403636579763555999", "1403636579813555000"]),
+    ],
+)
+def test_frames_that_are_all_there_are_matched_without_a_word(a, b):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert stems(matched_frames(files(a=a, b=b))) == {"a": a, "b": b}
+
+
+@pytest.mark.parametrize(("prefix_a", "prefix_b"), [("", ""), ("m_", "c_"), ("cam0_", "cam1_")])
+def test_a_frame_that_a_camera_lacks_shifts_none(prefix_a, prefix_b):
+    """Of as many files each, they were fused one by one: 2 with 1, 3 with 2."""
+    a = [f"{prefix_a}{i}" for i in (0, 2, 3, 4)]
+    b = [f"{prefix_b}{i}" for i in (0, 1, 2, 4)]
+    with pytest.warns(MissingFramesWarning, match=rf"'a' has none of {prefix_b}1; 'b' has none of {prefix_a}3: 3 of 5"):
+        found = stems(matched_frames(files(a=a, b=b)))
+    assert found == {"a": [f"{prefix_a}{i}" for i in (0, 2, 4)], "b": [f"{prefix_b}{i}" for i in (0, 2, 4)]}
+
+
+def test_a_time_without_another_near_it_is_missing():
+    with pytest.warns(MissingFramesWarning, match=r"'b' has none of 10\.5"):
+        found = stems(matched_frames(files(a=["10.0", "10.5", "11.0", "11.5"], b=["10.1", "11.1", "11.6"])))
+    assert found == {"a": ["10.0", "11.0", "11.5"], "b": ["10.1", "11.1", "11.6"]}
+
+
+def test_frames_that_nothing_relates_are_taken_in_order_and_that_is_said():
+    with pytest.warns(MissingFramesWarning, match="taken in order"):
+        found = stems(matched_frames(files(a=["1", "2"], b=["x", "y"])))
+    assert found == {"a": ["1", "2"], "b": ["x", "y"]}
+    with pytest.raises(ValueError, match="as many images of each camera, got 2 of 'a', 3 of 'b'"):
+        matched_frames(files(a=["1", "2"], b=["x", "y", "z"]))
+
+
+def test_many_missing_frames_are_not_all_listed():
+    with pytest.warns(MissingFramesWarning, match=r"none of 1, 3, 5, 7, 9 and 5 more: 10 of 20"):
+        matched_frames(files(a=map(str, range(20)), b=map(str, range(0, 20, 2))))
+
+
+def test_a_gap_in_a_sequence_is_said():
+    with pytest.warns(MissingFramesWarning, match=r"'a' has no frame between 2\.png and 4\.png"):
+        warn_of_gaps(files(a=["0", "1", "2", "4", "5"], b=["0", "1", "2"]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_gaps(files(a=["0", "2", "4", "6"], b=["kitchen", "garden"]))

@@ -1,0 +1,36 @@
+"""Every number of an algorithm's settings says what kind it is and where it is from."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from pat.cli.authors import Settings
+from pat.support.settings import all_settings, listed, physics, size, tuned
+
+
+@dataclass(frozen=True)
+class SomeSettings:
+    a: float = physics(1.0, "light")
+    b: tuple[int, int] = tuned((2, 3), "pairs")
+    c: int = size(4, "rows")
+
+
+def test_entries_have_value_kind_and_reason():
+    found = [(s.name, s.value, s.kind, s.why, s.numbers) for s in listed(SomeSettings(c=5))]
+    assert found == [("a", 1.0, "physics", "light", 1), ("b", (2, 3), "tuned", "pairs", 2), ("c", 5, "size", "rows", 1)]
+
+
+def test_a_number_without_a_kind_is_refused():
+    @dataclass(frozen=True)
+    class Unsaid:
+        a: float = 1.0
+
+    with pytest.raises(ValueError, match=r"Unsaid\.a is not said to be"):
+        list(listed(Unsaid()))
+
+
+def test_fewer_than_120_numbers_were_tuned():
+    found = [s for s in all_settings(*Settings.rooms) if s.kind == "tuned"]
+    assert len({s.algorithm for s in found}) > 5
+    assert sum(s.numbers for s in found) < 120
+    assert all(len(s.why) > 20 for s in found)
