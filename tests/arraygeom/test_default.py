@@ -64,7 +64,8 @@ def test_recorded_images_are_seen_through_their_lenses():
     assert recorded_field(calibrated(lens=True)) == Curved(256)
     assert recorded_field(calibrated(lens=True), samples=64, nodes=16) == Curved(64, nodes=16)
     through = recorded_field(linked(calibrated(lens=True)), samples=9)
-    assert through == ThroughLenses(default_field(linked(calibrated(lens=True))), 9)
+    assert through == ThroughLenses(straight_field(linked(calibrated(lens=True))), 9)
+    assert default_field(calibrated(lens=True)) == Curved()
 
 
 def test_drawings_need_no_depth_range():
