@@ -88,7 +88,7 @@ def depth_of(
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)
-    if alpha.distortion is None and beta.distortion is None:
+    if not pair.has_lens:
         return depth_from_track(track(alpha.K, beta.K, pair.beta_from_alpha, x), x_beta, deviation)
     if not (alpha.central and beta.central):
         raise ValueError("rays of one of these cameras do not meet in a point: use arraygeom.fields.ray_depth")

@@ -19,6 +19,7 @@ from arraygeom import (
     sampling_locations,
 )
 from arraygeom.fields import FIELDS, default_field, recorded_field
+from arraygeom.fields.default import straight_field
 from tests.arraygeom.rigs import random_rig
 
 HW, BETA_HW = (20, 30), (60, 40)
