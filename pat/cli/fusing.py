@@ -68,7 +68,6 @@ class Fuse:
     (a page that shows them) and view.yaml (the rig of the fused view)."""
     weights: Annotated[str | None, arg(metavar="NAME|FILE", help=WEIGHTS_HELP, help_behavior_hint="")] = None
     field: FieldName = "auto"
-    """Receptive field in the other cameras; auto takes what the rig allows."""
     max_memory: Memory = None
     """Memory limit of the whole process, such as 4GiB; larger frames are fused in tiles."""
     normalise_radiometry: bool = False
