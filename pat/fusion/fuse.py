@@ -13,6 +13,7 @@ from torch import Tensor
 
 from arraygeom import ReceptiveField, Rig
 from arraygeom.chunks import Tile
+from arraygeom.threads import torch_in_one_thread
 
 from ..matching.match import Matcher, match
 from ..matching.radiometry import Given
@@ -38,6 +39,7 @@ Progress = Callable[[Iterable[Tile], int], Iterable[Tile]]
 """Wraps the tiles (and their number) to show how far the work is, as `rich.progress.track` does."""
 
 
+@torch_in_one_thread()
 def fuse(
     network: FusionNetwork | ImageSources,
     rig: Rig | None = None,
@@ -177,6 +179,7 @@ def _with_rig(
     return load_weights(array.weights), array.rig, array.images, array.alpha, array.match_levels
 
 
+@torch_in_one_thread()
 def corrections_of(
     network: FusionNetwork,
     rig: Rig,

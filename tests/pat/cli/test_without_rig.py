@@ -18,7 +18,7 @@ from pat.cli.authors import with_found_rig
 from pat.cli.main import main
 from pat.data.sample_array import load_sample
 from pat.evaluation.metrics import score
-from pat.fusion.from_images import array_from_images, camera_names
+from pat.fusion.from_images import array_from_images, camera_names, found_rig
 from pat.fusion.results import Frame, save_frame
 from pat.media.images import read_image, write_image
 from pat.media.video import read_video, write_video
@@ -250,3 +250,13 @@ def test_a_wrong_rig_is_refused_before_the_work_with_the_doctors_verdict(
     assert "behind the cameras or outside the depth range" in text
     assert said in text
     assert not (tmp_path / "out").exists()
+
+
+def test_why_there_is_no_depth_is_said(halved, monkeypatch):
+    """Images of which no pose was found gave none, without a word."""
+    monkeypatch.setattr("pat.fusion.from_images.self_calibrated", lambda *given, **options: None)
+    monkeypatch.setattr("pat.fusion.from_images.MATCHED", 300)
+    lines = []
+    rig, _ = found_rig(halved[1], "mono", {}, load_weights("mono-colour"), lines.append)
+    assert not isinstance(rig["mono"], Camera)
+    assert any(line.startswith("no depth: no position of colour beside mono") for line in lines)
