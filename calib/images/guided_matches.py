@@ -1,4 +1,4 @@
-"""PointMatches between unlike bands where it is roughly known where a point is: patches whose structure agrees.
+"""Matches between unlike bands where it is roughly known where a point is: patches whose structure agrees.
 
 Descriptors of features hardly match where leaves are dark in red and bright in near infrared. A patch's correlation,
 squared, does not depend on the sign of its contrast, and the search is confined to a window around what is expected.
