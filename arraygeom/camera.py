@@ -198,7 +198,7 @@ class Camera(LensView):
         """
         from kornia.geometry.camera import PinholeCamera
 
-        if self.distortion is not None:
+        if self.distortion is not None and not self.distortion.harmless:
             raise ValueError("kornia's PinholeCamera has no lens model: undistort first, or drop `distortion`")
         R, t, K = self.R.reshape(-1, 3, 3), self.t.reshape(-1, 3), self.K.reshape(-1, 3, 3)
         row = K.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(K), 1, 4)

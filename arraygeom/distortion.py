@@ -40,6 +40,7 @@ from .lenses.central import FOV, MODELS, central_project, central_unproject
 from .lenses.common import WIDEST, finite_points, unit
 from .lenses.fisheye import fisheye_limit, fisheye_project, fisheye_unproject
 from .pixels import to_homogeneous
+from .tracing import traced
 
 BROWN_CONRADY = "brown-conrady"
 KANNALA_BRANDT = "kannala-brandt"
@@ -77,6 +78,14 @@ class Distortion(Batched):
     def is_identity(self) -> bool:
         """Whether this lens distorts nothing: Brown-Conrady with all coefficients 0."""
         return self.model == BROWN_CONRADY and not bool(self.coefficients.any())
+
+    @property
+    def harmless(self) -> bool:
+        """Whether the lens can be left out: it distorts nothing, and no gradient is asked of it.
+
+        Never where numbers cannot decide (`traced`).
+        """
+        return not self.coefficients.requires_grad and not traced() and self.is_identity
 
     @property
     def sees_behind(self) -> bool:

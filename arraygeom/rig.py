@@ -64,7 +64,7 @@ class Pair(Batched):
     beta: View
     depth: Depths | None = None
     link: Link | None = None
-    memo: dict[str, Tensor] = field(default_factory=dict, init=False, compare=False, repr=False)
+    memo: dict[str, Any] = field(default_factory=dict, init=False, compare=False, repr=False)
     """Cache of what fields compute once a pair; never copied."""
 
     @property
@@ -74,8 +74,9 @@ class Pair(Batched):
 
     @property
     def has_lens(self) -> bool:
-        """Whether either view has a lens, so that lines are curves in its image."""
-        return any(isinstance(view, LensView) and view.distortion is not None for view in (self.alpha, self.beta))
+        """Whether either view has a lens that distorts, so that lines are curves in its image."""
+        lenses = [view.distortion for view in (self.alpha, self.beta) if isinstance(view, LensView)]
+        return any(lens is not None and not lens.harmless for lens in lenses)
 
     @property
     def cameras(self) -> tuple[Camera, Camera]:

@@ -88,7 +88,7 @@ def depth_of(
     """
     alpha, beta = pair.cameras
     x, x_beta = floating(x), floating(x_beta)
-    if alpha.distortion is None and beta.distortion is None:
+    if not pair.has_lens:
         return depth_from_track(track(alpha.K, beta.K, pair.beta_from_alpha, x), x_beta, deviation)
     pose = pair.beta_from_alpha
     normalised, seen = zip(*(_normalised(c.to(x.dtype), p) for c, p in ((alpha, x), (beta, x_beta))))

@@ -241,7 +241,6 @@ TINY = 1e-24
 """Two rays of which the squared sine, times their squared lengths, is smaller than this have one direction."""
 
 
-@torch.no_grad()
 def undistorted_limits(camera: Camera) -> tuple[Tensor, Tensor, Tensor, Tensor] | None:
     """(x low, y low, x high, y high) of a lens's image in normalised undistorted points, (*b) each, 2 % wider.
 

@@ -47,9 +47,9 @@ class NearestVoxels:
         line, centre = line.reshape(-1, 3), centre.reshape(-1, 2)
         if compilable(line):
             xy, mask = self._compiled(line, centre, usable.reshape(-1), pair.beta.hw)
-            return Positions(xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1))
+            return Positions(xy.reshape(*axes, self.count, 2), mask.reshape(*axes, self.count))
         xy, mask = self._nearest(line, centre, pair)
-        xy, mask = xy.reshape(*axes, -1, 2), mask.reshape(*axes, -1) & usable[..., None]
+        xy, mask = xy.reshape(*axes, self.count, 2), mask.reshape(*axes, self.count) & usable[..., None]
         return Positions(torch.where(mask[..., None], xy, 0.0), mask)
 
     def _nearest(self, line: Tensor, centre: Tensor, pair: Pair) -> tuple[Tensor, Tensor]:

@@ -59,7 +59,7 @@ class PointMatches(NamedTuple):
 
 
 Pairs = Mapping[tuple[str, str], PointMatches]
-"""PointMatches of pairs of cameras, by their names (alpha, beta)."""
+"""Matches of pairs of cameras, by their names (alpha, beta)."""
 Images = Mapping[str, Float[Tensor, "_ _ _"]]
 """An image (C, H, W) of each camera, by name."""
 
@@ -133,7 +133,7 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
-    """PointMatches between the images of every two cameras that are consistent with some fundamental matrix.
+    """Matches between the images of every two cameras that are consistent with some fundamental matrix.
 
     With `alpha`, only between that camera's image and each of the others, alpha first.
     Where there are few, the second image is tried mirrored, to which features are not invariant. Pairs with fewer than

@@ -30,7 +30,7 @@ from arraygeom.fields import Local, lazily
 from arraygeom.pixels import pixel_coordinates
 from arraygeom.rig import Pair
 from arraygeom.segments import Positions, Segments
-from arraygeom.tracing import transformations
+from arraygeom.tracing import needs_numbers, transformations
 from pat.attention import reference, torch_op
 from pat.attention.reference import Attended, AttentionInputs, SamplePositions, accumulated
 
@@ -215,6 +215,7 @@ def sample_positions(locations: Locations, query: Tensor, samples: int | None) -
 
 def samples_for(segments: Segments) -> int:
     """Enough samples for one on each beta pixel of the longest valid segment."""
+    needs_numbers("the number of samples of the longest segment (give `samples`)", segments.start, segments.end)
     lengths = torch.where(segments.valid, segments.length.detach(), 0)
     return int(lengths.max().ceil()) + 1
 

@@ -24,7 +24,7 @@ def rig_of(depth=(1.0, 9.0)) -> Rig:
 
 
 def seen_points(rig, *, count=300, near=2.0, far=6.0, noise=0.0):
-    """PointMatches of random points between two depths in front of left, good to `noise` pixels."""
+    """Matches of random points between two depths in front of left, good to `noise` pixels."""
     g = torch.Generator().manual_seed(0)
     left, right = rig["left"], rig["right"]
     x = torch.rand(count, 2, generator=g, dtype=torch.float64) * torch.tensor([319.0, 239.0])
