@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ..batching import tensors_of
 from ..camera import Camera
+from ..checks import check_above, check_bounds
 from ..chunks import chunked
 from ..epipolar import Track, epipolar_lines, segments_between, track
 from ..homography import apply_homography
@@ -36,6 +37,9 @@ class Epipolar:
 
     near: float | None = None
     far: float | None = None
+
+    def __post_init__(self) -> None:
+        check_bounds(self.near, self.far)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from near to far, inside beta's image and in front of it. Raises ValueError for lenses."""
@@ -91,6 +95,9 @@ class HomographyDisplacement:
     """
 
     displacement: float | None = None
+
+    def __post_init__(self) -> None:
+        check_above(0, displacement=self.displacement)
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments centred on the point of the line nearest to H x, then clipped to beta's image.
@@ -173,6 +180,11 @@ class Rectified:
     def __post_init__(self) -> None:
         if self.alpha_is not in get_args(SIDES):
             raise ValueError(f"alpha_is must be one of {', '.join(get_args(SIDES))}, got {self.alpha_is!r}")
+
+    def __post_init__(self) -> None:
+        check_above(0, max_disparity=self.max_disparity)
+        if self.alpha_is not in ("left", "right", "either"):
+            raise ValueError(f"alpha_is is {self.alpha_is!r}: wanted 'left', 'right' or 'either'")
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from the largest disparity (near) to none (far)."""
