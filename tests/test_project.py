@@ -198,7 +198,9 @@ def test_arraygeom_touches_files_only_in_io():
     assert {
         p.name: names(p) & READING_FILES
         for p in sources("arraygeom")
-        if names(p) & READING_FILES and "io" not in p.relative_to(ROOT).parts and p.name != "atomic.py"
+        if names(p) & READING_FILES
+        and "io" not in p.relative_to(ROOT).parts
+        and p.name not in ("atomic.py", "compiled.py")
     } == {}
 
 
@@ -234,6 +236,15 @@ def test_examples_in_docstrings(path):
     results = doctest.testmod(load(path))
     assert results.attempted
     assert not results.failed
+
+
+def test_every_public_class_name_occurs_once():
+    places: dict[str, list[str]] = {}
+    for path in sources(*PACKAGES):
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                places.setdefault(node.name, []).append(module_name(path))
+    assert {name: modules for name, modules in places.items() if len(modules) > 1} == {}
 
 
 def test_one_version():

@@ -19,9 +19,10 @@ from arraygeom import Camera, LensView, Pair, Rig
 from arraygeom.pixels import HW
 from arraygeom.rig import Depths
 from arraygeom.robust import cauchy, least_squares, robust_least_squares
+from arraygeom.threads import torch_in_one_thread
 
 from .held_out import image_parts, trimmed_square
-from .matches import Images, Matches, Pairs, match_cameras
+from .matches import Images, Pairs, PointMatches, match_cameras
 from .plausibility import DriftEvidence, plausible
 from .remedies import NOTHING, Remedy, bare_cameras, lens_remedy, remedies
 from .residuals import lines_basis, related, residuals_and_depths, stack_key, stacked
@@ -167,6 +168,7 @@ def _rounded(figures: FitStatistics) -> dict[str, float | None]:
     return {name: None if math.isnan(value) else round(value, 4) for name, value in figures._asdict().items()}
 
 
+@torch_in_one_thread()
 def diagnose(rig: Rig, images: Images) -> Diagnosis:
     """Find the usual mistake, if any, in a rig, by one image (C, H, W) of two or more of its cameras.
 
@@ -227,10 +229,10 @@ def _clearly_better(
     )
 
 
-def _thinned(matches: Matches) -> Matches:
+def _thinned(matches: PointMatches) -> PointMatches:
     """At most `MOST` of them, evenly through the list."""
     step = max(1, -(-len(matches.alpha) // MOST))
-    return Matches(matches.alpha[::step], matches.beta[::step])
+    return PointMatches(matches.alpha[::step], matches.beta[::step])
 
 
 def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[FitStatistics], Tensor, float]:
@@ -255,7 +257,7 @@ def _evaluate(rig: Rig, tried: Sequence[Remedy], pairs: Pairs) -> tuple[list[Fit
     return figures, inliers, max(math.sqrt(floor / OF_TRIMMED), LEAST_NOISE)
 
 
-def handedness(matches: Matches) -> float:
+def handedness(matches: PointMatches) -> float:
     """The share of Delaunay triangles of the points in alpha that keep their orientation in beta."""
     try:
         corners = Delaunay(matches.alpha.numpy()).simplices
@@ -292,7 +294,7 @@ def _observe(rigs: Sequence[Rig], pairs: Pairs) -> PointObservations:
     return PointObservations(*(torch.cat(part, 1) for part in zip(*parts)))
 
 
-def _observe_pair(pairs: Sequence[Pair], matches: Matches) -> PointObservations:
+def _observe_pair(pairs: Sequence[Pair], matches: PointMatches) -> PointObservations:
     """One pair of cameras under several rigs, batched by lens model."""
     count = len(matches.alpha)
     off, depth = torch.full((2, len(pairs), count), torch.nan, dtype=torch.float64)
@@ -328,7 +330,7 @@ def _inliers(rig: Rig, tried: Sequence[Remedy], off: Tensor, pairs: Pairs) -> tu
     return inliers, trimmed_square(left_over[inliers])
 
 
-def _beyond_pose(pair: Pair, matches: Matches, off: Tensor) -> Tensor:
+def _beyond_pose(pair: Pair, matches: PointMatches, off: Tensor) -> Tensor:
     """The residual of the distances after a robust first-order fit of F."""
     terms = lines_basis(pair, matches).T
 

@@ -15,10 +15,20 @@ from torch import Tensor
 
 from arraygeom import Rig, View, intrinsics
 from arraygeom.progress import part, stage
+from arraygeom.threads import torch_in_one_thread
 
 from .held_out import median_off, split
 from .lenses import describe_lenses
-from .matches import AGREE, Matches, fit_fundamental, fit_link, line_distance, match_cameras, matching_time, with_map
+from .matches import (
+    AGREE,
+    PointMatches,
+    fit_fundamental,
+    fit_link,
+    line_distance,
+    match_cameras,
+    matching_time,
+    with_map,
+)
 from .refinement import refine_matches
 
 JOINED = 1.0
@@ -38,7 +48,7 @@ class UncalibratedRig(NamedTuple):
     distance: dict[tuple[str, str], float]
     displacement: dict[tuple[str, str], float]
     by_focal: dict[tuple[str, str], bool]
-    matches: dict[tuple[str, str], Matches]
+    matches: dict[tuple[str, str], PointMatches]
 
     def as_text(self) -> str:
         """One line per link, and one on lenses if there are any."""
@@ -51,6 +61,7 @@ class UncalibratedRig(NamedTuple):
         return "\n".join([*lines, *filter(None, [describe_lenses(self.rig)])])
 
 
+@torch_in_one_thread()
 @stage()
 def rig_from_images(
     images: Mapping[str, Float[Tensor, "_ _ _"]], *, focal: Mapping[str, float] | None = None, alpha: str | None = None
@@ -94,10 +105,10 @@ def rig_from_images(
     return found._replace(rig=rig.replace(links=links))
 
 
-def _fundamental(matches: Matches, K: Tensor | None, K_beta: Tensor | None) -> tuple[Tensor, float, bool]:
+def _fundamental(matches: PointMatches, K: Tensor | None, K_beta: Tensor | None) -> tuple[Tensor, float, bool]:
     """F of all points; the median distance of held-out points if fitted to the rest; whether by focal lengths."""
     (used,), (held_out,) = (list(part.values()) for part in split([{("", ""): matches}]))
-    fits: dict[bool, Callable[[Matches], Tensor]] = {False: fit_fundamental}
+    fits: dict[bool, Callable[[PointMatches], Tensor]] = {False: fit_fundamental}
     if K is not None and K_beta is not None:
         fits[True] = partial(_by_focal, K=K, K_beta=K_beta)
     distance = {by: float(line_distance(held_out, fit(used)).median()) for by, fit in fits.items()}
@@ -105,7 +116,7 @@ def _fundamental(matches: Matches, K: Tensor | None, K_beta: Tensor | None) -> t
     return fits[best](matches), distance[best], best
 
 
-def _by_focal(matches: Matches, K: Tensor, K_beta: Tensor) -> Tensor:
+def _by_focal(matches: PointMatches, K: Tensor, K_beta: Tensor) -> Tensor:
     x, y = (points.numpy() for points in matches)
     no_lens = np.zeros(5)
     E, _ = cv2.findEssentialMat(x, y, K.numpy(), no_lens, K_beta.numpy(), no_lens, method=cv2.RANSAC, threshold=1.0)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 from torch import Tensor
 
-from .matches import Matches, contrast_equalised
+from .matches import PointMatches, contrast_equalised
 
 POINTS = 1500
 """Corners of alpha at most."""
@@ -38,7 +38,7 @@ def guided_matches(
     *,
     window: int,
     shown: tuple[Bool[Tensor, "h w"], Bool[Tensor, "hb wb"]],
-) -> Matches:
+) -> PointMatches:
     """Corners of alpha with the patch most like theirs within `window` pixels of where a homography puts them in beta.
 
     Images are to be alike in scale and orientation. `shown` says what of each image a camera recorded.
@@ -55,7 +55,7 @@ def guided_matches(
     found = [_most_alike(own, other, valid, *points, window) for points in zip(x, there)]
     kept = [i for i, y in enumerate(found) if y is not None]
     y = np.array([found[i] for i in kept], np.float64).reshape(-1, 2)
-    return Matches(torch.from_numpy(x[kept].round()), torch.from_numpy(y))
+    return PointMatches(torch.from_numpy(x[kept].round()), torch.from_numpy(y))
 
 
 def _most_alike(

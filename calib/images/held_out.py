@@ -11,7 +11,7 @@ from torch import Tensor
 
 from arraygeom import Rig
 
-from .matches import Matches, Pairs
+from .matches import Pairs, PointMatches
 from .refined import LineStatistics
 from .residuals import epipolar_residuals
 
@@ -54,7 +54,7 @@ def median_off(rig: Rig, pairs: Pairs) -> float:
     return float(line_distances(rig, pairs).abs().median())
 
 
-def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict[tuple[str, str], Matches]]:
+def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], PointMatches], dict[tuple[str, str], PointMatches]]:
     """Points to use and points to hold out: whole frames if there are several, else squares of alpha's image."""
     if len(frames) > 1:
         held_out = max(1, len(frames) // HELD_OUT)
@@ -67,16 +67,16 @@ def split(frames: Sequence[Pairs]) -> tuple[dict[tuple[str, str], Matches], dict
     )
 
 
-def _held_out_points(matches: Matches) -> Tensor:
+def _held_out_points(matches: PointMatches) -> Tensor:
     """Points in one square out of `HELD_OUT`."""
     column, row = (matches.alpha / CELL).floor().long().unbind(-1)
     return (column + 2 * row) % HELD_OUT == 0
 
 
-def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], Matches]:
+def _joined(frames: Sequence[Pairs]) -> dict[tuple[str, str], PointMatches]:
     names = dict.fromkeys(name for frame in frames for name in frame)
     parts = {name: [frame[name] for frame in frames if name in frame] for name in names}
-    return {name: Matches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
+    return {name: PointMatches(*(torch.cat(side) for side in zip(*found))) for name, found in parts.items()}
 
 
 def held_out_pixels(error: Tensor) -> Tensor:

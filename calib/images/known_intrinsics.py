@@ -20,14 +20,14 @@ from arraygeom.pixels import map_homogeneous
 
 from .guided_matches import guided_matches
 from .held_out import median_off
-from .matches import ENOUGH, Images, Matches, near_lines
+from .matches import ENOUGH, Images, PointMatches, near_lines
 from .refinement import refine_matches
 from .self_calibration import depth_bounds
 
 WINDOW = 0.09
 """Largest displacement between images of parallel views, as a share of the longer side: 15 mm at .15 m, 60 degrees."""
 NEAR = 4.0
-"""Matches this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
+"""Points this many pixels from the line of a baseline are consistent with it: orientations are known to .2 degrees."""
 SHARE = 0.4
 """A baseline counts with which at least this share of a pair's matches is consistent: of wrong ones up to .3 are."""
 TRIALS = 500
@@ -49,7 +49,7 @@ def centres_found(
     ValueError if none matches.
     """
     stated = [float(rig.pair(alpha, name).beta_from_alpha.t.norm()) for name in rig.betas(alpha)]
-    pairs: dict[tuple[str, str], Matches] = {}
+    pairs: dict[tuple[str, str], PointMatches] = {}
     for a, b in combinations(rig.names, 2):
         found = _consistent(rig, a, b, _matched(rig, a, b, images, shown))
         if found is not None:
@@ -71,20 +71,20 @@ def centres_found(
     return rig.replace(depth=_depths(rig, alpha, near)), facts
 
 
-def _matched(rig: Rig, a: str, b: str, images: Images, shown: Mapping[str, Tensor]) -> Matches:
+def _matched(rig: Rig, a: str, b: str, images: Images, shown: Mapping[str, Tensor]) -> PointMatches:
     infinite = rig[b].K @ rig[b].R @ rig[a].R.mT @ torch.linalg.inv(rig[a].K)
     window = round(WINDOW * max(images[b].shape[-2:]))
     return guided_matches(images[a], images[b], infinite, window=window, shown=(shown[a], shown[b]))
 
 
-def _normals(rig: Rig, a: str, b: str, matches: Matches) -> Float[Tensor, "n 3"]:
+def _normals(rig: Rig, a: str, b: str, matches: PointMatches) -> Float[Tensor, "n 3"]:
     """What is perpendicular to the baseline, of each match, in the rig's frame; times the focal length, so that the
     product with a baseline of length 1 is about a distance in pixels."""
     one, two = _rays(rig, a, b, matches)
     return float(rig[b].K[0, 0]) * torch.linalg.cross(one, two)
 
 
-def _rays(rig: Rig, a: str, b: str, matches: Matches) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+def _rays(rig: Rig, a: str, b: str, matches: PointMatches) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
     """The matches' rays in the rig's frame, of both cameras."""
     one, two = (
         map_homogeneous(rig[name].R.mT @ torch.linalg.inv(rig[name].K), x.double())
@@ -93,7 +93,7 @@ def _rays(rig: Rig, a: str, b: str, matches: Matches) -> tuple[Float[Tensor, "n 
     return one, two
 
 
-def _consistent(rig: Rig, a: str, b: str, matches: Matches) -> Matches | None:
+def _consistent(rig: Rig, a: str, b: str, matches: PointMatches) -> PointMatches | None:
     """The matches that one direction of the baseline explains; None if that is no large share of them."""
     if len(matches.alpha) < ENOUGH:
         return None
@@ -116,7 +116,7 @@ def _connected(alpha: str, pairs: list[tuple[str, str]]) -> set[str]:
     return names
 
 
-def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], Matches]) -> Rig:
+def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], PointMatches]) -> Rig:
     """The rig with the centres that all matches agree on: alpha's is the origin, most points are in front."""
     index = {name: i for i, name in enumerate(rig.betas(alpha))}
     rows = []
@@ -144,7 +144,7 @@ def _with_centres(rig: Rig, alpha: str, pairs: Mapping[tuple[str, str], Matches]
     return Rig(cameras)
 
 
-def _points_ahead(rig: Rig, pair: tuple[str, str], matches: Matches, centres: Mapping[str, Tensor]) -> float:
+def _points_ahead(rig: Rig, pair: tuple[str, str], matches: PointMatches, centres: Mapping[str, Tensor]) -> float:
     """How many more matches are in front of both cameras than behind."""
     a, b = pair
     one, two = _rays(rig, a, b, matches)
@@ -162,13 +162,13 @@ def _scaled(rig: Rig, alpha: str, factor: float) -> Rig:
     return rig.replace(cameras=cameras)
 
 
-def _fit(rig: Rig, near: Mapping[tuple[str, str], Matches], name: str) -> tuple[int, float]:
+def _fit(rig: Rig, near: Mapping[tuple[str, str], PointMatches], name: str) -> tuple[int, float]:
     """The points of a camera with all others, and their median distance from their lines."""
     own = {pair: matches for pair, matches in near.items() if name in pair}
     return sum(len(matches.alpha) for matches in own.values()), median_off(rig, own)
 
 
-def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], Matches]) -> tuple[float, float]:
+def _depths(rig: Rig, alpha: str, near: Mapping[tuple[str, str], PointMatches]) -> tuple[float, float]:
     """The range of depths that all pairs' points have, extended. Raises ValueError for points without parallax."""
     found = []
     for (a, b), matches in near.items():

@@ -47,24 +47,24 @@ STILL = 0.05
 """Images in which nine points in ten move less than this, in pixels, are the same image."""
 
 
-class Matches(NamedTuple):
+class PointMatches(NamedTuple):
     """Points (x, y) of alpha, and their positions in beta."""
 
     alpha: Float[Tensor, "n 2"]
     beta: Float[Tensor, "n 2"]
 
-    def only(self, kept: Bool[Tensor, " n"]) -> Matches:
+    def only(self, kept: Bool[Tensor, " n"]) -> PointMatches:
         """The matches selected by a mask."""
-        return Matches(self.alpha[kept], self.beta[kept])
+        return PointMatches(self.alpha[kept], self.beta[kept])
 
 
-Pairs = Mapping[tuple[str, str], Matches]
+Pairs = Mapping[tuple[str, str], PointMatches]
 """Matches of pairs of cameras, by their names (alpha, beta)."""
 Images = Mapping[str, Float[Tensor, "_ _ _"]]
 """An image (C, H, W) of each camera, by name."""
 
 
-def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> Matches:
+def match_points(alpha: Float[Tensor, "_ h w"], beta: Float[Tensor, "_ hb wb"]) -> PointMatches:
     """Mutually nearest SIFT features of both images' luminance that pass the ratio test.
 
     Contrast is equalised (CLAHE). Where patches around them correlate, beta's points are refined by least squares.
@@ -113,7 +113,7 @@ def _mutual(a: SiftFeatures, b: SiftFeatures) -> tuple[list[int], list[int]]:
     return i[mutual].tolist(), forward[mutual].tolist()
 
 
-def _match(a: SiftFeatures, b: SiftFeatures) -> Matches:
+def _match(a: SiftFeatures, b: SiftFeatures) -> PointMatches:
     """Points of the mutually nearest features, beta's refined by patches around them."""
     i, j = _mutual(a, b)
     ratio, angle = b.sizes[j] / a.sizes[i], b.directions[j] - a.directions[i]
@@ -121,7 +121,7 @@ def _match(a: SiftFeatures, b: SiftFeatures) -> Matches:
     maps = np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], 1)
     y, deviation = refine_points(a.image, b.image, a.points[i], b.points[j], maps)
     kept = torch.from_numpy(_well_localised(deviation))
-    return Matches(torch.from_numpy(a.points[i]), torch.from_numpy(y)).only(kept)
+    return PointMatches(torch.from_numpy(a.points[i]), torch.from_numpy(y)).only(kept)
 
 
 def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -132,7 +132,7 @@ def _well_localised(deviation: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.ones_like(deviation, dtype=np.bool_)
 
 
-def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], Matches]:
+def match_cameras(images: Images, *, alpha: str | None = None) -> dict[tuple[str, str], PointMatches]:
     """Matches between the images of every two cameras that are consistent with some fundamental matrix.
 
     With `alpha`, only between that camera's image and each of the others, alpha first.
@@ -175,17 +175,17 @@ def matching_time(images: Images, pairs: int) -> float:
     return sum(MEGAPIXEL * image[0].numel() / 1e6 for image in images.values()) + PAIR * pairs
 
 
-def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> Matches:
+def _agreeing(a: SiftFeatures, b: SiftFeatures, image: Tensor) -> PointMatches:
     """The consistent matches; of the mirrored image if those are more."""
     unmirrored = agreeing(_match(a, b))
     if len(unmirrored.alpha) >= MANY:
         return unmirrored
     x, y = agreeing(_match(a, detect_features(image.flip(-1))))
-    mirrored = Matches(x, torch.stack([image.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
+    mirrored = PointMatches(x, torch.stack([image.shape[-1] - 1 - y[:, 0], y[:, 1]], -1))
     return max(unmirrored, mirrored, key=lambda m: len(m.alpha))
 
 
-def agreeing(matches: Matches) -> Matches:
+def agreeing(matches: PointMatches) -> PointMatches:
     """The matches that some fundamental matrix puts within `AGREE` pixels of their lines; none if there are few."""
     if len(matches.alpha) >= ENOUGH:
         with suppress(ValueError):
@@ -193,12 +193,12 @@ def agreeing(matches: Matches) -> Matches:
     return matches.only(torch.zeros(len(matches.alpha), dtype=torch.bool))
 
 
-def near_lines(matches: Matches, F: Float[Tensor, "3 3"], *, within: float) -> Matches:
+def near_lines(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float) -> PointMatches:
     """The matches within some pixels of their epipolar line in beta."""
     return matches.only(line_distance(matches, F) <= within)
 
 
-def line_distance(matches: Matches, F: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
+def line_distance(matches: PointMatches, F: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
     """Distance of each match from its epipolar line, in beta's pixels."""
     return epipolar_distance(F.to(matches.alpha), *matches).abs()
 
@@ -212,11 +212,11 @@ class FittedLink(NamedTuple):
     """
 
     link: Link
-    matches: Matches
+    matches: PointMatches
     displacement: float
 
 
-def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
+def fit_link(matches: PointMatches, F: Float[Tensor, "3 3"], *, within: float = 6.0) -> FittedLink:
     """Improve `F`, and fit a rough map, by the matches within some pixels of their lines.
 
     F by MAGSAC++ (Barath et al. 2020) to 1 px; H by `rough_map`. Raises ValueError for fewer than 20 consistent
@@ -227,20 +227,20 @@ def fit_link(matches: Matches, F: Float[Tensor, "3 3"], *, within: float = 6.0) 
     return _with_rough_map(near_lines(near, fitted, within=3), fitted)
 
 
-def with_map(pair: Pair, matches: Matches) -> FittedLink:
+def with_map(pair: Pair, matches: PointMatches) -> FittedLink:
     """The pair's F, unchanged, with a rough map of the points near their lines. Raises ValueError for too few."""
     F = pair.fundamental
     return _with_rough_map(near_lines(undistort_matches(pair, matches), F, within=3), F)
 
 
-def _with_rough_map(matches: Matches, F: Tensor) -> FittedLink:
+def _with_rough_map(matches: PointMatches, F: Tensor) -> FittedLink:
     if len(matches.alpha) < ENOUGH:
         raise ValueError(f"only {len(matches.alpha)} points seen in both images agree with F: does it belong to them?")
     H, displacement = rough_map(matches, F)
     return FittedLink(Link(F, H), matches, displacement)
 
 
-def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
+def rough_map(matches: PointMatches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, "3 3"], float]:
     """A similarity centred on the points along their lines, and the distance that contains 98% of them, pixels.
 
     By RANSAC, then shifted along the mean direction of the lines.
@@ -254,18 +254,18 @@ def rough_map(matches: Matches, F: Float[Tensor, "3 3"]) -> tuple[Float[Tensor, 
     return H, max(-low, high)
 
 
-def undistort_matches(pair: Pair, matches: Matches) -> Matches:
+def undistort_matches(pair: Pair, matches: PointMatches) -> PointMatches:
     """The undistorted points, without those outside the domain of the lens models."""
     (x, x_valid), (y, y_valid) = pair.alpha.undistort(matches.alpha), pair.beta.undistort(matches.beta)
-    return Matches(x, y).only(x_valid & y_valid)
+    return PointMatches(x, y).only(x_valid & y_valid)
 
 
-def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
+def seen_depths(pair: Pair, matches: PointMatches) -> tuple[float, float]:
     """Depth bounds of the matched points, metres in front of alpha: 0.9 of the nearest to 1.25 of the farthest.
 
     Nearest and farthest without the outermost 2% of the points. Raises ValueError for fewer than 20 points in front.
     """
-    undistorted = Matches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
+    undistorted = PointMatches(pair.alpha.undistort(matches.alpha)[0], pair.beta.undistort(matches.beta)[0])
     near = matches.only(line_distance(undistorted, pair.fundamental) <= 3)
     cameras = [camera.to(torch.float64) for camera in pair.cameras]
     found = triangulate(cameras, torch.stack(near), deviation=LOCALISED, residual=3.0)
@@ -276,7 +276,7 @@ def seen_depths(pair: Pair, matches: Matches) -> tuple[float, float]:
     return 0.9 * low, 1.25 * high
 
 
-def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
+def fit_fundamental(matches: PointMatches) -> Float[Tensor, "3 3"]:
     """F by MAGSAC++ (Barath et al. 2020) to 1 px, or else by RANSAC. Raises ValueError if none fits."""
     x, y = (points.numpy() for points in matches)
     found = None
@@ -288,7 +288,7 @@ def fit_fundamental(matches: Matches) -> Float[Tensor, "3 3"]:
     raise ValueError("no fundamental matrix fits the points seen in both images")
 
 
-def similarity(matches: Matches) -> Float[Tensor, "3 3"]:
+def similarity(matches: PointMatches) -> Float[Tensor, "3 3"]:
     """The similarity that most matches fit to 30 pixels of beta, by RANSAC."""
     x, y = (points.numpy() for points in matches)
     found, _ = cv2.estimateAffinePartial2D(x, y, ransacReprojThreshold=30)
@@ -297,7 +297,7 @@ def similarity(matches: Matches) -> Float[Tensor, "3 3"]:
     return torch.from_numpy(np.vstack([found, [0, 0, 1]]))
 
 
-def _along_lines(matches: Matches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
+def _along_lines(matches: PointMatches, F: Float[Tensor, "3 3"], H: Float[Tensor, "3 3"]) -> Float[Tensor, " n"]:
     """Signed position of each match along its line, from the point nearest to H x, pixels of beta."""
     line = epipolar_lines(F, matches.alpha)
     from_map = matches.beta - apply_homography(H, matches.alpha).x

@@ -17,7 +17,7 @@ from torch import Tensor
 from arraygeom import Camera, LensView, Link, Pair, Rig, View, essential_matrix, stack
 from arraygeom.pixels import to_homogeneous
 
-from .matches import Matches, Pairs, fit_fundamental, line_distance, undistort_matches
+from .matches import Pairs, PointMatches, fit_fundamental, line_distance, undistort_matches
 
 
 class EpipolarResiduals(NamedTuple):
@@ -44,7 +44,7 @@ LEAST_PARALLAX = 2.0
 """Least angle between rays, in pixels, at which their depth is observable."""
 
 
-def epipolar_residuals(pair: Pair, matches: Matches) -> EpipolarResiduals:
+def epipolar_residuals(pair: Pair, matches: PointMatches) -> EpipolarResiduals:
     """The algebraic error x_beta^T F x_alpha divided by its gradient in the pixels, which counts as constant.
 
     With cameras, rays replace pixels and E replaces F, so that lenses are respected to first order in the distance.
@@ -59,14 +59,14 @@ def sampson_of_pairs(rig: Rig, pairs: Pairs) -> list[Float[Tensor, " n"]]:
     return [torch.where(part.valid, part.sampson, 0.0) for part in parts]
 
 
-def residuals_and_depths(pair: Pair, matches: Matches) -> tuple[EpipolarResiduals, MatchDepths | None]:
+def residuals_and_depths(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, MatchDepths | None]:
     """The residuals, and the depths where the rays are closest to each other: None for uncalibrated pairs."""
     residuals, (a, b) = _residuals(pair, matches)
     calibrated = pair.calibrated and pair.link is None
     return residuals, _depths(pair, a.detach(), b.detach(), residuals.valid) if calibrated else None
 
 
-def match_depths(pair: Pair, matches: Matches) -> MatchDepths | None:
+def match_depths(pair: Pair, matches: PointMatches) -> MatchDepths | None:
     """Depths where the rays are closest to each other, differentiable in the rig; None for uncalibrated pairs."""
     if not pair.calibrated or pair.link is not None:
         return None
@@ -74,7 +74,7 @@ def match_depths(pair: Pair, matches: Matches) -> MatchDepths | None:
     return _depths(pair, a, b, valid)
 
 
-def systematic_modes(pair: Pair, matches: Matches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
+def systematic_modes(pair: Pair, matches: PointMatches) -> tuple[Float[Tensor, "n m"], Float[Tensor, "n m"]]:
     """Derivatives of the Sampson distances by smooth displacements of alpha's points, and of beta's.
 
     The displacements are what a lens model leaves, each 1 pixel at the image's corner: radial, of third and fifth
@@ -102,7 +102,7 @@ def _displacements(view: View, points: Tensor) -> Tensor:
     return torch.stack([r2 * p, r2 * r2 * p, *decentred], -1)
 
 
-def _residuals(pair: Pair, matches: Matches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:
+def _residuals(pair: Pair, matches: PointMatches) -> tuple[EpipolarResiduals, tuple[Tensor, Tensor]]:
     alpha, beta = (x.detach().requires_grad_() for x in _for_each(pair, matches))
     with torch.enable_grad():
         (a, b), F, valid = _rays(pair, alpha, beta)
@@ -113,7 +113,7 @@ def _residuals(pair: Pair, matches: Matches) -> tuple[EpipolarResiduals, tuple[T
     return EpipolarResiduals(algebraic / both.sqrt(), algebraic / across.clamp(min=1e-300).sqrt(), valid), (a, b)
 
 
-def lines_basis(pair: Pair, matches: Matches) -> Float[Tensor, "n 8"]:
+def lines_basis(pair: Pair, matches: PointMatches) -> Float[Tensor, "n 8"]:
     """Derivatives of the line distances by the eight degrees of freedom of F (of E, for rays) up to scale."""
     alpha, beta = (x.detach().requires_grad_() for x in matches)
     with torch.enable_grad():
@@ -139,7 +139,7 @@ def _depths(pair: Pair, a: Tensor, b: Tensor, valid: Tensor) -> MatchDepths:
     return MatchDepths(along_a * a[..., 2], (along_a > 0) & (along_b > 0), observable)
 
 
-def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], Matches]:
+def related(rig: Rig, pairs: Pairs) -> dict[tuple[str, str], PointMatches]:
     """Those of the pairs that the rig relates: calibrated ones and those with an F. Raises ValueError if none."""
     found = {names: m for names, m in pairs.items() if (pair := rig.pair(*names)).calibrated or pair.link is not None}
     if not found:
@@ -172,7 +172,7 @@ def _stacked(views: Sequence[View]) -> View:
     return stack([view.replace(hw=views[0].hw) for view in with_K])
 
 
-def _for_each(pair: Pair, matches: Matches) -> tuple[Tensor, Tensor]:
+def _for_each(pair: Pair, matches: PointMatches) -> tuple[Tensor, Tensor]:
     """The points expanded to a batch of rigs."""
     numbers = pair.link.F if pair.link is not None else pair.cameras[0].K if pair.calibrated else pair.fundamental
     x, y = (points.expand(*numbers.shape[:-2], *points.shape[-2:]) for points in matches)

@@ -20,9 +20,10 @@ from torch import Tensor
 from arraygeom import Camera, Link, Pair, Pose, Rig, View, intrinsics, rotation_from_vector, triangulate
 from arraygeom.pixels import map_homogeneous
 from arraygeom.text import angle
+from arraygeom.threads import torch_in_one_thread
 
 from .held_out import median_off
-from .matches import ENOUGH, LOCALISED, Images, Matches, contrast_equalised, line_distance, near_lines
+from .matches import ENOUGH, LOCALISED, Images, PointMatches, contrast_equalised, line_distance, near_lines
 from .patch_matching import refine_points
 from .refinement import refine_matches
 
@@ -69,8 +70,9 @@ class RefinedPair(NamedTuple):
     distance: float
 
 
+@torch_in_one_thread()
 def self_calibrated(
-    views: Mapping[str, View], link: Link, matches: Matches, *, focal: Mapping[str, float]
+    views: Mapping[str, View], link: Link, matches: PointMatches, *, focal: Mapping[str, float]
 ) -> RefinedPair | None:
     """Two cameras (alpha, beta) whose epipolar lines are those of `link`; None where points do not determine them.
 
@@ -96,6 +98,7 @@ def self_calibrated(
     return min(fitting, key=lambda trial: float(angle(_pair(trial.rig).beta_from_alpha.R.T @ upright)))
 
 
+@torch_in_one_thread()
 def refined_by_depth(
     pair: RefinedPair,
     images: Images,
@@ -138,7 +141,7 @@ def dense_matches(
     images: Images,
     depth: Float[Tensor, "h w"],
     confidence: Float[Tensor, "h w"],
-) -> Matches:
+) -> PointMatches:
     """Points of texture in alpha with their positions in beta, from a depth map, refined by least squares."""
     alpha, beta = (camera.to(torch.float64) for camera in _pair(rig).cameras)
     own, other = (contrast_equalised(images[name]) for name in rig.names)
@@ -155,10 +158,10 @@ def dense_matches(
     y, step = in_beta(x), torch.eye(2, dtype=torch.float64)
     maps = torch.stack([in_beta(x + step[0]) - y, in_beta(x + step[1]) - y], -1)
     refined, deviation = refine_points(own, other, x.numpy(), y.numpy(), maps.numpy())
-    return Matches(x, torch.from_numpy(refined)).only(torch.from_numpy(deviation < WELL_LOCALISED))
+    return PointMatches(x, torch.from_numpy(refined)).only(torch.from_numpy(deviation < WELL_LOCALISED))
 
 
-def depth_bounds(rig: Rig, matches: Matches) -> tuple[float, float] | None:
+def depth_bounds(rig: Rig, matches: PointMatches) -> tuple[float, float] | None:
     """Near and far of the matched points of a rig of two cameras, extended; far may be infinite.
 
     None for points without parallax.
@@ -188,7 +191,7 @@ def _focal_lengths(views: Mapping[str, View], link: Link, focal: Mapping[str, fl
     return {alpha: own, beta: focal.get(beta, own * ratio)}
 
 
-def _poses(matches: Matches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
+def _poses(matches: PointMatches, F: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
     """Poses of beta by F and by an essential matrix fitted to the points."""
     x, y = (map_homogeneous(torch.linalg.inv(k), p)[..., :2].numpy() for k, p in zip((K, K_beta), matches))
     threshold = 1 / float(K_beta[0, 0])
@@ -208,7 +211,7 @@ def _upright(link: Link) -> Float[Tensor, "3 3"]:
     return rotation_from_vector(torch.tensor([0.0, 0.0, steps * math.pi / 2], dtype=torch.float64))
 
 
-def _lateral_poses(matches: Matches, R: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
+def _lateral_poses(matches: PointMatches, R: Tensor, K: Tensor, K_beta: Tensor) -> list[Pose]:
     """Poses of parallel axes, beta to either side along the direction in which most points differ."""
     x = map_homogeneous(R @ torch.linalg.inv(K), matches.alpha)[..., :2]
     flow = map_homogeneous(torch.linalg.inv(K_beta), matches.beta)[..., :2] - x
@@ -221,7 +224,7 @@ def _camera(view: View, K: Tensor, pose: Pose) -> Camera:
     return Camera(hw=view.hw, sensor=view.sensor, K=K, cam_from_world=pose)
 
 
-def _refined_pair(rig: Rig, matches: Matches, near: Matches) -> RefinedPair | None:
+def _refined_pair(rig: Rig, matches: PointMatches, near: PointMatches) -> RefinedPair | None:
     """The pair refined by matches, its distance and depths those of `near`; None without parallax."""
     alpha, beta = rig.names
     free = [f"{beta}.{kind}" for kind in (*SIGMA, "centre")]

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-MEASURES = {"psnr": ("PSNR, dB", "{:.2f}"), "peaks": ("peaks within a pixel, %", "{:.1f}")}
+MEASURES = {"psnr": ("gain in PSNR, dB", "{:+.2f}"), "peaks": ("peaks within a pixel, %", "{:.1f}")}
 """What is drawn, its label, and how it is printed."""
 
 
@@ -52,7 +52,10 @@ def shipped_rows() -> list[Row]:
 
 
 def markdown(rows: Sequence[Row]) -> str:
-    """A table for each sweep and measure: fields as lines, values as columns; means over scenes."""
+    """A table for each sweep and measure: fields as lines, values as columns; means over scenes.
+
+    PSNR is against the first field at the first value, scene by scene: scenes differ by more than fields.
+    """
     return "\n".join(
         f"#### {sweep}: {SWEEPS[sweep][0] if sweep in SWEEPS else 'rigs'}\n\n{_tables(rows, sweep)}"
         for sweep in distinct(row.sweep for row in rows)
@@ -60,24 +63,18 @@ def markdown(rows: Sequence[Row]) -> str:
 
 
 def _tables(rows: Sequence[Row], sweep: str) -> str:
-    values = distinct(row.value for row in rows if row.sweep == sweep)
-    fields = distinct(row.field for row in rows if row.sweep == sweep)
+    some = [row for row in rows if row.sweep == sweep]
+    values, fields = distinct(row.value for row in some), distinct(row.field for row in some)
     parts = []
     for measure, (label, form) in MEASURES.items():
-        lines = [[field, *(_cell(_of(rows, sweep, field, v, measure), form) for v in values)] for field in fields]
+        lines = [[field, *(_cell(_drawn(some, field, v, measure), form) for v in values)] for field in fields]
         parts.append(markdown_table([label, *(f"{v:g}" for v in values)], lines))
-    notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in rows if row.sweep == sweep and row.note)
+    notes = distinct(f"{row.field} at {row.value:g}: {row.note}" for row in some if row.note)
     return "\n".join(parts) + "".join(f"\n{note}." for note in notes) + "\n" * bool(notes)
 
 
 def _cell(values: Sequence[float], form: str) -> str:
     return form.format(np.mean(values)) if values else ""
-
-
-def _of(rows: Sequence[Row], sweep: str, field: str, value: float, measure: str) -> list[float]:
-    """A measure on every scene where there is one, peaks in percent."""
-    found = [getattr(r, measure) for r in rows if (r.sweep, r.field, r.value) == (sweep, field, value)]
-    return [100 * v if measure == "peaks" else v for v in found if not math.isnan(v)]
 
 
 def save_curves(rows: Sequence[Row], path: Path) -> Path:
@@ -88,7 +85,7 @@ def save_curves(rows: Sequence[Row], path: Path) -> Path:
 def curves(rows: Sequence[Row]) -> Figure:
     """A column for each sweep, a row for each measure, a curve for each field; bars are 95 % intervals of the mean.
 
-    PSNR is drawn against the first field at the first value, scene by scene: scenes differ by more than fields.
+    PSNR is drawn as in `markdown`.
     """
     sweeps = distinct(row.sweep for row in rows)
     figure = new_figure(figsize=(3.2 * len(sweeps), 6.0))
@@ -113,18 +110,18 @@ def _draw(axis: Axes, rows: Sequence[Row], measure: str) -> None:
         bounds = np.array([bootstrap_interval(found[value]) for value in known]).reshape(-1, 2)
         spread = np.abs(np.nan_to_num(bounds.T - means)) if len(known) else None
         axis.errorbar(known, means, yerr=spread, label=field, marker="o", markersize=3, capsize=2, linewidth=1)
-    axis.set_ylabel(f"{'gain in ' if measure == 'psnr' else ''}{MEASURES[measure][0]}", fontsize=8)
+    axis.set_ylabel(MEASURES[measure][0], fontsize=8)
     axis.tick_params(labelsize=8)
     axis.grid(alpha=0.3)
 
 
 def _drawn(rows: Sequence[Row], field: str, value: float, measure: str) -> list[float]:
-    """What is drawn of each scene where there is something."""
-    if measure != "psnr":
-        return _of(rows, rows[0].sweep, field, value, measure)
-    first = {r.scene: r.psnr for r in rows if (r.field, r.value) == (rows[0].field, rows[0].value)}
-    found = [r.psnr - first[r.scene] for r in rows if (r.field, r.value) == (field, value) and r.scene in first]
-    return [gain for gain in found if not math.isnan(gain)]
+    """What is drawn of each scene of one sweep, where there is something: gains in dB, peaks in percent."""
+    some = [row for row in rows if (row.field, row.value) == (field, value) and not row.note]
+    if measure == "peaks":
+        return [100 * row.peaks for row in some]
+    first = {row.scene: row.psnr for row in rows if (row.field, row.value) == (rows[0].field, rows[0].value)}
+    return [row.psnr - first[row.scene] for row in some if row.scene in first]
 
 
 def _plain(row: Row) -> dict[str, object]:

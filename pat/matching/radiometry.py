@@ -26,10 +26,8 @@ from arraygeom import pixel_grid
 from arraygeom.robust import RobustFit, cauchy, gaussian, least_squares, normal_deviation, robust_least_squares
 
 from ..media.colour import REC601
-from ..support.settings import size, tuned
+from ..support.settings import physics, size, tuned
 from .normalisation import box_mean
-
-GAMMAS = (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6)
 
 
 @dataclass(frozen=True)
@@ -44,17 +42,14 @@ class ResponseSettings:
         (0.32, 0.48, 0.20), "Middlebury: weights of a usual sensor that is not Rec. 601's: it sees more blue"
     )
     prior: float = tuned(0.2, "Middlebury: standard deviation of weights about these")
-    independent: float = tuned(
-        20.0,
-        "Middlebury: as how many independent observations all points count: about as many as there are materials",
-    )
-    error: float = tuned(
-        0.012,
-        "Middlebury: standard deviation of one of those, at least: light and surfaces differ between the views",
-    )
+    independent: float = tuned(20.0, "Middlebury: as how many independent observations, or materials, all points count")
+    error: float = tuned(0.012, "Middlebury: standard deviation of one of those, at least: light differs between views")
     outlier: float = tuned(2.0, "Middlebury: residuals of this many robust deviations count half")
     points: tuple[int, int] = size((6000, 300), "Pixels used at most, and the fewest that are enough")
-    gammas: tuple[float, ...] = size(GAMMAS, "Gammas that are tried")
+    gammas: tuple[float, ...] = size(
+        (0.4, 0.5, 0.6, 0.7, 0.77, 0.85, 0.92, 1.0, 1.08, 1.18, 1.3, 1.45, 1.6, 1.8, 2.0, 2.3, 2.6),
+        "Gammas that are tried",
+    )
     unlikely: tuple[float, float, float] = tuned(
         (22.0, 12.0, 45.0),
         "Middlebury: by how much another gain, other weights, and both must lower the misfit to be taken",
@@ -70,10 +65,20 @@ class ResponseSettings:
         "601's, and alpha is brighter than luma where an unfiltered sensor would be darker, or the other "
         "way round: that is light too",
     )
-    equal_weights: float = tuned(
-        8.0,
-        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to "
-        "be taken in their place: a sensor without filters",
+    negative: float = physics(0.05, "Standard deviation of negative weights, which no sensor has")
+    sensor: tuple[float, float, float] = physics(
+        (0.33, 0.39, 0.28), "Weights of an unfiltered sensor, which sees more blue than Rec. 601"
+    )
+    alike: float = tuned(
+        2.0, "Middlebury: a gain explains alpha as well as weights do if its misfit is up to this much larger"
+    )
+    equal_weights: tuple[float, float] = tuned(
+        (8.0, 0.006),
+        "Middlebury: by how much the misfit of 1/3, 1/3, 1/3 may be larger than that of other weights, to be taken "
+        "in their place: a sensor without filters; light may differ by a gain of this standard deviation",
+    )
+    least_change: float = physics(
+        0.01, "Root mean square change of luma up to which the weights are left at Rec. 601's"
     )
     equal: float = tuned(1.1, "Middlebury: the error over the least one up to which a gamma explains alpha as well")
     better: float = tuned(
@@ -342,16 +347,17 @@ def _decided(x: Tensor, y: Tensor, gamma: float, found: _Fit, settings: Response
     weights, further = usual + CHANGES @ change, usual + CHANGES @ torch.stack(rest) / total
     trials = [
         (only_gain + settings.unlikely[0], rec601, float(gain)),
-        (both + settings.unlikely[2], further, float(total)),
+        (both + settings.unlikely[2] + _negative(further, settings), further, float(total)),
     ]
     if gamma == 1:
-        trials.append((only_weights + settings.unlikely[1], weights, 1.0))
+        trials.append((only_weights + settings.unlikely[1] + _negative(weights, settings), weights, 1.0))
         trials.append((points.misfit(rec601 @ x), rec601, 1.0))
     misfit, chosen, exposure = min(trials, key=lambda trial: trial[0])
-    as_well = only_gain < only_weights
-    if exposure == 1 and _is_light(points, float(gain), as_well, (weights, further), settings):
+    as_well = only_gain < only_weights + settings.alike
+    unchanged = float(((chosen - rec601) @ x).square().mean().sqrt()) < settings.least_change
+    if exposure == 1 and (unchanged or _is_light(points, float(gain), as_well, (weights, further), settings)):
         chosen = rec601
-    if chosen is not rec601:
+    elif chosen is not rec601:
         chosen, exposure = _or_equal(points, chosen, exposure, settings)
     return misfit, Response(chosen, exposure, gamma, found.explained)
 
@@ -361,26 +367,28 @@ def _is_light(
 ) -> bool:
     """Whether light that differs between the views may be why other weights explain alpha better: a small
     gain explains it as well, or no sensor has such weights."""
-    rec601, usual = Response.rec601().weights, points.x.new_tensor(settings.usual)
-    unlike_sensors = (gain - 1) * float(((usual - rec601) @ points.x) @ points.counts) < 0
+    rec601, sensor = Response.rec601().weights, points.x.new_tensor(settings.sensor)
+    unlike_sensors = (gain - 1) * float(((sensor - rec601) @ points.x) @ points.counts) < 0
     no_sensor = any(bool((w[1] > settings.greenest) & (w[2] < rec601[2])) for w in weights)
     small = as_well and abs(math.log(gain)) < settings.light[unlike_sensors]
     return small or (unlike_sensors and no_sensor)
 
 
+def _negative(weights: Tensor, settings: ResponseSettings) -> float:
+    """How unlikely negative weights are, as a misfit."""
+    return float((weights.clamp(max=0) / settings.negative).square().sum())
+
+
 def _or_equal(points: _Points, weights: Tensor, gain: float, settings: ResponseSettings) -> tuple[Tensor, float]:
     """1/3 of each band if they explain alpha about as well, with the gain that fits best unless that is 1."""
+    more, deviation = settings.equal_weights
+    precision = points.x.new_full((1, 1), deviation**-2 if gain == 1 else 0.0)
     equal = torch.full_like(weights, 1 / 3)
-
-    def best(weights: Tensor) -> tuple[float, float]:
-        shade = weights @ points.x
-        if gain == 1:
-            return points.misfit(shade), gain
-        misfit, (factor,) = points.explained(points.y, shade[None], points.x.new_zeros(1, 1))
-        return misfit, float(factor)
-
-    (misfit, _), (of_equal, its_gain) = best(weights), best(equal)
-    return (weights, gain) if of_equal > misfit + settings.equal_weights else (equal, its_gain)
+    shades = [gain * (w @ points.x) for w in (weights, equal)]
+    (misfit, _), (of_equal, (light,)) = (points.explained(points.y - s, s[None], precision) for s in shades)
+    if of_equal > misfit + more:
+        return weights, gain
+    return equal, gain if gain == 1 else gain * (1 + float(light))
 
 
 class SpectralMix(NamedTuple):

@@ -34,7 +34,7 @@ def _entry(kind: Kind, value: Any, why: str) -> Any:
     return field(default=value, metadata={"kind": kind, "why": why})
 
 
-class Setting(NamedTuple):
+class SettingEntry(NamedTuple):
     """One entry of an algorithm's settings: its name, value, kind, and why it is so."""
 
     algorithm: str
@@ -49,11 +49,11 @@ class Setting(NamedTuple):
         return len(self.value) if isinstance(self.value, tuple) else 1
 
 
-def listed(settings: Any) -> Iterator[Setting]:
+def listed(settings: Any) -> Iterator[SettingEntry]:
     """The entries of an algorithm's settings, in their order. Raises ValueError for one without a kind."""
     name = type(settings).__name__
     for entry in fields(settings):
-        yield Setting(name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"])
+        yield SettingEntry(name, entry.name, getattr(settings, entry.name), _kind(name, entry), entry.metadata["why"])
 
 
 def _kind(algorithm: str, entry: Field[Any]) -> Kind:
@@ -63,7 +63,7 @@ def _kind(algorithm: str, entry: Field[Any]) -> Kind:
     return kind
 
 
-def all_settings(*rooms: str) -> list[Setting]:
+def all_settings(*rooms: str) -> list[SettingEntry]:
     """The entries of all settings of these packages, such as "pat.matching", in the order of their modules."""
     found: dict[str, Any] = {}
     for room in rooms:

@@ -24,7 +24,7 @@ from arraygeom import Link, Rig, View
 from arraygeom.pixels import coarse_grid
 from calib.images.from_images import rig_from_images
 from calib.images.held_out import line_distances, line_statistics, split
-from calib.images.matches import Matches, fit_fundamental, line_distance, match_cameras
+from calib.images.matches import PointMatches, fit_fundamental, line_distance, match_cameras
 from calib.images.refinement import FREE, LineStatistics, RefinementProblem, polish, refine, refine_matches
 from pat.attention import attend_with_statistics
 from pat.data.sample_array import load_sample
@@ -144,7 +144,7 @@ def by_photometry(draws: int, g: torch.Generator) -> Iterator[str]:
         yield markdown_row([f"draw {draw}", f"{off[0]:.2f} px", f"{off[1]:.2f} px"])
 
 
-def exact_points(rig: Rig, names: tuple[str, str]) -> Matches:
+def exact_points(rig: Rig, names: tuple[str, str]) -> PointMatches:
     """Points without noise, between the depth bounds."""
     alpha, beta = rig.pair(*names).cameras
     x = coarse_grid(alpha.hw).reshape(-1, 2)
@@ -152,7 +152,7 @@ def exact_points(rig: Rig, names: tuple[str, str]) -> Matches:
     depth = torch.linspace(near, far, len(x), dtype=torch.float64)[torch.randperm(len(x))]
     y = beta.project(alpha.unproject(x, depth)).x
     seen = beta.contains(y)
-    return Matches(x[seen], y[seen])
+    return PointMatches(x[seen], y[seen])
 
 
 def main() -> None:

@@ -27,7 +27,7 @@ from calib.boards.rig import Calibration, calibrate
 from calib.boards.start import StartDeviations
 from calib.boards.target import parse_board
 from calib.images.held_out import line_distances
-from calib.images.matches import Matches, match_cameras
+from calib.images.matches import PointMatches, match_cameras
 from pat.evaluation.tables import markdown_header, markdown_row
 from pat.media.images import read_image
 from tests.benchmarks.printed import data_and_out, print_tables
@@ -66,7 +66,7 @@ def neighbours() -> Iterator[tuple[str, str]]:
         yield from ((f"Cam-{a}", f"Cam-{b}") for a, b in pairwise(line))
 
 
-def scene_matches(folder: Path) -> dict[tuple[str, str], Matches]:
+def scene_matches(folder: Path) -> dict[tuple[str, str], PointMatches]:
     images = {f"Cam-{i}": read_image(folder / "scene" / f"Cam-{i}.png") for i in range(9)}
     return {names: m for names, m in match_cameras(images).items() if len(m.alpha) >= ENOUGH}
 
@@ -80,7 +80,7 @@ def rows(folder: Path) -> Iterator[str]:
         yield markdown_row([f"± {1e3 * position:g} mm", f"{found.rms:.3f}", *_cells(found, matches)])
 
 
-def _cells(found: Calibration, matches: Mapping[tuple[str, str], Matches]) -> Iterator[str]:
+def _cells(found: Calibration, matches: Mapping[tuple[str, str], PointMatches]) -> Iterator[str]:
     covariance, rig = rig_covariance(found), found.rig
     assert covariance is not None
     off = [float((rig[b].centre - rig[a].centre).norm()) - GRID for a, b in neighbours()]

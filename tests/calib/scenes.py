@@ -6,7 +6,7 @@ import torch
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
 from calib.images.least_squares import Solution
-from calib.images.matches import Matches
+from calib.images.matches import PointMatches
 from calib.images.refinement import RefinementProblem
 
 HW = (240, 320)
@@ -55,7 +55,7 @@ def uninformed(fit: RefinementProblem) -> Solution:
     return Solution(z, torch.ones(n, dtype=torch.bool), covariance, covariance, z, covariance)
 
 
-def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dict[tuple[str, str], Matches]:
+def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dict[tuple[str, str], PointMatches]:
     """Points of the first two cameras, between two depths and in both images, good to `noise` pixels in beta."""
     g = torch.Generator().manual_seed(seed)
     (a, alpha), (b, beta) = list(rig.cameras.items())[:2]
@@ -65,7 +65,7 @@ def seen_points(rig, *, count=200, near=2.0, far=6.0, noise=0.15, seed=0) -> dic
     y, _, valid = beta.project(alpha.unproject(x, depth))
     seen = valid & beta.contains(y) & x.isfinite().all(-1)
     x, y = x[seen][:count], y[seen][:count]
-    return {(a, b): Matches(x, y + noise * torch.randn(len(y), 2, generator=g, dtype=torch.float64))}
+    return {(a, b): PointMatches(x, y + noise * torch.randn(len(y), 2, generator=g, dtype=torch.float64))}
 
 
 def rectified_images(seed=0) -> dict[str, torch.Tensor]:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from arraygeom import Camera, Distortion, Pose, Rig, intrinsics, rotation_from_vector
-from calib.images.matches import Matches
+from calib.images.matches import PointMatches
 
 HW = (480, 640)
 FOCAL = {"wide": 420.0, "narrow": 1900.0}
@@ -52,7 +52,7 @@ def _towards(direction: np.ndarray) -> Tensor:
 
 def simulated_matches(
     rig: Rig, field: str, g: np.random.Generator, *, count: int = 250, noise: float = NOISE, wrong: float = WRONG
-) -> dict[tuple[str, str], Matches]:
+) -> dict[tuple[str, str], PointMatches]:
     """Matched points of every two neighbouring cameras of a true rig; wrong ones lie some pixels across the lines."""
     names = rig.names
     found = {}
@@ -64,7 +64,7 @@ def simulated_matches(
 
 def _pair_matches(
     rig: Rig, names: tuple[str, str], field: str, g: np.random.Generator, *, count: int, noise: float, wrong: float
-) -> Matches:
+) -> PointMatches:
     alpha, beta = (rig[name] for name in names)
     h, w = alpha.hw
     near, far = DISTANCE[field]
@@ -75,4 +75,4 @@ def _pair_matches(
     x, y = x[seen][:count], y[seen][:count]
     is_wrong = torch.from_numpy(g.uniform(size=len(x)) < wrong)
     off = torch.from_numpy(np.where(is_wrong[:, None], g.uniform(-5, 5, (len(x), 2)), g.normal(0, noise, (len(x), 2))))
-    return Matches(x + torch.from_numpy(g.normal(0, noise, (len(x), 2))), y + off)
+    return PointMatches(x + torch.from_numpy(g.normal(0, noise, (len(x), 2))), y + off)

@@ -21,7 +21,7 @@ from arraygeom import (
 from calib.images.doctor import diagnose_matches
 from calib.images.held_out import line_distances
 from calib.images.lenses import largest_distortion, with_lenses
-from calib.images.matches import Matches, fit_fundamental, match_cameras, undistort_matches
+from calib.images.matches import PointMatches, fit_fundamental, match_cameras, undistort_matches
 from calib.images.photometric import PhotometricFrame, photometric_errors
 from calib.images.refinement import Refinement, refine_matches
 from pat.attention import attend_with_statistics
@@ -46,28 +46,28 @@ def lenses(rig: Rig) -> set[str]:
     return {name for name, view in rig.cameras.items() if isinstance(view, LensView) and view.distortion is not None}
 
 
-def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], Matches]:
+def matches(rig, *, count=400, noise=0.05, wrong=True) -> dict[tuple[str, str], PointMatches]:
     """Points at 2 to 7 m, one in twenty wrong."""
     (names, (x, y)), *_ = seen_points(rig, count=count, near=2.0, far=7.0, noise=noise).items()
     if wrong:
         y[::20] += 4 * torch.randn(len(y), 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)[::20]
-    return {names: Matches(x, y)}
+    return {names: PointMatches(x, y)}
 
 
 @functools.cache
-def found_by_points() -> tuple[dict[tuple[str, str], Matches], Rig, Refinement]:
+def found_by_points() -> tuple[dict[tuple[str, str], PointMatches], Rig, Refinement]:
     """Points, the rig of them with no regard to lenses, and what refining finds."""
     points = matches(pair(-0.25))
     rig = known_by_f(points)
     return points, rig, refine_matches(rig, [points])
 
 
-def known_by_f(points: dict[tuple[str, str], Matches]) -> Rig:
+def known_by_f(points: dict[tuple[str, str], PointMatches]) -> Rig:
     """Two sizes, and F of the points with no regard to lenses."""
     return Rig({name: View(hw=HW) for name in NAMES}, links={NAMES: Link(fit_fundamental(points[NAMES]))})
 
 
-def median(rig: Rig, points: dict[tuple[str, str], Matches]) -> float:
+def median(rig: Rig, points: dict[tuple[str, str], PointMatches]) -> float:
     return float(line_distances(rig, points).abs().median())
 
 

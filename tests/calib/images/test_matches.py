@@ -7,7 +7,7 @@ import torch
 
 from arraygeom import Camera, Pose, Rig, apply_homography, epipolar_lines, intrinsics, rotation_from_vector
 from calib.images import matches
-from calib.images.matches import ENOUGH, Matches, fit_link, line_distance, match_points, near_lines, seen_depths
+from calib.images.matches import ENOUGH, PointMatches, fit_link, line_distance, match_points, near_lines, seen_depths
 from tests.calib.scenes import texture
 
 HW = (240, 320)
@@ -30,7 +30,7 @@ def seen_points(rig, *, count=300, near=2.0, far=6.0, noise=0.0):
     x = torch.rand(count, 2, generator=g, dtype=torch.float64) * torch.tensor([319.0, 239.0])
     depth = near + (far - near) * torch.rand(count, generator=g, dtype=torch.float64)
     y = right.project(left.unproject(x, depth)).x
-    return Matches(x, y + noise * torch.randn(count, 2, generator=g, dtype=torch.float64))
+    return PointMatches(x, y + noise * torch.randn(count, 2, generator=g, dtype=torch.float64))
 
 
 def test_matches_follow_a_known_map():
@@ -52,8 +52,8 @@ def test_lines_choose_matches():
     rig = rig_of()
     F, matches = rig.pair("left", "right").fundamental, seen_points(rig)
     assert line_distance(matches, F).max() < 1e-6
-    wrong = Matches(matches.alpha, matches.beta.flip(0))
-    both = Matches(torch.cat([matches.alpha, wrong.alpha]), torch.cat([matches.beta, wrong.beta]))
+    wrong = PointMatches(matches.alpha, matches.beta.flip(0))
+    both = PointMatches(torch.cat([matches.alpha, wrong.alpha]), torch.cat([matches.beta, wrong.beta]))
     assert 300 <= len(near_lines(both, F, within=1).alpha) < 330
 
 

@@ -10,7 +10,7 @@ import torch
 
 from arraygeom import Pose
 from calib.images import misfit
-from calib.images.matches import Matches, match_cameras
+from calib.images.matches import PointMatches, match_cameras
 from calib.images.misfit import find_misfit, misfit_warning, share_outside
 from pat.cli.main import main
 from pat.media.images import write_image
@@ -92,7 +92,7 @@ def test_images_are_compared_at_full_size_only_where_small_ones_do_not_fit(monke
 
 def test_too_few_points_of_observable_depth_are_no_share():
     points = torch.tensor([[10.0, 20.0], [30.0, 25.0], [50.0, 60.0]], dtype=torch.float64)
-    few = {("left", "right"): Matches(points, points - 5)}
+    few = {("left", "right"): PointMatches(points, points - 5)}
     assert math.isnan(share_outside(rectified_pair(), few))
 
 

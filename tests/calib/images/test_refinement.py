@@ -9,7 +9,7 @@ import torch
 from arraygeom import Camera, Link, Rig, View
 from calib.images.depth_change import relative_change
 from calib.images.held_out import median_off
-from calib.images.matches import Matches, match_cameras
+from calib.images.matches import PointMatches, match_cameras
 from calib.images.parameters import apply_change, free_parameters
 from calib.images.photometric import PhotometricFrame, photometric_errors
 from calib.images.refinement import RefinementProblem, jacobian, polish, refine, refine_matches, solve
@@ -126,7 +126,7 @@ def test_wrong_points_do_not_matter():
     (names, points), *_ = seen_points(rig).items()
     wrong = points.beta.clone()
     wrong[::8] += torch.from_numpy(np.random.default_rng(0).uniform(-20, 20, wrong[::8].shape))
-    found = refine_matches(worse(rig), [{names: Matches(points.alpha, wrong)}], force=True)
+    found = refine_matches(worse(rig), [{names: PointMatches(points.alpha, wrong)}], force=True)
     assert median_off(found.rig, seen_points(rig, noise=0.0, seed=1)) < 0.25
 
 

@@ -7,12 +7,12 @@ import torch
 
 from arraygeom import Rig
 from calib.images.held_out import line_distances
-from calib.images.matches import Matches, with_map
+from calib.images.matches import PointMatches, with_map
 from calib.images.self_calibration import RefinedPair, dense_matches, joined, refined_by_depth, self_calibrated
 from tests.calib.scenes import HW, rectified_images, rectified_pair, seen_points, unlike_pair
 
 
-def calibrated_from(rig: Rig, matches: Matches, **focal: float) -> RefinedPair | None:
+def calibrated_from(rig: Rig, matches: PointMatches, **focal: float) -> RefinedPair | None:
     names = rig.names
     link = with_map(rig.pair(*names), matches).link
     return self_calibrated(rig.cameras, link, matches, focal=focal)

@@ -147,7 +147,7 @@ def test_reports_are_written_and_read_back(tmp_path):
     back = read_rows(tmp_path / "ablation.json")
     assert repr(back) == repr(made_up())
     ElementTree.parse(tmp_path / "ablation.svg")
-    assert "| calibrated | 25.50 | 26.50 |" in (tmp_path / "ablation.md").read_text()
+    assert "| calibrated | +0.00 | +1.00 |" in (tmp_path / "ablation.md").read_text()
 
 
 @pytest.mark.parametrize("text", ["", "{}", "[1]", '[{"sweep": 1}]', "[[]]"])
