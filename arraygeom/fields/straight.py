@@ -178,13 +178,9 @@ class Rectified:
     alpha_is: SIDES = "left"
 
     def __post_init__(self) -> None:
+        check_above(0, max_disparity=self.max_disparity)
         if self.alpha_is not in get_args(SIDES):
             raise ValueError(f"alpha_is must be one of {', '.join(get_args(SIDES))}, got {self.alpha_is!r}")
-
-    def __post_init__(self) -> None:
-        check_above(0, max_disparity=self.max_disparity)
-        if self.alpha_is not in ("left", "right", "either"):
-            raise ValueError(f"alpha_is is {self.alpha_is!r}: wanted 'left', 'right' or 'either'")
 
     def __call__(self, pair: Pair, x: Real[Tensor, "*n 2"]) -> Segments:
         """Segments from the largest disparity (near) to none (far)."""

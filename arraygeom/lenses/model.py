@@ -45,6 +45,11 @@ class LensModel(Batched):
         return torch.zeros_like(to_homogeneous(floating(xy)))
 
     @property
+    def harmless(self) -> bool:
+        """Whether it is a pinhole after all."""
+        return False
+
+    @property
     def sees_behind(self) -> bool:
         """Whether the model may have directions at 90 degrees or more off axis."""
         return True
