@@ -3,9 +3,6 @@
 Cameras, rigs, two-view geometry and receptive fields as tensor operations; see conventions.md.
 """
 
-import sys
-from typing import TYPE_CHECKING, Any
-
 from .batching import stack
 from .camera import Camera, LensView, Projected, View, intrinsics
 from .checks import unchecked
@@ -42,7 +39,6 @@ from .fields import (
     sampling_locations,
 )
 from .homography import apply_homography, fit_homography, fit_similarity, infinite_homography, plane_homography
-from .moved import OldModules, moved_name
 from .multiview import ConsistentDepth, WorldRays, consistent_depth, plane_sweep, warp, world_rays
 from .pixels import pixel_grid, resize_matrix
 from .pose import Pose, rotation_from_vector
@@ -131,13 +127,3 @@ __all__ = [
     "warp",
     "world_rays",
 ]
-
-sys.meta_path.insert(0, OldModules({"arraygeom.io.whole": "arraygeom.atomic"}, {}))
-
-if not TYPE_CHECKING:
-
-    def __getattr__(name: str) -> Any:
-        """Functions by the names that they had, for one release."""
-        return moved_name(
-            __name__, name, {"retaken": "arraygeom.resampled", "look": "arraygeom.sampling_locations"}.get(name)
-        )

@@ -6,12 +6,9 @@ imported before it is used.
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from .support.moved import OldNames
 
 if TYPE_CHECKING:
     from .fusion.align import Aligned, align
@@ -30,8 +27,6 @@ _MODULES = {
     "load_weights": "pat.networks.weights",
     "read_image": "pat.media.images",
 }
-
-sys.meta_path.insert(0, OldNames)
 
 
 if not TYPE_CHECKING:

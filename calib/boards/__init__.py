@@ -21,6 +21,4 @@ __getattr__ = _lazy(
         "simulate_photos": "simulation",
         "write_board": "run",
     },
-    {name: f"{__name__}.target.{name}" for name in ("Board", "Charuco", "Chessboard", "Circles")}
-    | {"draw_board": f"{__name__}.printing.draw_board"},
 )
